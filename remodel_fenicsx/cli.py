@@ -22,8 +22,15 @@ from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_sc
 from remodel_fenicsx.schema.tables import printable, shortened
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.children import SERVE, serve
-from remodel_fenicsx.system.environment import check_usable, kernels, reason_undrawable, reason_unusable, versions
-from remodel_fenicsx.system.extensions import EXTENSIONS, load_extensions
+from remodel_fenicsx.system.environment import (
+    EXTENSIONS,
+    check_usable,
+    kernels,
+    load_extensions,
+    reason_undrawable,
+    reason_unusable,
+    versions,
+)
 from remodel_fenicsx.system.files import megabytes, positive, refusal_in_words, wall_time, write_new
 
 # what an error of Python's begins with, and the option for it

@@ -56,131 +56,76 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from remodel_fenicsx._lazy import on_demand
-from remodel_fenicsx.body import SHAPES, LoadKind, Shape
-from remodel_fenicsx.body.cube import box_domain
-from remodel_fenicsx.body.shape import COLUMNS, COLUMNS_ON_REQUEST, Column, End, WithRegions, uniaxial_columns
-from remodel_fenicsx.body.wall import Walled
-from remodel_fenicsx.body.reductions import Reduction
-from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation, Selective
-from remodel_fenicsx.fem.kinematics import KINEMATICS, FullKinematics, Kinematics
-from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS, SolverMethod
-from remodel_fenicsx.model.cells import UnitCell, angle_to_axis
-from remodel_fenicsx.model.chains import CHAINS, Chain, Parameter
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame
+from remodel_fenicsx.body import SHAPES as SHAPES, LoadKind as LoadKind, Shape as Shape
+from remodel_fenicsx.body.cube import box_domain as box_domain
+from remodel_fenicsx.body.shape import (
+    COLUMNS as COLUMNS,
+    COLUMNS_ON_REQUEST as COLUMNS_ON_REQUEST,
+    Column as Column,
+    End as End,
+    WithRegions as WithRegions,
+    uniaxial_columns as uniaxial_columns,
+)
+from remodel_fenicsx.body.wall import Walled as Walled
+from remodel_fenicsx.body.reductions import Reduction as Reduction
+from remodel_fenicsx.fem.formulations import (
+    FORMULATIONS as FORMULATIONS,
+    Formulation as Formulation,
+    Selective as Selective,
+)
+from remodel_fenicsx.fem.kinematics import (
+    KINEMATICS as KINEMATICS,
+    FullKinematics as FullKinematics,
+    Kinematics as Kinematics,
+)
+from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS as SOLVER_METHODS, SolverMethod as SolverMethod
+from remodel_fenicsx.model.cells import UnitCell as UnitCell, angle_to_axis as angle_to_axis
+from remodel_fenicsx.model.chains import CHAINS as CHAINS, Chain as Chain, Parameter as Parameter
+from remodel_fenicsx.model.drivers import DRIVERS as DRIVERS, FRAMES as FRAMES, Driver as Driver, Frame as Frame
 from remodel_fenicsx.model.energy import (
-    MATRICES,
-    REPULSIONS,
-    Matrix,
-    Repulsion,
-    Stresses,
-    axes_sum,
-    neo_hookean,
-    squared_end_to_end_length,
+    MATRICES as MATRICES,
+    REPULSIONS as REPULSIONS,
+    Matrix as Matrix,
+    Repulsion as Repulsion,
+    Stresses as Stresses,
+    axes_sum as axes_sum,
+    neo_hookean as neo_hookean,
+    squared_end_to_end_length as squared_end_to_end_length,
 )
-from remodel_fenicsx.model.laws import LAWS, Drive, Law, ranked
-from remodel_fenicsx.model.axes import AXES, LocalAxes
-from remodel_fenicsx.model.spectral import PAIRINGS, principal
-from remodel_fenicsx.model.tensors import linear_map, ln
-from remodel_fenicsx.schema.settings import COUPLINGS, CouplingKind
-from remodel_fenicsx.schema.tables import markdown_reference
+from remodel_fenicsx.model.laws import LAWS as LAWS, Drive as Drive, Law as Law, ranked as ranked
+from remodel_fenicsx.model.axes import AXES as AXES, LocalAxes as LocalAxes
+from remodel_fenicsx.model.spectral import PAIRINGS as PAIRINGS, principal as principal
+from remodel_fenicsx.model.tensors import linear_map as linear_map, ln as ln
+from remodel_fenicsx.schema.settings import COUPLINGS as COUPLINGS, CouplingKind as CouplingKind
+from remodel_fenicsx.schema.tables import markdown_reference as markdown_reference
 from remodel_fenicsx.schema.units import (
-    AREA,
-    FORCE,
-    LENGTH,
-    LENGTH_UNIT,
-    NUMBER_DENSITY,
-    STRESS,
-    STRESS_UNIT,
-    TEMPERATURE,
-    Dimension,
+    AREA as AREA,
+    FORCE as FORCE,
+    LENGTH as LENGTH,
+    LENGTH_UNIT as LENGTH_UNIT,
+    NUMBER_DENSITY as NUMBER_DENSITY,
+    STRESS as STRESS,
+    STRESS_UNIT as STRESS_UNIT,
+    TEMPERATURE as TEMPERATURE,
+    Dimension as Dimension,
 )
-from remodel_fenicsx.watch import WATCHERS, WatcherKind
+from remodel_fenicsx.watch import WATCHERS as WATCHERS, WatcherKind as WatcherKind
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.evolution.coupling import Coupling, Staggered, Traits
-    from remodel_fenicsx.fem.jit import form
-    from remodel_fenicsx.results.columns import Measurement
-    from remodel_fenicsx.solver.linear import EveryTangent
-    from remodel_fenicsx.watch.warnings import WarnsOnce
+    from remodel_fenicsx.evolution.coupling import Coupling as Coupling, Staggered as Staggered, Traits as Traits
+    from remodel_fenicsx.fem.jit import form as form
+    from remodel_fenicsx.results.columns import Measurement as Measurement
+    from remodel_fenicsx.solver.linear import EveryTangent as EveryTangent
+    from remodel_fenicsx.watch.warnings import WarnsOnce as WarnsOnce
 
-__all__ = [
-    "AREA",
-    "AXES",
-    "CHAINS",
-    "COLUMNS",
-    "COLUMNS_ON_REQUEST",
-    "COUPLINGS",
-    "Chain",
-    "Column",
-    "Coupling",
-    "CouplingKind",
-    "DRIVERS",
-    "Dimension",
-    "Drive",
-    "Driver",
-    "End",
-    "EveryTangent",
-    "FORCE",
-    "FORMULATIONS",
-    "FRAMES",
-    "Formulation",
-    "Frame",
-    "FullKinematics",
-    "KINEMATICS",
-    "Kinematics",
-    "LAWS",
-    "LENGTH",
-    "LENGTH_UNIT",
-    "Law",
-    "LoadKind",
-    "LocalAxes",
-    "MATRICES",
-    "Matrix",
-    "Measurement",
-    "NUMBER_DENSITY",
-    "PAIRINGS",
-    "Parameter",
-    "REPULSIONS",
-    "Reduction",
-    "Repulsion",
-    "SHAPES",
-    "SOLVER_METHODS",
-    "STRESS",
-    "STRESS_UNIT",
-    "Selective",
-    "Shape",
-    "SolverMethod",
-    "Staggered",
-    "Stresses",
-    "TEMPERATURE",
-    "Traits",
-    "UnitCell",
-    "WATCHERS",
-    "WarnsOnce",
-    "WatcherKind",
-    "Walled",
-    "WithRegions",
-    "angle_to_axis",
-    "axes_sum",
-    "box_domain",
-    "form",
-    "linear_map",
-    "ln",
-    "markdown_reference",
-    "neo_hookean",
-    "principal",
-    "ranked",
-    "squared_end_to_end_length",
-    "uniaxial_columns",
-]
-
-__getattr__ = on_demand(
-    __name__,
-    {
-        **dict.fromkeys(("Coupling", "Staggered", "Traits"), "evolution.coupling"),
-        "EveryTangent": "solver.linear",
-        "Measurement": "results.columns",
-        "WarnsOnce": "watch.warnings",
-        "form": "fem.jit",
-    },
-)
+_LATE = {
+    **dict.fromkeys(("Coupling", "Staggered", "Traits"), "evolution.coupling"),
+    "EveryTangent": "solver.linear",
+    "Measurement": "results.columns",
+    "WarnsOnce": "watch.warnings",
+    "form": "fem.jit",
+}
+__getattr__ = on_demand(__name__, _LATE)
+if not TYPE_CHECKING:  # type checkers go by the imports
+    _HELPERS = ("annotations", "TYPE_CHECKING", "on_demand")
+    __all__ = sorted(name for name in {*globals(), *_LATE} if name not in _HELPERS and not name.startswith("_"))

@@ -11,50 +11,33 @@ Examples
 ('bottom', 'top', 'inner', 'outer')
 """
 
-from remodel_fenicsx.body import Cube, GeometryError, Tendon, Tube
-from remodel_fenicsx.body.shape import columns_of
-from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
-from remodel_fenicsx.fem.kinematics import FullKinematics
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.results.fields import Fields
-from remodel_fenicsx.results.run_folder import FolderTaken, RunFolder, chosen_folder
-from remodel_fenicsx.schema.settings import Cells, Material, Mesh, Remodeling, Solver
-from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.state.state import State
-from remodel_fenicsx.state.state import UnitCells
-from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Cells",
-    "Cube",
-    "Domain",
-    "Fields",
-    "FolderTaken",
-    "FullKinematics",
-    "GeometryError",
-    "Loading",
-    "Material",
-    "Mesh",
-    "Observer",
-    "Quadrature",
-    "Remodeling",
-    "RunFolder",
-    "Solver",
-    "State",
-    "Step",
-    "StepFailure",
-    "Stepper",
-    "Tendon",
-    "Tissue",
-    "Tube",
-    "UnitCells",
-    "Watcher",
-    "chosen_folder",
-    "columns_of",
-    "end_all_ranks_on_exception",
-    "times",
-]
+from remodel_fenicsx.body import Cube as Cube, GeometryError as GeometryError, Tendon as Tendon, Tube as Tube
+from remodel_fenicsx.body.shape import columns_of as columns_of
+from remodel_fenicsx.body.domain import Domain as Domain
+from remodel_fenicsx.body.loading import Loading as Loading
+from remodel_fenicsx.evolution.stepper import Step as Step, Stepper as Stepper, Watcher as Watcher, times as times
+from remodel_fenicsx.fem.kinematics import FullKinematics as FullKinematics
+from remodel_fenicsx.fem.quadrature import Quadrature as Quadrature
+from remodel_fenicsx.model.energy import Tissue as Tissue
+from remodel_fenicsx.results.columns import Observer as Observer
+from remodel_fenicsx.results.fields import Fields as Fields
+from remodel_fenicsx.results.run_folder import (
+    FolderTaken as FolderTaken,
+    RunFolder as RunFolder,
+    chosen_folder as chosen_folder,
+)
+from remodel_fenicsx.schema.settings import (
+    Cells as Cells,
+    Material as Material,
+    Mesh as Mesh,
+    Remodeling as Remodeling,
+    Solver as Solver,
+)
+from remodel_fenicsx.solver.continuation import StepFailure as StepFailure
+from remodel_fenicsx.state.state import State as State, UnitCells as UnitCells
+from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception as end_all_ranks_on_exception
+
+if not TYPE_CHECKING:  # type checkers go by the imports
+    __all__ = sorted(name for name in globals() if name != "TYPE_CHECKING" and not name.startswith("_"))

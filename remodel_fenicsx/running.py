@@ -36,8 +36,7 @@ from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.schema.toml import read_toml
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.extensions import check_extensions
+from remodel_fenicsx.system.environment import check_extensions, versions
 from remodel_fenicsx.system.guarded import LARGEST_FILE
 from remodel_fenicsx.system.interrupts import (
     Interrupted,
@@ -110,7 +109,7 @@ def run(
     >>> run(scene, "one-step")
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.results.run_lock.FolderTaken: folder one-step: is not empty; allowed is a new or an empty folder
+    remodel_fenicsx.results.recording.FolderTaken: folder one-step: is not empty; allowed is a new or an empty folder
     """
     end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written

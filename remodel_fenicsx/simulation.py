@@ -29,8 +29,7 @@ from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
 from remodel_fenicsx.schema.settings import Cells, Properties
-from remodel_fenicsx.state.state import State, by_region
-from remodel_fenicsx.state.state import UnitCells
+from remodel_fenicsx.state.state import State, UnitCells, by_region
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch import WATCHERS

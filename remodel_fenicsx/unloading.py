@@ -33,7 +33,7 @@ from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import mandel_vector
-from remodel_fenicsx.system.temporary import temporary_folder
+from remodel_fenicsx.system.files import temporary_folder
 from remodel_fenicsx.system.terminal import unsaid
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import PROFILE
 from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies import trade as rungs
 

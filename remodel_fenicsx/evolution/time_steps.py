@@ -15,7 +15,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
 from remodel_fenicsx.model.tensors import largest_change_of_length
-from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state.state import Earlier, Numbers
 

@@ -25,25 +25,23 @@ from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from remodel_fenicsx.results.history import unit_of, with_unit, words
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
-    CHAIN_COLOUR,
-    CHAIN_LIFT,
-    CHAIN_REACH,
-    CHAIN_ROOM,
-    CHAIN_WIDTH,
+    CHAIN_LOOK,
     HistoryColumns,
     LEVELS,
     RecordedRun,
     RecordingError,
     VIEWS,
+    unit_of,
+    with_unit,
+    words,
 )
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines, has_a_body
-from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import FigureError
-from remodel_fenicsx.system.temporary import temporary_folder
+from remodel_fenicsx.system.files import temporary_folder
 
 if TYPE_CHECKING:
     import pyvista
@@ -168,7 +166,7 @@ def add_body(
     is_deformed = "displacement" in found.point_data
     plotter.add_mesh(found.warp_by_vector("displacement") if is_deformed else found, **{**looks, **options})
     if with_chains and set(OF_RIBBONS) <= set(found.cell_data):
-        plotter.add_mesh(chains(found, towards), color=CHAIN_COLOUR, culling="back", **light)
+        plotter.add_mesh(chains(found, towards), color=CHAIN_LOOK["colour"], culling="back", **light)
 
 
 def chains(found: pyvista.UnstructuredGrid, towards: Array | None) -> pyvista.PolyData:
@@ -187,15 +185,15 @@ def chains(found: pyvista.UnstructuredGrid, towards: Array | None) -> pyvista.Po
     sides = np.linalg.norm(reference - np.roll(reference, 1, axis=1), axis=2)
     size = np.where(sides > 0, sides, np.inf).min(axis=1)[:, None, None]  # of a wedge one side has no length
     ends, _ = chain_lines(np.zeros((len(faces[has_area]), 3)), fields["cell_dimensions"], axes, 1.0)
-    half = CHAIN_REACH * size * ends.reshape(-1, 8, 3)[:, ::2]  # (m, 4, 3): one half of each chain
+    half = CHAIN_LOOK["reach"] * size * ends.reshape(-1, 8, 3)[:, ::2]  # (m, 4, 3): one half of each chain
     outward, middle = _normals(deformed), deformed.mean(axis=1, keepdims=True)
     arms = _on_plane(half @ np.swapaxes(gradient, 1, 2), outward)
-    room = CHAIN_ROOM * _room(arms, _on_plane(deformed - middle, outward), outward)
+    room = CHAIN_LOOK["room"] * _room(arms, _on_plane(deformed - middle, outward), outward)
     arms *= np.minimum(1.0, room)[..., None]
     across = np.cross(outward[:, None], arms)
     length = np.linalg.norm(across, axis=-1, keepdims=True)
-    across *= CHAIN_WIDTH / 2 * size / np.where(length > 0, length, 1.0)
-    lift = LIFT_ALONG_NORMALS * outward[:, None] if towards is None else CHAIN_LIFT * towards
+    across *= CHAIN_LOOK["width"] / 2 * size / np.where(length > 0, length, 1.0)
+    lift = LIFT_ALONG_NORMALS * outward[:, None] if towards is None else CHAIN_LOOK["lift"] * towards
     middle = middle + np.median(size) * lift
     corners = [middle - arms - across, middle + arms - across, middle + arms + across, middle - arms + across]
     points = np.stack(corners, axis=2).reshape(-1, 3)

@@ -27,8 +27,7 @@ from remodel_fenicsx._version import __version__
 from remodel_fenicsx.pictures.bodies import Pixels, Sight, View, Viewing, angle_scale, render, scale_colours
 from remodel_fenicsx.results.recording import RecordedRun, kept_times
 from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, About, FigureError, Palette, as_file
-from remodel_fenicsx.system.files import write_new
-from remodel_fenicsx.system.temporary import temporary_folder
+from remodel_fenicsx.system.files import temporary_folder, write_new
 
 PICTURES, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".webp", ".mp4")
 MOST_PANELS = 12

@@ -1,4 +1,4 @@
-"""The page as one file: template, cards, data, scripts; nothing in it asks for anything from outside."""
+"""The page as one file. Its parts, from top to bottom, are functions of the run that give a card, or None."""
 
 from __future__ import annotations
 
@@ -7,17 +7,435 @@ import hashlib
 import json
 import math
 import os
+import re
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from html import escape
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from remodel_fenicsx._version import __version__
+from remodel_fenicsx.body.shape import Column, columns_of_region
+from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.report.card import Card, ShownBody, packed
-from remodel_fenicsx.report.parts import ASSETS, ReportedRun, Story, cards, data_of
-from remodel_fenicsx.results.recording import RecordedRun, kept_times
+from remodel_fenicsx.report.card import Array, Card, ShownBody, folded, packed, section, table
+from remodel_fenicsx.results.recording import (
+    AMBIENT,
+    ANGLE_COLOURS,
+    CHAIN_LOOK,
+    HISTORY,
+    HistoryColumns,
+    LARGEST_HISTORY,
+    RecordedRun,
+    SCENE,
+    VIEWS,
+    kept_times,
+    unit_of,
+    with_unit,
+    words,
+    writer,
+)
+from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended, log_entries
 from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
-from remodel_fenicsx.system.files import read_regular, write_new, write_whole
+from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.schema.settings import Load, Properties
+from remodel_fenicsx.schema.tables import Table
+from remodel_fenicsx.schema import same_time
+from remodel_fenicsx.system.files import read_regular, typed, write_new, write_whole
+from remodel_fenicsx.system.terminal import duration
+
+
+# ---------------------------------------------------------------- how a run went, from its folder
+# How a run went, from its folder: whether it has ended and why, what it warned of.
+
+_STEP = re.compile(r"time (\S+?), ")
+SAID_UNLOADED = "unloaded: "  # as logs say it
+_RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
+
+
+@dataclass
+class Warned:
+    """A warning of a run, with others that differ from it in numbers alone."""
+
+    text: str
+    count: int
+    time: str
+
+
+@dataclass(frozen=True)
+class Story:
+    """How a run went."""
+
+    state: str
+    words: str
+    history: HistoryColumns
+    began: str
+    ended: str
+    ranks: str
+    warnings: list[Warned]
+    unloaded: str = ""
+
+    @classmethod
+    def of(cls, recording: RecordedRun) -> Story:
+        """The story of a run's folder."""
+        lives = writer(recording.path)[1]
+        history = recording.history
+        lines = log_entries(recording.path)
+        stamps = [stamp for stamp, _, _ in lines] or [""]
+        ranks = [found[1] for _, _, text in lines if (found := _RANKS.match(text))] or [""]
+        unloaded = [text for _, _, text in lines if text.startswith(SAID_UNLOADED)] or [""]
+        state, words = _state(recording, history, lives)
+        return cls(state, words, history, stamps[0], stamps[-1], ranks[-1], _warnings(lines), unloaded[-1])
+
+
+def _warnings(lines: list[tuple[str, str, str]]) -> list[Warned]:
+    found: dict[str, Warned] = {}
+    time = ""
+    for _, level, text in lines:
+        step = _STEP.match(text)
+        if level == "INFO" and step:
+            time = step[1]
+        if level not in ("WARNING", "ERROR", "CRITICAL"):
+            continue
+        first = found.setdefault(re.sub(r"\d+", "0", text), Warned(text, 0, time))
+        first.count += 1
+    return list(found.values())
+
+
+def _state(recording: RecordedRun, history: HistoryColumns, lives: bool) -> tuple[str, str]:
+    """A word, and why or where."""
+    scene, times = recording.scene, history["time"]
+    if len(times) and same_time(float(times[-1]), scene.last_time):
+        return "finished", ""
+    words = how_it_ended(recording.path)
+    if words.startswith(FAILED):
+        return "failed", words.removeprefix(FAILED)
+    at = f"at t = {float(times[-1]) if len(times) else 0.0:g} of {scene.last_time:g}"
+    if words.startswith(STOPPED):
+        return "stopped", f"{at}: {words.removeprefix(STOPPED)}"
+    if lives:
+        of = f" of {scene.time.number_of_steps}" if scene.time.tolerance is None else ""
+        return "running", f"step {max(0, len(times) - 1)}{of}, {at}"
+    return "stopped", f"{at}, without a word: it was killed"
+
+
+ASSETS = Path(__file__).with_name("assets")
+MOST_TILES = 8
+MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
+LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
+LAST = ("min_jacobian", "newton_iterations", "linear_iterations", "substeps", "seconds", "processor_seconds")
+
+
+@dataclass(frozen=True)
+class ReportedRun:
+    """All that a part may ask of a run."""
+
+    recording: RecordedRun
+    story: Story
+    body: ShownBody | None
+
+    @cached_property
+    def columns(self) -> list[Column]:
+        """Of the history, those of the shape first; none without a number."""
+        scene, history = self.recording.scene, self.story.history
+        known = {column.name: column for column in scene.columns()}
+        own = {
+            column.name
+            for column in (*scene.geometry.columns, *chain.from_iterable(map(columns_of_region, scene.regions)))
+        }
+        names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
+        if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
+            names.remove("substeps")
+        names.sort(key=lambda name: (name not in own, name in LAST))
+        return [known.get(name) or Column(name, "", "", lambda m: np.nan) for name in names]
+
+    def unit(self, column: Column) -> str:
+        """The column's unit where the scene says what it is, else nothing."""
+        return unit_of(self.recording.scene, column.unit)
+
+
+Part = Callable[[ReportedRun], Card | None]
+
+
+# ---------------------------------------------------------------- top
+def head(run: ReportedRun) -> Card:
+    """Name, how the run ended, when."""
+    story, name = run.story, run.recording.scene.name
+    dates = " to ".join(dict.fromkeys(filter(None, (story.began, story.ended))))
+    reason = f'<p class="reason">{escape(story.words)}</p>' if story.words else ""
+    html = (
+        f'<header class="whole"><h1>{escape(name)}</h1><span class="badge {story.state}">{story.state}</span>'
+        f'<span class="note">{escape(dates)}</span>{reason}</header>'
+    )
+    return Card("head", html, {"name": name, "state": story.state})
+
+
+def tiles(run: ReportedRun) -> Card | None:
+    """The shape's own columns and r/L: the last value and the first."""
+    history = run.story.history
+    found: list[str] = []
+    own = [column.name for column in run.recording.scene.geometry.columns]
+    for column in run.columns:
+        if column.name not in (*own, "max_chain_extension") or len(found) == MOST_TILES:
+            continue
+        values, unit = history[column.name][np.isfinite(history[column.name])], run.unit(column)
+        last, first = (escape(with_unit(float(values[index]), unit)) for index in (-1, 0))
+        found.append(
+            f'<div class="tile" title="{escape(column.meaning)}"><b>{last}</b>'
+            f'<span>{escape(words(column.name))}</span><span class="note">from {first}</span></div>'
+        )
+    return Card("tiles", f'<div class="tiles whole">{"".join(found)}</div>') if found else None
+
+
+# ---------------------------------------------------------------- the body
+def view(run: ReportedRun) -> Card | None:
+    """The body in space, with time, and what can be done with it."""
+    body = run.body
+    if body is None:
+        text = "The run recorded no fields (output.fields), so there is no body to be seen."
+        return Card("no_view", section("The body", f'<p class="note">{text}</p>', "whole"))
+    arrays, scales = body.arrays()
+    data = {
+        **scales, "times": [float(time) for time in body.times], "layers": len(body.whole.depth),
+        "words": run.recording.scene.geometry.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT,
+        "views": VIEWS,
+        "least_extension": 0.0 if body.extension is None else float(np.floor(20 * np.nanmin(body.extension)) / 20),
+        "chain": CHAIN_LOOK,
+    }  # fmt: skip
+    html = (ASSETS / "view.html").read_text(encoding="utf-8")
+    html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.whole.depth) - 1))
+    html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in _notes(run, body)))
+    return Card("view", html, data, arrays)
+
+
+def _ways_to_show(arrays: Mapping[str, Array]) -> str:
+    """The choices of what is shown, as far as it was recorded."""
+    ways = {
+        "both": ("angle and chains", {"angle", "edges"}), "coloured": ("chains in colour", {"angle", "edges"}),
+        "alone": ("chains alone", {"edges"}), "angle": ("angle", {"angle"}), "extension": ("r/L", {"extension"}),
+        "shape": ("shape alone", set()),
+    }  # fmt: skip
+    there = {name: text for name, (text, needed) in ways.items() if needed <= set(arrays)}
+    return "".join(f'<option value="{name}">{text}</option>' for name, text in there.items())
+
+
+def _notes(run: ReportedRun, body: ShownBody) -> list[str]:
+    """What is to be known of the view."""
+    found = []
+    if body.whole.is_turned:
+        found.append(f"Solved with the kinematics {run.recording.scene.model.kinematics!r}, shown as the whole body.")
+    if not body.is_deformed:
+        found.append("Displacements were not recorded: this is the reference body.")
+    if len(body.times) < len(run.recording.times):
+        found.append(f"{len(body.times)} of {len(run.recording.times)} recorded times are kept here, to save room.")
+    return found
+
+
+def angles(run: ReportedRun) -> Card | None:
+    """The fibre angle through the body, and where the collagen points."""
+    body, shape, regions = run.body, run.recording.scene.geometry, run.recording.scene.regions
+    if body is None or body.angle is None:
+        return None
+    through, start, end = shape.depth_in_words
+    if not np.isfinite(run.story.history.get("lumen_volume", np.zeros(1))).any():
+        through = "through the body"  # its inner face encloses nothing
+    along, across = shape.angle_in_words
+    legend = '<p class="note">Red: now, mean and 10 to 90 % of the volume. Grey: other times.</p>'
+    profile = section(f"Collagen angle {through}, deformed", f'<div id="profile"></div>{legend}', "narrow")
+    rose = section("Where the collagen points, by volume", '<div id="rose"></div>', "narrow")
+    data = {"depth": body.whole.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "along": along,
+            "across": across, "colours": ANGLE_COLOURS,
+            "regions": [{"name": words(name), "from": start, "to": end}
+                        for name, (start, end) in shape.region_depths(regions).items()]}  # fmt: skip
+    return Card("angles", f'<div class="stack">{profile if len(body.whole.depth) > 1 else ""}{rose}</div>', data)
+
+
+# ---------------------------------------------------------------- curves
+def curves(run: ReportedRun) -> Card | None:
+    """The history, columns of one kind together."""
+    history = run.story.history
+    if len(history["time"]) < 2 or not run.columns:
+        return None
+    rows = np.unique(np.linspace(0, len(history["time"]) - 1, MOST_ROWS).round().astype(int))
+    groups: list[list[Column]] = []
+    for column in run.columns:
+        alike = next((group for group in groups if _together(group[0], column)), None)
+        groups.append([column]) if alike is None else alike.append(column)
+    cards, data = [], []
+    for index, group in enumerate(groups):
+        unit = run.unit(group[0])
+        title = _title([column.name for column in group])
+        cards.append(section(title, f'<div class="curve" id="curve-{index}"></div>', "third", unit))
+        series = [
+            {"name": words(column.name), "values": [_finite(value) for value in history[column.name][rows]]}
+            for column in group
+        ]
+        data.append({"title": title, "unit": unit, "series": series})
+    times = [float(time) for time in history["time"][rows]]
+    return Card("curves", f'<div class="curves whole">{"".join(cards)}</div>', {"times": times, "curves": data})
+
+
+def _together(first: Column, second: Column) -> bool:
+    """Whether two columns are drawn in one frame: of one unit, and their names begin or end alike."""
+    a, b = first.name.split("_"), second.name.split("_")
+    return first.unit == second.unit and len(a) > 1 and len(b) > 1 and (a[-1] == b[-1] or a[:2] == b[:2])
+
+
+def _title(names: list[str]) -> str:
+    """What names have in common."""
+    if len(names) == 1:
+        return words(names[0])[0].upper() + words(names[0])[1:]
+    parts = [name.split("_") for name in names]
+    starts = [same[0] for same in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
+    common = words("_".join(starts or parts[0][-1:]))
+    return common[0].upper() + common[1:]
+
+
+def _finite(value: float) -> float | None:
+    return float(f"{value:.7g}") if np.isfinite(value) else None
+
+
+# ---------------------------------------------------------------- in words
+def facts(run: ReportedRun) -> Card:
+    """What was run."""
+    scene, story = run.recording.scene, run.story
+    shape, mesh, remodeling = scene.geometry, scene.mesh, scene.remodeling
+    sizes = ", ".join(
+        f"{words(name)} {value:g}" for name, value in shape.model_dump().items() if isinstance(value, (int, float))
+    )
+    given = f"; {story.unloaded}" if story.unloaded else ""
+    count = f", {len(run.recording.elements):,} in number" if run.body else ""
+    name = KINEMATICS[scene.model.kinematics].element(mesh.element)
+    seed = f", seed {scene.cells.seed}" if scene.has_random_cells else ""
+    cells, kappa = _by_region(scene, _cells), _by_region(scene, lambda properties: f"{properties.kappa:g}")
+    loads = "; ".join(f"{words(name)} {load.value:g}{_ramp(load)}" for name, load in scene.loads.items())
+    seconds = story.history.get("seconds", np.zeros(0))
+    solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
+    steps = f"{max(0, len(story.history['time']) - 1)}{'' if scene.time.chooses else ' of'}"
+    ranks = f", {story.ranks} ranks" if story.ranks not in ("", "1") else ""
+    rows = [
+        ("Body", f"{shape.name}: {sizes}{f' in {shape.length_unit}' if shape.length_unit else ''}{given}"),
+        *([] if scene.natural.is_of_the_mesh else [("Free of stress", _natural(scene))]),
+        ("Mesh", f"{name} elements{count}, degree {mesh.degree}, refinement {mesh.refinement}, {mesh.formulation}"),
+        ("Kinematics", f"{scene.model.kinematics}: {KINEMATICS[scene.model.kinematics].meaning}"),
+        ("Supports", f"ends {scene.supports.ends}"),
+        ("Cells", f"{cells}{seed}, axes {scene.cells.axes}"),
+        ("Loads", loads or "none"),
+        *([("Load cases", _load_cases(scene))] if scene.cases else []),
+        ("Material", scene.summary()),
+        ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
+                       f"coupling {remodeling.coupling}, kappa {kappa}"),
+        *([("Turnover", _keys(remodeling.turnover))] if remodeling.turnover.is_on else []),
+        ("Time", f"{steps} {scene.time.in_words()}{solving}{ranks}"),
+    ]  # fmt: skip
+    return Card("facts", section("What was run", table(rows)))
+
+
+def _ramp(load: Load) -> str:
+    """By what it is multiplied over time."""
+    return f", times {', '.join(f'{factor:g} at t = {time:g}' for time, factor in load.ramp)}"
+
+
+def _natural(scene: Scene) -> str:
+    """In which pieces the tissue is, and how they were stretched."""
+    layers = [_keys(layer) for layer in scene.natural.layers]
+    return "; ".join([f"opening angle {scene.natural.opening_angle:g}°", *(f"layer {layer}" for layer in layers)])
+
+
+def _keys(table: Table) -> str:
+    """All keys of a table that have a value."""
+    found = table.model_dump(exclude_none=True).items()
+    return ", ".join(
+        f"{words(name)} {value:g}" if isinstance(value, float) else f"{words(name)} {value}" for name, value in found
+    )
+
+
+def _by_region(scene: Scene, in_words: Callable[[Properties], str]) -> str:
+    """What holds in the body, or in each region by its name where they differ."""
+    found = {name: in_words(properties) for name, properties in scene.properties().items()}
+    if len(set(found.values())) == 1:
+        return next(iter(found.values()))
+    return "; ".join(f"{name or 'elsewhere'}: {text}" for name, text in found.items())
+
+
+def _load_cases(scene: Any) -> str:
+    """Weight and factors of each."""
+    factors = (
+        ", ".join(f"{words(name)} times {factor:g}" for name, factor in case.loads.items()) for case in scene.cases
+    )
+    return "; ".join(
+        f"{case.weight:.3g} of the time{': ' if f else ''}{f}" for case, f in zip(scene.cases, factors, strict=True)
+    )
+
+
+def _cells(properties: Properties) -> str:
+    return f"{properties.cells.initial}, r0 = {properties.cells.end_to_end_length:g}"
+
+
+def warnings(run: ReportedRun) -> Card:
+    """What the run warned of, and how to run it again."""
+    found = run.story.warnings
+    items = "".join(
+        f"<li>{escape(one.text)} "
+        f'<span class="note">({"once" if one.count == 1 else f"{one.count} times"}'
+        f'{f", first after t = {escape(one.time)}" if one.time else ""})</span></li>'
+        for one in found
+    )
+    said = f"<ul>{items}</ul>" if found else '<p class="note">None: the run raised no warnings.</p>'
+    name = run.recording.scene.name
+    again = f"{typed()} run scene.toml -o {shlex.quote(f'results/{name}-again')}"
+    buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a>' for file in _files(run))
+    html = section(f"Warnings ({sum(one.count for one in found)})", said + f'<h2>Run it again</h2><pre id="again">'
+                   f'{escape(again)}</pre><p><button id="copy">copy</button> {buttons}</p>')  # fmt: skip
+    arrays = {file: Array(np.frombuffer(data, dtype=np.uint8)) for file, data in _files(run).items()}
+    return Card("warnings", html, {"files": list(arrays)}, arrays)
+
+
+def _files(run: ReportedRun) -> dict[str, bytes]:
+    """The downloads; a history that is larger than a page may be stays where it is."""
+    found = {name: read_regular(run.recording.path / name, LARGEST_HISTORY) for name in (SCENE, HISTORY)}
+    return {name: data for name, data in found.items() if len(data) <= LARGEST_DOWNLOAD}
+
+
+def scene(run: ReportedRun) -> Card:
+    """The whole scene, with its comments."""
+    text = read_regular(run.recording.path / SCENE, LARGEST_HISTORY).decode(errors="replace")
+    return Card("scene", folded("The whole scene, as run", f"<pre>{escape(text)}</pre>"))
+
+
+def versions(run: ReportedRun) -> Card:
+    """Versions that the run wrote, and the licences of what is in the page."""
+    rows = [*run.recording.versions.items(), ("this page", f"remodel_fenicsx {__version__}")]
+    licences = "".join(
+        f"<h3>{escape(name)}</h3><pre>{escape((ASSETS / f'LICENSE.{file}').read_text(encoding='utf-8'))}</pre>"
+        for name, file in (("three.js", "three"), ("uPlot", "uplot"))
+    )
+    note = "<p>This page has the code of three.js and uPlot in it.</p>"
+    return Card("versions", folded("Versions and licences", table(rows) + note + licences))
+
+
+PAGE_PARTS: list[Part] = [head, tiles, view, angles, curves, facts, warnings, scene, versions]
+"""In the order of the page."""
+
+
+def cards(run: ReportedRun) -> list[Card]:
+    """Of all parts that have something to say."""
+    return [card for card in (part(run) for part in PAGE_PARTS) if card is not None]
+
+
+def data_of(cards_: list[Card]) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Data by card and arrays by card and name, as the script takes them."""
+    data = {card.name: dict(card.data) for card in cards_}
+    return data, {f"{card.name}.{name}": array for card in cards_ for name, array in card.arrays.items()}
+
+
+# ---------------------------------------------------------------- the page as one file
+# Template, cards, data, scripts; nothing in it asks for anything from outside.
 
 REPORT = "report.html"
 PAGE_SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times

@@ -223,15 +223,13 @@ class Measurement:
         return self._face(face, deformed).area()
 
     def _face(self, face: str, deformed: bool) -> _FaceIntegral:
-        found: _FaceIntegral = self.tool((face, deformed), lambda: _FaceIntegral(self.observer, face, deformed))
-        return found
+        return self.tool((face, deformed), lambda: _FaceIntegral(self.observer, face, deformed))
 
     def end_force(self, face: str) -> EndForce:
         """Of a tube whose inner face has this name, at the end z = length."""
         length = self.domain.dimensions["length"]
         measure = self.tool(("end force", face), lambda: _EndForceForms(self.equilibrium, face, length))
-        found: EndForce = self.tool_of_step(("end force", face), measure)
-        return found
+        return self.tool_of_step(("end force", face), measure)
 
     def lumen_volume(self) -> float:
         """Of an own body (`MeshDomain`): volume inside the deformed inner face, with flat caps on its rims."""

@@ -15,8 +15,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS
-from remodel_fenicsx.system.files import write_new
-from remodel_fenicsx.system.temporary import temporary_folder
+from remodel_fenicsx.system.files import temporary_folder, write_new
 
 
 def write_vtu(

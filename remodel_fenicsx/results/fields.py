@@ -22,7 +22,7 @@ from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_ch
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION, UNLOADED
-from remodel_fenicsx.schema.times import SAME_TIME, same_time
+from remodel_fenicsx.schema import SAME_TIME, same_time
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state.state import State
 

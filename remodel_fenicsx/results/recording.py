@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import os
+import re
+import socket
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -15,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.schema.times import same_time
-from remodel_fenicsx.system.extensions import check_extensions
-from remodel_fenicsx.system.files import check_regular, read_regular
+from remodel_fenicsx.schema import same_time
+from remodel_fenicsx.system.environment import check_extensions
+from remodel_fenicsx.system.files import check_regular, open_own, part_of, read_regular
 
 if TYPE_CHECKING:
     import h5py
@@ -34,11 +37,13 @@ ANGLE_COLOURS = (
     "#a50026", "#c21c27", "#dc3b2c", "#ed5f3c", "#f7844e", "#fcaa5f", "#fec87a", "#fee496", "#fff6b1",
     "#f6fbd0", "#e4f4f1", "#c7e7f1", "#a8d6e8", "#87bdd9", "#69a0ca", "#4d7fb9", "#3d5ba7", "#313695",
 )  # fmt: skip
-CHAIN_COLOUR = (0.08, 0.08, 0.10)
-CHAIN_REACH = 0.39  # half a chain's length over the shorter side of its face, both undeformed
-CHAIN_ROOM = 0.78  # how far a chain goes at most, over the way from the middle to the edge of its face
-CHAIN_WIDTH = 0.06  # over the shorter side
-CHAIN_LIFT = 0.2  # towards the eye, over the same: faces need not be plane
+CHAIN_LOOK: dict[str, Any] = {  # as the page takes it
+    "colour": (0.08, 0.08, 0.10),
+    "reach": 0.39,  # half a chain's length over the shorter side of its face, both undeformed
+    "room": 0.78,  # how far a chain goes at most, over the way from the middle to the edge of its face
+    "width": 0.06,  # over the shorter side
+    "lift": 0.2,  # towards the eye, over the same: faces need not be plane
+}
 AMBIENT = 0.8  # share of a colour that does not depend on where its face looks: it must mean the same everywhere
 VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}  # where the eye is, from the middle of the body
 
@@ -102,8 +107,6 @@ def _tried_again(read: Callable[..., Any]) -> Any:
 
     @wraps(read)
     def reading(self: RecordedRun, *arguments: Any, **others: Any) -> Any:
-        from remodel_fenicsx.results.run_lock import writer  # which needs names of this module
-
         for _ in range(TRIES):
             try:
                 return read(self, *arguments, **others)
@@ -374,9 +377,124 @@ def _block(dataset: h5py.Dataset, start: int, length: int) -> Array:
     return values
 
 
+# ---------------------------------------------------------------- columns, numbers and units as people read them
+
+WORDS = {"max_chain_extension": "largest r/L", "min_jacobian": "smallest J", "seconds": "seconds a step"}
+
+
+def words(name: str) -> str:
+    """A column's name."""
+    known = next((known for known in WORDS if f"{name}_".startswith(f"{known}_")), "")
+    return WORDS.get(known, "") + name.removeprefix(known).replace("_", " ")
+
+
+def number(value: float) -> str:
+    """Three digits, all of them: 3.40 beside 2.45."""
+    if value == 0:
+        return "0"
+    return f"{value:#.3g}".rstrip(".") if 1e-3 <= abs(value) < 1e5 else f"{value:.2e}"
+
+
+def with_unit(value: float, unit: str) -> str:
+    """A number and its unit."""
+    return number(value) + (unit if unit == "°" else f" {unit}" if unit else "")
+
+
+def unit_of(scene: Any, dimension: str) -> str:
+    """The unit of a `Column` by what it measures, where the scene says what it is, else nothing."""
+    names = {"stress": scene.material.stress_unit, "length": scene.geometry.length_unit, "degrees": "°"}
+    parts = re.split(r"(\w+)", dimension.replace("force", "stress length^2"))
+    if not all(names.get(part, part) for part in parts if part):
+        return ""
+    return "".join(names.get(part) or part for part in parts).replace("^2", "²").replace("^3", "³")
+
+
 def _in_words(times: Array) -> str:
     """Recorded times: all of a few, the first and the last ones of many."""
     if not len(times):
         return "none"
     shown = [f"{time:g}" for time in times]
     return ", ".join(shown if len(shown) <= 8 else [*shown[:3], "...", *shown[-2:]])
+
+
+# ---------------------------------------------------------------- who writes in a folder
+# One run at a time, and others can see which.
+
+LOCK = "run.lock"
+_WRITER = re.compile(r"process \d+ on [\w.-]+( \(\d+ ranks\))?")
+
+
+class FolderTaken(RemodelError, ValueError):
+    """The folder asked for holds something already, or a run writes in it.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from mpi4py import MPI
+    >>> from remodel_fenicsx import parts
+    >>> Path("taken").mkdir()
+    >>> written = Path("taken/notes.txt").write_text("mine")
+    >>> parts.chosen_folder("taken", "cube", MPI.COMM_WORLD)
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.results.recording.FolderTaken: folder taken: is not empty; allowed is a new or an empty folder
+    """
+
+
+class RunLock:
+    """This process writes alone in a folder, as long as it lives: the system gives back a lock of a killed process."""
+
+    def __init__(self, folder: Path, ranks: int = 1):
+        self._path = folder / LOCK
+        folder.mkdir(parents=True, exist_ok=True)
+        self._descriptor = open_own(self._path, os.O_RDWR | os.O_CREAT)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            while not self._is_at_its_place():  # the writer before has taken the file away meanwhile
+                os.close(self._descriptor)
+                self._descriptor = open_own(self._path, os.O_RDWR | os.O_CREAT)
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(self._descriptor)
+            if isinstance(error, BlockingIOError):
+                raise FolderTaken(f"{folder}: {writer(folder)[0] or 'another process'} writes in it") from None
+            raise
+        others = f" ({ranks} ranks)" if ranks > 1 else ""
+        os.ftruncate(self._descriptor, 0)
+        os.write(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}{others}\n".encode())
+
+    def _is_at_its_place(self) -> bool:
+        return self._path.exists() and os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
+
+    def close(self) -> None:
+        """Let others in."""
+        self._path.unlink(missing_ok=True)
+        os.close(self._descriptor)
+
+    def __enter__(self) -> RunLock:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def writer(folder: Path) -> tuple[str | None, bool]:
+    """The process that writes in a folder, or wrote in it when it was killed, in words; and whether it lives."""
+    try:
+        descriptor = open_own(folder / LOCK, os.O_RDONLY)
+    except FileNotFoundError:
+        return None, False
+    with open(descriptor, "rb") as file:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            lives = False
+        except BlockingIOError:
+            lives = True
+        words = file.read(4096).decode(errors="replace").strip()
+    return words if _WRITER.fullmatch(words) else None, lives  # none: just being written, or of another kind
+
+
+def is_vacant(folder: Path) -> bool:
+    """Whether a folder is empty, or holds only what a process leaves that is killed before its scene has its name."""
+    left = {LOCK, part_of(Path(SCENE)).name}
+    return {entry.name for entry in folder.iterdir()} <= left and not writer(folder)[1]

@@ -1,23 +1,38 @@
-"""What a run leaves in its folder: history.csv and the scene as run. Only rank 0 writes."""
+"""What a run leaves in its folder: history.csv (a row for each accepted step) and the scene as run. Rank 0 writes."""
 
 from __future__ import annotations
 
+import csv
+import errno
+import io
 import itertools
+import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+import time as clock
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.results.history import History, LastStep, size_of_rows
-from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS, HISTORY, LOG, SCENE, RecordingError
-from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, is_vacant
+from remodel_fenicsx.results.recording import (
+    CHAIN_LINES,
+    FIELDS,
+    FolderTaken,
+    HISTORY,
+    LARGEST_HISTORY,
+    LOG,
+    RecordingError,
+    RunLock,
+    SCENE,
+    is_vacant,
+)
 from remodel_fenicsx.results.vtkhdf import check_file
-from remodel_fenicsx.system.files import open_own, write_whole
+from remodel_fenicsx.schema import same_time
+from remodel_fenicsx.system.files import open_own, read_regular, write_whole
 
 DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
 
@@ -130,6 +145,111 @@ def forget_steps(folder: Path) -> None:
     """Take away what a run has kept that was killed before its first checkpoint: it starts again."""
     for name in (HISTORY, FIELDS, CHAIN_LINES):
         (folder / name).unlink(missing_ok=True)
+
+
+# ---------------------------------------------------------------- history.csv
+# Whole rows only, whatever happens.
+
+FLUSHED_AFTER = 0.5  # seconds: rows that come faster are brought to the disk together
+
+
+class LastStep(NamedTuple):
+    """Where a run goes on: columns of its history, number and time of the last step that was done."""
+
+    columns: Sequence[str]
+    number: int
+    time: float
+
+
+class History:
+    """history.csv: one row per accepted step, in the file as soon as the step is accepted."""
+
+    def __init__(self, path: Path, after: LastStep | None = None):
+        size = 0 if after is None else size_of_rows(path, after)
+        flags = os.O_RDWR | (os.O_CREAT | os.O_EXCL if after is None else 0)
+        self._path, self._file = path, open(open_own(path, flags), "r+b", buffering=0)
+        self._columns = None if after is None else list(after.columns)
+        self._sizes = [size]  # bytes up to the end of the last whole row, and before of the one before it
+        self._flushed_at, self._is_flushed = -math.inf, True
+        self._cut()
+
+    def append(self, row: dict[str, float]) -> None:
+        """Write one row; the first one decides the columns."""
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, fieldnames=self._columns or list(row), lineterminator="\n")
+        if not self._sizes[-1]:
+            writer.writeheader()
+        writer.writerow({key: _number(value) for key, value in row.items()})
+        self._write(text.getvalue().encode())
+        self._columns = list(writer.fieldnames)
+
+    def _write(self, data: bytes) -> None:
+        """All of it or nothing: a number that was cut short would read as another number."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+            self._is_flushed = False
+            if clock.monotonic() - self._flushed_at >= FLUSHED_AFTER:
+                self.flush()
+        except OSError:
+            self._cut()
+            raise
+        self._sizes = [self._sizes[-1], self._sizes[-1] + len(data)]
+
+    def flush(self) -> None:
+        """Bring all rows to the disk."""
+        if not self._is_flushed:
+            os.fsync(self._file.fileno())
+            if os.fstat(self._file.fileno()).st_nlink == 0:
+                lost = "the rows of this run, and what else was in its folder"
+                raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", self._path)
+            self._flushed_at, self._is_flushed = clock.monotonic(), True
+
+    def drop_last(self) -> None:
+        """Take the last row back; only once after each row."""
+        self._sizes.pop()
+        self._cut()
+
+    def _cut(self) -> None:
+        self._file.truncate(self._sizes[-1])
+        self._file.seek(self._sizes[-1])
+
+    def close(self) -> None:
+        """Flush and close the file; more than once does no harm."""
+        if not self._file.closed:
+            try:
+                self.flush()
+            finally:
+                self._file.close()
+
+
+def size_of_rows(path: Path, after: LastStep) -> int:
+    """Bytes of a history's head and of its rows up to a step."""
+    rows = after.number + 1
+    lines = read_regular(path, LARGEST_HISTORY).splitlines(keepends=True)[: rows + 1]
+    try:
+        texts = [line.decode("utf-8") for line in lines]
+        found, *read = csv.reader(texts)
+        whole = len(read) == rows and texts[-1].endswith("\n")
+        right = whole and same_time(float(read[-1][found.index("time")]), after.time)
+    except (ValueError, IndexError, csv.Error):
+        right = False
+    if not right:
+        raise RecordingError(f"{path}: lacks rows: the checkpoint belongs to {rows} rows up to time {after.time:g}")
+    if found != list(after.columns):
+        raise RecordingError(f"{path}: has other columns than this run; output.columns must stay as it was")
+    return sum(map(len, lines))
+
+
+def _number(value: float) -> str:
+    """Shortest text that reads back as the same number; none for what was not computed."""
+    if math.isnan(value):
+        return ""
+    return str(value) if isinstance(value, int) else repr(float(value))
+
+
+# ---------------------------------------------------------------- the folder
 
 
 class RunFolder(Watcher):

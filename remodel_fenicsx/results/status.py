@@ -14,16 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from remodel_fenicsx.results.checkpoint_file import time_of_checkpoint
-from remodel_fenicsx.results.recording import (
-    HISTORY,
-    LARGEST_HISTORY,
-    LOG,
-    STUDY,
-    RecordedRun,
-    RecordingError,
-)
-from remodel_fenicsx.results.run_lock import writer
-from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, LOG, STUDY, RecordedRun, RecordingError, writer
+from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.files import ForeignFileError, MOST_RUNS, read_regular, typed
 from remodel_fenicsx.system.terminal import duration
 

@@ -38,7 +38,7 @@ from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OV
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import IN_A_LIST, OneOf, Table, fault, named, quoted, refuse, shown
-from remodel_fenicsx.schema.times import is_multiple, same_time
+from remodel_fenicsx.schema import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
 if TYPE_CHECKING:

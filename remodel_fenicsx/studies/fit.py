@@ -26,7 +26,7 @@ from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.report.card import Card, folded, section, table as card_table
 from remodel_fenicsx.report.page import page_with
 from remodel_fenicsx.results.run_folder import chosen_folder
-from remodel_fenicsx.results.run_lock import RunLock
+from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure

@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.results.history import unit_of, words
+from remodel_fenicsx.results.recording import unit_of, words
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.files import write_whole

@@ -16,8 +16,7 @@ from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.running import with_files_kept
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.simulation import checked_domain, mesh_of, with_choices
-from remodel_fenicsx.system.files import TakenError, part_of
-from remodel_fenicsx.system.temporary import temporary_folder
+from remodel_fenicsx.system.files import TakenError, part_of, temporary_folder
 from remodel_fenicsx.unloading import unloaded
 
 

@@ -17,19 +17,20 @@ from mpi4py import MPI
 from remodel_fenicsx.errors import PAUSED, RemodelError, SOLVE_FAILED
 from remodel_fenicsx.results.recording import (
     HISTORY,
+    SCENE,
+    STUDY,
     HistoryColumns,
     RecordedRun,
     RecordingError,
-    SCENE,
-    STUDY,
+    RunLock,
     read_history,
     steps_recorded,
+    writer,
 )
-from remodel_fenicsx.results.run_lock import RunLock, writer
 from remodel_fenicsx.running import with_files_kept
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
-from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.simulation import with_choices
 from remodel_fenicsx.studies.page import Answer
 from remodel_fenicsx.system.children import Worker, cores, wait_for_one

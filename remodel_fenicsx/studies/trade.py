@@ -22,7 +22,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import EXACT, PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema.times import same_time
+from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import COLOURS, Answer
 from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, Study, TooFewRuns
 from remodel_fenicsx.system.files import make_own_folder, write_whole

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from remodel_fenicsx.system.extensions import extensions_for_children
+from remodel_fenicsx.system.environment import extensions_for_children
 from remodel_fenicsx.system.files import open_own
 
 SECONDS_TO_END = 30.0  # seconds

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.results.recording import read_history
-from remodel_fenicsx.system.extensions import EXTENSIONS
+from remodel_fenicsx.system.environment import EXTENSIONS
 from tests.command.test_run import PROJECT, run
 from tests.forks import forked
 

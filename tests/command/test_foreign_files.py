@@ -432,7 +432,7 @@ def test_a_run_whose_folder_is_deleted_ends_with_5(tmp_path: Path) -> None:
     program = f"""
 import shutil, sys
 from remodel_fenicsx import cli
-from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.run_folder import History
 append = History.append
 def append_and_delete(history, row):
     append(history, row)

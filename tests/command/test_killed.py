@@ -22,7 +22,7 @@ import pytest
 
 from remodel_fenicsx import Recording
 from remodel_fenicsx.results import checkpoint
-from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.run_folder import History
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.results.run_folder import FolderTaken
 from remodel_fenicsx.results.vtkhdf import TransientGrid

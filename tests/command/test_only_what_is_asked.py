@@ -18,7 +18,7 @@ from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem import assembly, jit
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results import history
+from remodel_fenicsx.results import run_folder
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import FIELDS_BY_NAME
 from remodel_fenicsx.solver.continuation import Blend, Work
@@ -172,8 +172,8 @@ def test_stress_that_nobody_writes_is_not_compiled(monkeypatch: pytest.MonkeyPat
 def test_rows_that_come_fast_are_flushed_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice a second, before a checkpoint, and at the end; every row is in the file at once."""
     flushes, now = Calls(monkeypatch, os, "fsync"), 0.0
-    monkeypatch.setattr(history.clock, "monotonic", lambda: now)
-    written = history.History(tmp_path / "history.csv")
+    monkeypatch.setattr(run_folder.clock, "monotonic", lambda: now)
+    written = run_folder.History(tmp_path / "history.csv")
     for number in range(101):
         now = number / 50
         written.append({"time": float(number)})
@@ -193,10 +193,10 @@ def test_the_rows_of_a_checkpoint_are_on_the_disk_before_it(tmp_path: Path, monk
     order: list[str] = []
     from remodel_fenicsx.results import checkpoint
 
-    write, flush = checkpoint.write_checkpoint, history.History.flush
+    write, flush = checkpoint.write_checkpoint, run_folder.History.flush
     monkeypatch.setattr(checkpoint, "write_checkpoint", lambda *a: (order.append("checkpoint"), write(*a)))
-    monkeypatch.setattr(history.History, "flush", lambda self: (order.append("rows"), flush(self)))
-    monkeypatch.setattr(history, "FLUSHED_AFTER", 1e9)
+    monkeypatch.setattr(run_folder.History, "flush", lambda self: (order.append("rows"), flush(self)))
+    monkeypatch.setattr(run_folder, "FLUSHED_AFTER", 1e9)
     run(scene(output={"fields": False, "checkpoint": 2}), tmp_path / "run", SELF)
     assert [entry for entry in order if entry][-3:] == ["rows", "checkpoint", "rows"]
     assert order.count("checkpoint") == 2

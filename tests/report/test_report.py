@@ -23,10 +23,10 @@ from remodel_fenicsx import Recording, cli
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
 from remodel_fenicsx.report.card import ANGLE_STEPS, NO_ANGLE, of_angles
-from remodel_fenicsx.report.parts import Story
+from remodel_fenicsx.report.page import Story
 from remodel_fenicsx.results.recording import ANGLE_COLOURS, HistoryColumns, kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
-from remodel_fenicsx.results.history import unit_of, with_unit
+from remodel_fenicsx.results.recording import unit_of, with_unit
 from remodel_fenicsx.scene.scene import preset_scene
 from tests.forks import forked
 from tests.report.conftest import DEMOS, Recorded
@@ -275,7 +275,7 @@ def test_a_hundred_thousand_elements_fit(monkeypatch: pytest.MonkeyPatch) -> Non
     )
     story = Story("finished", "", HistoryColumns(time=times, pressure=times), "", "", "1", [])
     monkeypatch.setattr(page.Story, "of", lambda recording: story)
-    monkeypatch.setattr("remodel_fenicsx.report.parts.read_regular", lambda path, most: b"")
+    monkeypatch.setattr("remodel_fenicsx.report.page.read_regular", lambda path, most: b"")
     text = page.page_of(run)  # type: ignore[arg-type]
     assert 10e6 < len(text) <= 20e6 and len(Decoded(text).view["times"]) >= 5
 
@@ -316,7 +316,7 @@ def test_the_state_of_a_run_is_said(folder: Path, lines: str, rows: str, state: 
 
 
 def test_a_run_that_goes_on_is_said_to(folder: Path) -> None:
-    from remodel_fenicsx.results.run_lock import RunLock
+    from remodel_fenicsx.results.recording import RunLock
 
     with RunLock(folder):
         story = Story.of(Recording(folder))

@@ -11,7 +11,7 @@ import pytest
 
 from remodel_fenicsx.body.shape import COLUMNS
 from remodel_fenicsx.evolution.stepper import Step
-from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.run_folder import History
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.equilibrium import Extension

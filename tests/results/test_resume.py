@@ -34,7 +34,7 @@ from remodel_fenicsx.results.checkpoint_file import (
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.schema.settings import COUPLINGS, CouplingKind
 from remodel_fenicsx.system.files import typed
-from remodel_fenicsx.results.run_lock import FolderTaken, RunLock, writer
+from remodel_fenicsx.results.recording import FolderTaken, RunLock, writer
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import preset_scene

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from remodel_fenicsx import Recording, RecordingError, cli, preset_scene, run as run_scene
-from remodel_fenicsx.results.run_lock import RunLock
+from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.system.files import write_new
-from remodel_fenicsx.system.temporary import temporary_folder
+from remodel_fenicsx.system.files import temporary_folder
 
 # a command that is killed at its N-th write, rename or link that has to do with a file of this name
 KILLED = """
@@ -70,7 +70,7 @@ def test_a_new_file_is_whole_or_not_there(tmp_path: Path) -> None:
 def test_the_temporary_folder_of_a_killed_process_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the next one; that of a process that lives stays."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    program = "import time; from remodel_fenicsx.system.temporary import temporary_folder\n"
+    program = "import time; from remodel_fenicsx.system.files import temporary_folder\n"
     program += "with temporary_folder() as folder:\n    (folder / 'job').touch()\n    time.sleep(100)"
     command = [sys.executable, "-c", program]
     killed, alive = (subprocess.Popen(command, env=os.environ | {"TMPDIR": str(tmp_path)}) for _ in range(2))

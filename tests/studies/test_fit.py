@@ -18,7 +18,7 @@ from PIL import Image
 
 from benchmarks.recovery import MOST, TRUTH as RECOVERED, fitted, noisy, tables, tube as tube_of_the_benchmark
 from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, read_scene
-from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
+from remodel_fenicsx.results.recording import FolderTaken, RunLock
 from remodel_fenicsx.schema.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
 from remodel_fenicsx.studies.measurements import read_measurements

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli, preset_scene
-from remodel_fenicsx.results.run_lock import FolderTaken, RunLock
+from remodel_fenicsx.results.recording import FolderTaken, RunLock
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.studies import stability
 from remodel_fenicsx.studies.sweep import ensemble, latin_hypercube, read_axes

@@ -15,7 +15,7 @@ from remodel_fenicsx import Scene, Simulation, read_scene
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.fem.solver_methods import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
-from remodel_fenicsx.results.history import History
+from remodel_fenicsx.results.run_folder import History
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.solver.continuation import StepFailure
