@@ -80,7 +80,9 @@ class Recording(RecordedRun):
         Raises
         ------
         ReportError
-            If the file is there already, or a report.html that this package has not made; a ValueError.
+            If this package has not made the report.html that is there; a ValueError.
+        FileExistsError
+            If the file is there already; a ValueError too.
         RecordingError
             If the folder is damaged.
         OSError
@@ -186,6 +188,8 @@ class Recording(RecordedRun):
         ------
         FigureError
             One line: what is not allowed, or that nothing can be drawn here; a ValueError.
+        FileExistsError
+            If the file is there already; a ValueError too.
         RecordingError
             If the folder is damaged.
         OSError

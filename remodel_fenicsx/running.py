@@ -38,13 +38,7 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system.environment import check_extensions, versions
 from remodel_fenicsx.system.guarded import LARGEST_FILE
-from remodel_fenicsx.system.interrupts import (
-    Interrupted,
-    Paused,
-    StopRequest,
-    end_all_ranks_on_exception,
-    stopping_at_once,
-)
+from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 from remodel_fenicsx.unloading import as_unloaded
@@ -111,15 +105,15 @@ def run(
         ...
     remodel_fenicsx.results.recording.FolderTaken: folder one-step: is not empty; allowed is a new or an empty folder
     """
-    end_all_ranks_on_exception()
+    interrupts.end_all_ranks_on_exception()
     # what the scene asks for is built before anything is written
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
-    with StopRequest() as stop, ExitStack() as body:
+    with interrupts.StopRequest() as stop, ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
             scene = body.enter_context(as_unloaded(scene, comm))
-            simulation = _built(_with_sums(scene, comm), comm)
+            simulation = body.enter_context(_built(_with_sums(scene, comm), comm))
             place = place or chosen_folder(None, scene.name, comm)
-        with _closing(simulation), locked(place, comm, new=True):
+        with locked(place, comm, new=True):
             _record(simulation, place, stop, held, quiet, deadline, report, watchers=watchers)
     return place
 
@@ -133,18 +127,15 @@ def resume(
     report: bool = True,
 ) -> Path:
     """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet."""
-    end_all_ranks_on_exception()
+    interrupts.end_all_ranks_on_exception()
     place = Path(folder)
-    with StopRequest() as stop, locked(place, comm, new=False):
+    with interrupts.StopRequest() as stop, locked(place, comm, new=False), ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
             scene, checkpoint = _kept(place, overrides, comm)
-            simulation = _built(scene, comm)
-        with _closing(simulation):
+            simulation = body.enter_context(_built(scene, comm))
             if comm.bcast(checkpoint is not None):
-                with hold_log(comm.rank, quiet=quiet) as more:
-                    restore_state(simulation.state, checkpoint)
-                held += more
-            _record(simulation, place, stop, held, quiet, deadline, report, resumes=True)
+                restore_state(simulation.state, checkpoint)
+        _record(simulation, place, stop, held, quiet, deadline, report, resumes=True)
     return place
 
 
@@ -195,13 +186,22 @@ def _say_changes(begun: dict[str, str], now: dict[str, str]) -> None:
             log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
 
 
-def _built(scene: Scene, comm: MPI.Intracomm) -> Simulation:
+@contextmanager
+def _built(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
+    """It is closed at the end, if all ranks come there: the others would wait for ever."""
     try:
-        with stopping_at_once(), _options_blamed(scene):
-            return Simulation(scene, comm)
-    except Interrupted as interruption:
+        with interrupts.stopping_at_once(), _options_blamed(scene):
+            simulation = Simulation(scene, comm)
+    except interrupts.Interrupted as interruption:
         interruption.kept = "nothing was computed"
         raise
+    try:
+        yield simulation
+    except BaseException as error:
+        if comm.size == 1 or getattr(error, "on_all_ranks", False):
+            simulation.close()
+        raise
+    simulation.close()
 
 
 @contextmanager
@@ -216,22 +216,10 @@ def _options_blamed(scene: Scene) -> Iterator[None]:
         raise SceneError(f"solver.petsc_options = {shown(given)}: {rule}") from error
 
 
-@contextmanager
-def _closing(simulation: Simulation) -> Iterator[None]:
-    """Close it at the end, if all ranks come there: the others would wait for ever."""
-    try:
-        yield
-    except BaseException as error:
-        if simulation.domain.comm.size == 1 or getattr(error, "on_all_ranks", False):
-            simulation.close()
-        raise
-    simulation.close()
-
-
 def _record(
     simulation: Simulation,
     place: Path,
-    stop: StopRequest,
+    stop: interrupts.StopRequest,
     held: list[logging.LogRecord],
     quiet: bool,
     deadline: float | None,
@@ -285,7 +273,7 @@ def _record(
             with _options_blamed(scene):
                 for _ in simulation.steps(followers):
                     pass
-        except (StepFailure, Interrupted, Paused) as reason:
+        except (StepFailure, interrupts.Interrupted, interrupts.Paused) as reason:
             if isinstance(reason, StepFailure):
                 log.info(FAILED + "%s. %s", reason, reason.refusal)
                 reason.kept += ", and run --resume goes on from there"
@@ -293,7 +281,7 @@ def _record(
                 log.info(STOPPED + "%s", reason)
             if reason.on_all_ranks:
                 checkpoints.write()
-            if not isinstance(reason, (Interrupted, Paused)):  # these shall end soon
+            if not isinstance(reason, (interrupts.Interrupted, interrupts.Paused)):  # these shall end soon
                 leave_report()
             raise
         except Exception as defect:

@@ -8,7 +8,6 @@ can draw without (EGL) gets by without that program.
 from __future__ import annotations
 
 import math
-import os
 import pickle
 import shutil
 import subprocess
@@ -16,7 +15,6 @@ import sys
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -41,6 +39,7 @@ from remodel_fenicsx.results.recording import (
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines, has_a_body
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import FigureError
+from remodel_fenicsx.system.children import environment_of_child, last_line
 from remodel_fenicsx.system.files import temporary_folder
 
 if TYPE_CHECKING:
@@ -247,15 +246,14 @@ def render(grids: Sequence[pyvista.UnstructuredGrid], view: View) -> list[Pixels
         command = [sys.executable, "-m", __name__, str(job)]
         if shutil.which("xvfb-run"):
             command = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24", *command]
-        paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYVISTA_OFF_SCREEN": "true"}
-        environment["MPLBACKEND"] = "agg"  # a notebook's own is one that only its kernel may know
+        # the backend of a notebook is one that only its kernel may know
+        environment = environment_of_child() | {"PYVISTA_OFF_SCREEN": "true", "MPLBACKEND": "agg"}
         # in the folder of the job: Python looks for modules where it is started, and that may be anybody's folder
         silent: Any = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
         child = subprocess.run(command, env=environment, cwd=folder, **silent)
         result = job.with_suffix(".npy")
         if child.returncode != 0 or not result.exists():
-            said = (child.stderr.strip().splitlines() or ["it said nothing"])[-1]
+            said = last_line(child.stderr)
             message = f"no picture in space: pyvista ended with {child.returncode}: {said}; are xvfb and xauth there?"
             raise FigureError(message, 5)
         return list(np.load(result))

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import textwrap
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,8 @@ from remodel_fenicsx._version import __version__
 from remodel_fenicsx.pictures.bodies import Pixels, Sight, View, Viewing, angle_scale, render, scale_colours
 from remodel_fenicsx.results.recording import RecordedRun, kept_times
 from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, About, FigureError, Palette, as_file
-from remodel_fenicsx.system.files import temporary_folder, write_new
+from remodel_fenicsx.system.children import last_line
+from remodel_fenicsx.system.files import TakenError, temporary_folder, write_new
 
 PICTURES, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".webp", ".mp4")
 MOST_PANELS = 12
@@ -259,7 +261,7 @@ def _mp4(frames: list[Image.Image], about: About) -> bytes:
         done = subprocess.run(command, input=pixels, capture_output=True, cwd=folder)
         film = folder / "film.mp4"
         if done.returncode != 0 or not film.exists():
-            said = (done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"])[-1]
+            said = last_line(done.stderr.decode(errors="replace"))
             raise FigureError(f"ffmpeg ended with {done.returncode}: {said}; .webp needs nothing", 5)
         return film.read_bytes()
 
@@ -272,29 +274,20 @@ def _check_new(path: Path | None, endings: Sequence[str]) -> None:
     if path.suffix.lower() not in endings:
         raise FigureError(f"path {path}: allowed is a name that ends in {', '.join(endings)}", 2)
     if os.path.lexists(path):
-        raise _taken(path)
+        raise TakenError(path)
     if not path.parent.is_dir():
         raise FigureError(f"path {path}: there is no folder {path.parent}", 2)
 
 
-def _taken(path: Path) -> FigureError:
-    return FigureError(f"path {path}: is there already; allowed is a new file", 2)
-
-
 def _write(path: Path | None, sight: Sight, times: Sequence[float], ending: str, data: bytes) -> Path:
     if path is not None:
-        try:
-            write_new(path, data)
-        except FileExistsError:
-            raise _taken(path) from None
+        write_new(path, data)
         return path
     ends = dict.fromkeys([times[0], times[-1]])
     stem = "-".join([sight.recording.scene.name, *(f"t{time:g}" for time in ends)])
     for number in itertools.count(1):
         free = sight.recording.path / f"{stem}{f'-{number}' if number > 1 else ''}{ending}"
-        try:
+        with suppress(TakenError):
             write_new(free, data)
             return free
-        except FileExistsError:
-            continue
     raise AssertionError("numbers do not end")

@@ -456,10 +456,7 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
     """Make the report of a run, finished or not, from its folder."""
     recording = RecordedRun(folder)
     if path is not None:
-        try:
-            write_new(path, page_of(recording, size).encode("utf-8"))
-        except FileExistsError as error:
-            raise ReportError(f"path {path}: is there already; allowed is a new file") from error
+        write_new(path, page_of(recording, size).encode("utf-8"))
         return path
     path = recording.path / REPORT
     if path.exists() and GENERATOR_TAG not in read_regular(path, LARGEST_PAGE)[:4096]:

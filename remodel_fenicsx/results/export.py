@@ -97,10 +97,7 @@ def export(folder: Path | str, kind: str, path: Path | None = None, time: float 
     ending, write = FIBRE_FORMATS[kind]
     fibres = recorded_fibres(RecordedRun(folder), time)
     path = Path(folder) / f"fibres{ending}" if path is None else path
-    try:
-        write(path, fibres)
-    except FileExistsError as error:
-        raise RecordingError(f"{path}: is there already; nothing is overwritten") from error
+    write(path, fibres)
     return path
 
 

@@ -25,6 +25,7 @@ from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REG
 from remodel_fenicsx.schema import SAME_TIME, same_time
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state.state import State
+from remodel_fenicsx.system.files import ClosedAtEnd
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -126,7 +127,7 @@ class ElementFields:
         return self._parameters.locking_length()
 
 
-class Fields(Watcher):
+class Fields(Watcher, ClosedAtEnd):
     """Time series of fields: fields.vtkhdf (the mesh) and fields_chains.vtkhdf (four chain lines per element).
 
     Both open in ParaView (5.12 or later) and PyVista as one time series. Nodes and elements stand in the mesh file's
@@ -245,12 +246,6 @@ class Fields(Watcher):
         for grid in (self._grid, self._chains):
             if grid is not None:
                 grid.close()
-
-    def __enter__(self) -> Fields:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
 
 def _continued(path: Path, after: float | None) -> TransientGrid | None:

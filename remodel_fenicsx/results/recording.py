@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.environment import check_extensions
-from remodel_fenicsx.system.files import check_regular, open_own, part_of, read_regular
+from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, open_own, part_of, read_regular
 
 if TYPE_CHECKING:
     import h5py
@@ -441,7 +441,7 @@ class FolderTaken(RemodelError, ValueError):
     """
 
 
-class RunLock:
+class RunLock(ClosedAtEnd):
     """This process writes alone in a folder, as long as it lives: the system gives back a lock of a killed process."""
 
     def __init__(self, folder: Path, ranks: int = 1):
@@ -470,12 +470,6 @@ class RunLock:
         """Let others in."""
         self._path.unlink(missing_ok=True)
         os.close(self._descriptor)
-
-    def __enter__(self) -> RunLock:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
 
 def writer(folder: Path) -> tuple[str | None, bool]:

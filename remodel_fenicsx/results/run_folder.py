@@ -32,7 +32,7 @@ from remodel_fenicsx.results.recording import (
 )
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.system.files import open_own, read_regular, write_whole
+from remodel_fenicsx.system.files import ClosedAtEnd, open_own, read_regular, write_whole
 
 DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
 
@@ -252,7 +252,7 @@ def _number(value: float) -> str:
 # ---------------------------------------------------------------- the folder
 
 
-class RunFolder(Watcher):
+class RunFolder(Watcher, ClosedAtEnd):
     """A run's folder, open for writing; as a watcher it writes the row of every step.
 
     Parameters
@@ -334,9 +334,3 @@ class RunFolder(Watcher):
         """Close the history."""
         if self.history is not None:
             self.history.close()
-
-    def __enter__(self) -> RunFolder:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()

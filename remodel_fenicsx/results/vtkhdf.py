@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.system.files import open_own
+from remodel_fenicsx.system.files import ClosedAtEnd, open_own
 
 if TYPE_CHECKING:
     import h5py
@@ -195,7 +195,7 @@ _VERSIONS = ("earliest", "v110")
 _COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
-class TransientGrid:
+class TransientGrid(ClosedAtEnd):
     """A time series on one grid; the file is whole after the constructor and after every `append`."""
 
     def __init__(
@@ -241,12 +241,6 @@ class TransientGrid:
                 if mode == "w":  # not even begun
                     path.unlink(missing_ok=True)
                 raise
-
-    def __enter__(self) -> TransientGrid:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def append(
         self,

@@ -24,20 +24,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene.presets import (
-    EXACT,
-    PRESETS,
-    PROFILES,
-    check_exclusive,
-    default_method,
-    nested,
-    parts_of,
-    place_of,
-    profile_for,
-    with_own_numbers,
-    with_part,
-    without_replaced,
-)
+from remodel_fenicsx.scene import presets
 from remodel_fenicsx.schema.settings import (
     AS_GIVEN,
     COUPLINGS,
@@ -222,9 +209,9 @@ class Scene(Table):
         default="scene", json_schema_extra={"allowed": "a file name without a path"}
     )
     """Name of the scene and of its results folder. Default: the name of the file without `.toml`."""
-    preset: Annotated[str | None, OneOf(PRESETS)] = None
+    preset: Annotated[str | None, OneOf(presets.PRESETS)] = None
     """A published model whose values hold where the scene says nothing, table by table (see the presets below)."""
-    profile: Annotated[str | None, OneOf(PROFILES)] = None
+    profile: Annotated[str | None, OneOf(presets.PROFILES)] = None
     """Chooses speed or accuracy: settings of mesh, kinematics and steps (docs/speed_and_accuracy.md has their errors
     and costs). They replace those of the preset, and the scene's own keys replace them. `--profile` on the command line
     replaces all of these."""
@@ -253,28 +240,28 @@ class Scene(Table):
         if not isinstance(values, dict):
             return handler(values)
         own = _with_measured_cells(_in_present_format(_plain(values)))
-        check_exclusive(own)
+        presets.check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
-            _check_name("preset", preset, PRESETS)
+            _check_name("preset", preset, presets.PRESETS)
         shape = _known_shape(own.get("geometry", {}))
         _check_load_names(shape, own.get("loads"))
         base = SHAPES[shape].defaults_of(own)
         if preset is None:
-            base = merged(base, default_method(own))
+            base = merged(base, presets.default_method(own))
         else:
-            if shape not in PRESETS[preset]:
-                known = ", ".join(map(repr, PRESETS[preset]))
+            if shape not in presets.PRESETS[preset]:
+                known = ", ".join(map(repr, presets.PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
-            base = merged(base, PRESETS[preset][shape])
+            base = merged(base, presets.PRESETS[preset][shape])
 
         def made(settings: Mapping[str, Any]) -> Scene:
-            values = merged(merged(base, nested(settings)), own)
-            return handler(with_own_numbers(_in_own_units(values, SHAPES[shape])))
+            values = merged(merged(base, presets.nested(settings)), own)
+            return handler(presets.with_own_numbers(_in_own_units(values, SHAPES[shape])))
 
         if profile is None:
             return made({})
-        _check_name("profile", profile, PROFILES)
+        _check_name("profile", profile, presets.PROFILES)
         return _with_profile(profile, made)
 
     @model_validator(mode="after")
@@ -341,7 +328,7 @@ class Scene(Table):
 
     def missing_for_implicit(self) -> str | None:
         """What the scene lacks for the coupling "implicit"; None where it lacks nothing."""
-        return COUPLINGS[EXACT].missing(self)
+        return COUPLINGS[presets.EXACT].missing(self)
 
     @property
     def has_exact_coupling(self) -> bool:
@@ -504,7 +491,7 @@ class Scene(Table):
             if not isinstance(key, str):
                 raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
             put(values, key, value)
-        without_replaced(values, changes)
+        presets.without_replaced(values, changes)
         return type(self)(**values)
 
     def to_toml(self, header: str = "") -> str:
@@ -534,23 +521,25 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:
     """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
-    for name, part in parts_of(values):
+    for name, part in presets.parts_of(values):
         cells = part.get("cells")
         if not isinstance(cells, Mapping) or cells.get("fibres") is None:
             continue
         if (said := cells.get("initial", MEASURED_CELLS)) != MEASURED_CELLS:
-            rule = f"{place_of(name)}cells.initial = {shown(said)} is there too; one of them gives the cells"
-            raise fault(rule, f"{place_of(name)}cells.fibres", cells["fibres"])
-        values = with_part(values, name, {**part, "cells": {**cells, "initial": MEASURED_CELLS}})
+            rule = f"{presets.place_of(name)}cells.initial = {shown(said)} is there too; one of them gives the cells"
+            raise fault(rule, f"{presets.place_of(name)}cells.fibres", cells["fibres"])
+        values = presets.with_part(values, name, {**part, "cells": {**cells, "initial": MEASURED_CELLS}})
     return values
 
 
 def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The keys of a file in this folder, with the places of the files that they name."""
-    for name, part in parts_of(values):
+    for name, part in presets.parts_of(values):
         cells = part.get("cells")
         if isinstance(cells, Mapping) and isinstance(file := cells.get("fibres"), str):
-            values = with_part(values, name, {**part, "cells": {**cells, "fibres": str(folder.absolute() / file)}})
+            values = presets.with_part(
+                values, name, {**part, "cells": {**cells, "fibres": str(folder.absolute() / file)}}
+            )
     geometry = values.get("geometry")
     if isinstance(geometry, Mapping) and isinstance(kind := geometry.get("shape"), str) and kind in SHAPES:
         values = {**values, "geometry": SHAPES[kind].with_files_from(geometry, folder)}
@@ -724,7 +713,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     changes = [parse_override(override) for override in overrides]
 
     def made(settings: Mapping[str, Any]) -> Scene:
-        values = merged(read, nested(settings))
+        values = merged(read, presets.nested(settings))
         for key, value in changes:
             put(values, key, value)
         return scene_from_dict(_beside(values, Path(path).parent))
@@ -736,9 +725,9 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
 
 def _with_profile(name: str, made: Callable[[Mapping[str, Any]], Scene]) -> Scene:
     """The scene that is made with a profile's settings: they depend on its cells and loads."""
-    scene = made(PROFILES[name].values)
-    settings = profile_for(name, scene).settings(scene)
-    return scene if settings == PROFILES[name].values else made(settings)
+    scene = made(presets.PROFILES[name].values)
+    settings = presets.profile_for(name, scene).settings(scene)
+    return scene if settings == presets.PROFILES[name].values else made(settings)
 
 
 # ---------------------------------------------------------------- where a run goes on

@@ -57,7 +57,7 @@ class Worker:
         if code is not None and code < 0:
             return f"killed by {signal.Signals(-code).name}"
         assert self.messages is not None
-        return _last_words(self.messages)
+        return last_line(self.messages.read_text(errors="replace")).removeprefix("remodel-fenicsx: ")
 
     def stop(self) -> None:
         """End it, by force if it takes too long."""
@@ -122,9 +122,9 @@ def _emptied(messages: Path) -> TextIO:
     return open(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w")
 
 
-def _last_words(messages: Path) -> str:
-    said = messages.read_text(errors="replace").strip().splitlines()
-    return said[-1].removeprefix("remodel-fenicsx: ") if said else "it said nothing"
+def last_line(said: str) -> str:
+    """Of what a process has said."""
+    return (said.strip().splitlines() or ["it said nothing"])[-1]
 
 
 def _wait(process: subprocess.Popen[Any]) -> None:

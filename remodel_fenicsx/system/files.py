@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Self
 
 from remodel_fenicsx.errors import RemodelError
 
@@ -37,12 +38,11 @@ class ForeignFileError(RemodelError, OSError):
 
     on_all_ranks = False
 
-    def in_words(self) -> str:
-        """Which file, and what it is."""
-        return refusal_in_words(self)
+    def __str__(self) -> str:
+        return f"{self.filename}: {self.strerror}"
 
 
-class TakenError(ForeignFileError, FileExistsError):
+class TakenError(ForeignFileError, FileExistsError, ValueError):
     """What was to be made is there already."""
 
     def __init__(self, path: Path, kind: str = "file"):
@@ -159,6 +159,19 @@ def _check_regular(descriptor: int, path: Path) -> os.stat_result:
     if not stat.S_ISREG(found.st_mode):
         raise ForeignFileError(errno.EINVAL, NO_FILE, str(path))
     return found
+
+
+class ClosedAtEnd:
+    """What is closed at the end of its `with`."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of files."""
 
 
 # ---------------------------------------------------------------- folders for a while

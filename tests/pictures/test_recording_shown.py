@@ -162,7 +162,7 @@ def test_a_screenshot_is_the_picture_of_the_command(
     assert path.read_bytes().startswith(b"\x89PNG")
     recording = Recording(recorded("cube"))
     for said, wish in (
-        ("path .*cube.png: is there already", {}),
+        (".*cube.png: is there already", {}),
         ("cut third: allowed", {"cut": "third"}),
         ("layers 9: allowed", {"layers": 9}),
         ("view behind: allowed", {"view": "behind"}),

@@ -264,7 +264,7 @@ def test_what_cannot_be_exported_is_said_in_a_line(
 
     assert "no fields at time 1.5; recorded are 0, 1, 2" in refused("--time", "1.5")
     (tmp_path / "old.csv").write_text("dear")
-    assert "old.csv: is there already; nothing is overwritten" in refused("-o", str(tmp_path / "old.csv"))
+    assert "old.csv: is there already; allowed is a new file" in refused("-o", str(tmp_path / "old.csv"))
     assert (tmp_path / "old.csv").read_text() == "dear"
     assert "there is no such folder" in refused(folder=tmp_path / "nowhere")
     point = {"geometry": {"shape": "cube"}, "model": {"kinematics": "point"}, "time": {"end": 1.0}}
