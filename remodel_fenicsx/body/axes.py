@@ -170,8 +170,7 @@ def outward_areas(mesh: Any, facets: Facets) -> Array:
     middles = mesh.geometry.x[nodes].mean(axis=1)
     outwards = np.sign(np.sum(vectors * (corners.mean(axis=1) - middles), axis=1))
     owned = facets < mesh.topology.index_map(2).size_local
-    areas: Array = vectors * (outwards * owned)[:, None]
-    return areas
+    return vectors * (outwards * owned)[:, None]
 
 
 def area(mesh: Any, facets: Facets) -> float:
@@ -263,8 +262,7 @@ def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:
     """The first marked place in space, whatever the number of ranks."""
     marked = quadrature.owned(quadrature.coordinates)[quadrature.owned(there)]
     places = [place for part in of_all_ranks(quadrature.mesh.comm, marked) for place in part]
-    first: Array = min(places, key=lambda place: np.round(place, 9).tolist())
-    return first
+    return min(places, key=lambda place: np.round(place, 9).tolist())
 
 
 def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None:

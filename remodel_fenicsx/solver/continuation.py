@@ -44,11 +44,8 @@ log = logging.getLogger(__name__)
 class Work(Counted):
     """Solver work of one step, failed attempts included."""
 
-    newton_iterations: int = 0
-    linear_iterations: int = 0
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
-    tangents: int = 0  # that were assembled
     extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
     last: Solution | None = None
     held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"

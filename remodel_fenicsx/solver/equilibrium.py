@@ -99,8 +99,7 @@ class PointwiseRepulsion:
 
     def _modulus(self) -> Array:
         points = self.tissue.map(lambda name, value: assembly.point_values(value, self.quadrature).reshape(-1))
-        modulus: Array = points.repulsion_modulus
-        return modulus
+        return points.repulsion_modulus
 
 
 class PointStresses:
