@@ -337,9 +337,9 @@ class Blend:
         equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
         length = quadrature.owned(equilibrium.locking_length())
         self.theta.value = done
-        now = quadrature.owned(equilibrium.limit_values()[0])
+        now = quadrature.owned(equilibrium.states()[..., 0])
         self.theta.value = 1.0
-        end = quadrature.owned(equilibrium.limit_values()[0])
+        end = quadrature.owned(equilibrium.states()[..., 0])
         allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
         growth = end - now
         room = np.where(growth > 0, (allowed - now) / np.where(growth > 0, growth, 1.0), np.inf)
