@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx import Scene, preset_scene
 from remodel_fenicsx.studies.fit import Fit, Problem, minimised, result_of
-from remodel_fenicsx.studies.measurements import Measured, Unknown
+from remodel_fenicsx.studies.fit import Measured, Unknown
 
 Array = NDArray[np.float64]
 

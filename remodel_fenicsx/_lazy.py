@@ -23,3 +23,13 @@ def resolved(maker: Callable[..., Any] | str) -> Callable[..., Any]:
     """A class or function that a registry names: itself, or what its dotted name stands for."""
     found: Callable[..., Any] = pkgutil.resolve_name(maker) if isinstance(maker, str) else maker
     return found
+
+
+class Late:
+    """A module of others that is imported when something of it is asked for."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(importlib.import_module(self._name), name)

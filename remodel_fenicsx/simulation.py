@@ -17,7 +17,7 @@ from remodel_fenicsx.body.loading import Loading, LoadValues
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.evolution.coupling import Maker
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
+from remodel_fenicsx.evolution.stepper import OtherCase, OtherCaseWatcher, Step, Stepper, Watcher, times
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -178,8 +178,6 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
     first, *more = (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, settings, solver, first, coupling, kappa)
     if others:
-        from remodel_fenicsx.evolution.load_cases import OtherCase
-
         given = enumerate(zip(others, more, strict=True), start=2)
         cases = [OtherCase(number, *part, stepper, solver, kappa) for number, part in given]
         stepper.remodeling.join(cases, [case.weight for case in scene.cases])
@@ -208,7 +206,7 @@ def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
     for case in stepper.remodeling.cases:
         own = [EquilibriumStability(case, unstable)]
         own += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
-        found += [case.watched_by(watcher) for watcher in own if watcher is not None]
+        found += [OtherCaseWatcher(case, watcher) for watcher in own if watcher is not None]
     return [watcher for watcher in found if watcher is not None]
 
 

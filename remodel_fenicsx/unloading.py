@@ -24,7 +24,7 @@ from remodel_fenicsx.body.mesh_file import MeshFile
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, over_ranks, second_derivative
+from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, factorised, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
 from remodel_fenicsx.results.fields import NodalGather, dof_of_node
 from remodel_fenicsx.results.run_folder import agreed
@@ -142,6 +142,11 @@ LOADED_AGAIN = 1e-9  # of the largest length: how far the loaded numbers may be 
 MOST_LOADINGS = 30  # runs for one share of the loads
 REMEMBERED = 5  # differences of earlier runs from which the next is guessed (Anderson 1965)
 LOAD_STEPS = 10  # of a run to the end of the ramps
+# cells that stay; what says how to remodel goes with a law
+PASSIVE: dict[str, Any] = {
+    "remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {},
+    "remodeling.exponent": 2.0, "remodeling.threshold": 0.0, "time.tolerance": None,
+}  # fmt: skip
 
 
 def unloaded_tube(scene: Scene, comm: MPI.Intracomm) -> Scene:
@@ -215,9 +220,7 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
     end = scene.end_of_ramps or 1.0
     changes: dict[str, Any] = {"output.columns": [], "output.times": [], "output.fields": False}
     if scene.natural.cells == AS_GIVEN:
-        changes |= {"remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.threshold": 0.0}
-        changes |= {"remodeling.turnover": {}}
-        changes |= {"remodeling.exponent": 2.0, "time.end": end, "time.step": end / LOAD_STEPS, "time.tolerance": None}
+        changes |= PASSIVE | {"time.end": end, "time.step": end / LOAD_STEPS}
     else:
         changes |= {"time.end": EQUILIBRIUM}
     changes |= {"solver.relative_tolerance": min(scene.solver.relative_tolerance, LOADED_AGAIN / 10)}
@@ -357,9 +360,10 @@ def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | 
     lift.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
     right.axpy(1.0, lift)
     dolfinx.fem.petsc.set_bc(right, conditions)
-    _solve(matrix, right, move.x.petsc_vec)
+    solver = factorised(matrix)
+    solver.solve(right, move.x.petsc_vec)
     move.x.scatter_forward()
-    for thing in (matrix, right, external, lift):
+    for thing in (solver, matrix, right, external, lift):
         thing.destroy()
     if over_ranks(domain.comm, not np.isfinite(move.x.array).all(), MPI.LOR):
         return None
@@ -396,14 +400,3 @@ def _tangents(simulation: Simulation, move: Any) -> list[Any]:
     if supports is not None:  # of fixed direction: u shrinks by what the unloaded place moves
         forms.append(-ufl.derivative(supports, unknown, trial))
     return forms
-
-
-def _solve(matrix: Any, right: Any, solution: Any) -> None:
-    """By factors: the matrix is not symmetric."""
-    solver = PETSc.KSP().create(matrix.comm)
-    solver.setType(PETSc.KSP.Type.PREONLY)
-    solver.getPC().setType(PETSc.PC.Type.LU)
-    solver.getPC().setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
-    solver.setOperators(matrix)
-    solver.solve(right, solution)
-    solver.destroy()

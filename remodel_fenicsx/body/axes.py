@@ -20,8 +20,8 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import SolveStopped, of_all_ranks, over_ranks, solve_positive
@@ -31,6 +31,7 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.schema.tables import SceneError
 
+spatial = Late("scipy.spatial")  # few bodies need it
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 
@@ -170,8 +171,7 @@ def outward_areas(mesh: Any, facets: Facets) -> Array:
     middles = mesh.geometry.x[nodes].mean(axis=1)
     outwards = np.sign(np.sum(vectors * (corners.mean(axis=1) - middles), axis=1))
     owned = facets < mesh.topology.index_map(2).size_local
-    areas: Array = vectors * (outwards * owned)[:, None]
-    return areas
+    return vectors * (outwards * owned)[:, None]
 
 
 def area(mesh: Any, facets: Facets) -> float:
@@ -263,8 +263,7 @@ def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:
     """The first marked place in space, whatever the number of ranks."""
     marked = quadrature.owned(quadrature.coordinates)[quadrature.owned(there)]
     places = [place for part in of_all_ranks(quadrature.mesh.comm, marked) for place in part]
-    first: Array = min(places, key=lambda place: np.round(place, 9).tolist())
-    return first
+    return min(places, key=lambda place: np.round(place, 9).tolist())
 
 
 def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None:
@@ -276,7 +275,7 @@ def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None
     answers = []
     for part in asked:
         if len(candidates):
-            distance, index = cKDTree(places).query(part)
+            distance, index = spatial.cKDTree(places).query(part)
             answers.append((distance, candidates[index]))
         else:
             answers.append((np.full(len(part), np.inf), np.zeros((len(part), 3, 3))))

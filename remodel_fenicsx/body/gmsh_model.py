@@ -9,7 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.errors import RemodelError
+
+gmsh: Any = Late("gmsh")  # it takes 0.2 s and only rank 0 needs it
 
 # Gmsh takes points that are closer than 1e-8 for one, and crashes on much longer or flatter bodies
 SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
@@ -47,8 +50,6 @@ def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
 @contextmanager
 def gmsh_model(name: str) -> Iterator[Any]:
     """A fresh, silent Gmsh model; whatever happens, Gmsh is left as it was found."""
-    import gmsh  # late: it takes 0.2 s and only rank 0 needs it
-
     foreign = gmsh.isInitialized()
     if not foreign:
         # no ~/.gmshrc, which could change the mesh; not interruptible: Ctrl-C stays Python's
@@ -78,8 +79,6 @@ class NamedGroups(NamedTuple):
 def named_groups() -> NamedGroups:
     """Those of the current model, once it is sure that dolfinx can take the model."""
     # dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
-    import gmsh
-
     found = NamedGroups(_groups(2), _groups(3))
     kinds = gmsh.model.mesh.getElements(3)[0]
     if not found.regions or len(kinds) != 1 or not found.faces:
@@ -94,8 +93,6 @@ def named_groups() -> NamedGroups:
 
 
 def _groups(dimension: int) -> dict[str, int]:
-    import gmsh
-
     tags = [tag for _, tag in gmsh.model.getPhysicalGroups(dimension)]
     names = [gmsh.model.getPhysicalName(dimension, tag) or str(tag) for tag in tags]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -123,8 +120,6 @@ class Point(NamedTuple):
 
 def points(coordinates: npt.NDArray[np.float64]) -> list[Point]:
     """Points at (n, 2)."""
-    import gmsh
-
     pairs = [(float(x), float(y)) for x, y in coordinates]
     return [Point(gmsh.model.geo.addPoint(x, y, 0.0), x, y) for x, y in pairs]
 
@@ -133,8 +128,6 @@ def line(start: Point, stop: Point, elements: int = 1) -> list[int]:
     """Straight chain of equal curves of one element each."""
     # So every node is given, as on the circles: the places that Gmsh finds along a curve are good to 1e-12 on straight
     # lines and to 1e-9 on arcs only.
-    import gmsh
-
     geo = gmsh.model.geo
     fraction = np.arange(1, elements)[:, None] / elements
     between = points((1.0 - fraction) * np.array(start[1:]) + fraction * np.array(stop[1:]))
@@ -152,8 +145,6 @@ def polygon(corners: Sequence[Point]) -> list[int]:
 
 def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], element: str) -> int:
     """Structured plane surface between four sides (each a chain of curves, a closed loop in all) and four corners."""
-    import gmsh
-
     geo = gmsh.model.geo
     surface = geo.addPlaneSurface([geo.addCurveLoop([curve for side in edges for curve in side])])
     geo.mesh.setTransfiniteSurface(surface, cornerTags=[corner.tag for corner in corners])
@@ -167,6 +158,24 @@ def reverse(curves: Sequence[int]) -> list[int]:
     return [-curve for curve in reversed(curves)]
 
 
+def ring(
+    inner: Sequence[Point],
+    outer: Sequence[Point],
+    inner_lines: Sequence[int],
+    outer_lines: Sequence[int],
+    spokes: Sequence[Sequence[int]],
+    element: str,
+) -> list[int]:
+    """Blocks between two closed polygons, from each of the spokes to the next."""
+    number, found = len(inner), []
+    part = number // len(spokes)
+    for i, k in enumerate(range(0, number, part)):
+        m, next_spoke = (k + part) % number, spokes[(i + 1) % len(spokes)]
+        edges = [spokes[i], outer_lines[k : k + part], reverse(next_spoke), reverse(inner_lines[k : k + part])]
+        found.append(block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
+    return found
+
+
 def extrude(
     section: Sequence[int],
     length: float,
@@ -176,8 +185,6 @@ def extrude(
     ends: tuple[str, str] = ("bottom", "top"),
 ) -> None:
     """Extrude a plane section along z, mesh it, and name the volume and the faces."""
-    import gmsh
-
     made = gmsh.model.geo.extrude(
         [(2, surface) for surface in section], 0.0, 0.0, length, numElements=[layers], recombine=element == "hexahedron"
     )
@@ -199,8 +206,6 @@ def raise_degree(degree: int, bulge: Callable[[npt.NDArray[np.float64]], npt.NDA
     """Give the straight elements nodes between their corners, and curve them around the z axis."""
     if degree == 1:
         return
-    import gmsh
-
     mesh = gmsh.model.mesh
     mesh.setOrder(degree)
     tags, coordinates, _ = mesh.getNodes()

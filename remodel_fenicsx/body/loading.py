@@ -311,10 +311,6 @@ class Loading:
         self._take(name, constant, scale)
         return constant
 
-    def constants(self, name: str) -> list[tuple[Any, Any]]:
-        """The Constants of a load, each with its value at magnitude 1."""
-        return list(self._magnitudes.get(name, ()))
-
     def surface_measure(self, face: str) -> Any:
         """Measure over a named face of the mesh; times `weight` it is one over the body's face."""
         measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)

@@ -13,9 +13,31 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
+from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gmsh_model
+from remodel_fenicsx.body.mesh_faces import (
+    Boundary,
+    FaceError,
+    GUIDE,
+    add_support,
+    again,
+    boundary_of,
+    check_supports,
+    groups_inside,
+    likely_exchange,
+    through_the_wall,
+)
+from remodel_fenicsx.body.mesh_file import (
+    BY_NUMBER,
+    ENDINGS,
+    TAGS,
+    Block,
+    MeshFile,
+    MeshFileError,
+    assembled,
+    distinct,
+    read_mesh,
+)
 from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions
-from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH
-from remodel_fenicsx.body.mesh_file import ENDINGS, MeshFile, MeshFileError, TAGS, distinct, read_mesh
 from remodel_fenicsx.body.wall import WalledMesh
 from remodel_fenicsx.schema.settings import LARGEST_MESH, Load, Mesh, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
@@ -23,10 +45,8 @@ from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
 
 if TYPE_CHECKING:
     from mpi4py import MPI
-
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
-    from remodel_fenicsx.body.mesh_faces import Boundary
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +56,10 @@ MESH_ENDINGS = (".msh", *ENDINGS)
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 Names = tuple[str | int, ...]
 _ENTRY: JsonDict = {"type": ["string", "integer"]}
+_GROUPS: JsonDict = {
+    "allowed": "a table of names, numbers or lists of them",
+    "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
+}
 
 
 def _faces(value: Any) -> Any:
@@ -59,10 +83,6 @@ def _file(value: Any) -> Any:
     if not _is_mesh(value):
         raise fault(f"must be the path of a mesh ({', '.join(MESH_ENDINGS)}), relative to the scene's folder")
     return value
-
-
-def _text(value: Any) -> str | None:
-    return value if isinstance(value, str) else None
 
 
 def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], there: set[int]) -> list[int]:
@@ -154,10 +174,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             "`inner`, `outer`, `inlet` and `outlet` are needed where the file has other names. Further "
             "faces are for supports and loads."
         ),
-        json_schema_extra={
-            "allowed": "a table of names, numbers or lists of them",
-            "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
-        },
+        json_schema_extra=_GROUPS,
     )
     regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
@@ -165,10 +182,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             "Names of regions, each with the name or number of a volume in the file, or a list of them."
             " Default: the names in the file."
         ),
-        json_schema_extra={
-            "allowed": "a table of names, numbers or lists of them",
-            "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
-        },
+        json_schema_extra=_GROUPS,
     )
     open_boundary: bool = Field(
         default=False,
@@ -204,7 +218,8 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         if said or not _is_mesh(file):
             return cls.defaults
         try:
-            found = read_mesh(Path(file), _text(own["geometry"].get("tags")))
+            tags = own["geometry"].get("tags")
+            found = read_mesh(Path(file), tags if isinstance(tags, str) else None)
         except MeshFileError as error:
             raise fault(str(error), "geometry.file", Path(file).name) from None
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
@@ -236,8 +251,6 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
     def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, Boundary, dict[str, int]]:
         """The mesh, its boundary, and its regions' numbers by name; on rank 0."""
-        from remodel_fenicsx.body.mesh_faces import FaceError, boundary_of, likely_exchange
-
         file = self._with_regions(self._read())
         scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
         file = replace(file, points=scale * file.points)
@@ -265,9 +278,6 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
     def _refined(self, file: MeshFile, mesh: Mesh) -> tuple[MeshFile, Boundary]:
         """With smaller elements, or those of degree 2."""
-        from remodel_fenicsx.body.mesh_faces import boundary_of
-        from remodel_fenicsx.body.mesh_refinement import refined
-
         if (number := len(file.cells) * mesh.refinement**3) > LARGEST_MESH:
             raise SceneError(f"mesh.refinement = {mesh.refinement}: {number} elements; at most {LARGEST_MESH} are made")
         try:
@@ -298,8 +308,6 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
     def _groups(self, file: MeshFile) -> dict[str, tuple[int, ...]]:
         """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
-        from remodel_fenicsx.body.mesh_faces import again, groups_inside
-
         names, there = file.names[2], set(distinct(file.facet_groups)) - {0}
         asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*ROLES, *self.faces])}
         groups = {face: tuple(_numbers("face", face, entries, names, there)) for face, entries in asked.items()}
@@ -331,8 +339,6 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
     def _with_regions(self, file: MeshFile) -> MeshFile:
         """Volumes of one region under one number, without others that have the same elements."""
-        from remodel_fenicsx.body.mesh_faces import again
-
         if not self.regions:
             return file
         groups, taken = file.cell_groups.copy(), set()
@@ -348,8 +354,6 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         return _numbers("region", region, entries, file.names[3], set(distinct(file.cell_groups)) - {0})
 
     def _say(self, file: MeshFile, boundary: Boundary) -> None:
-        from remodel_fenicsx.body.mesh_faces import through_the_wall
-
         counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
         log.info("%s: %s, SHA-256 %s", Path(self.file).name, counts, file.sha256)
         if through_the_wall(boundary):
@@ -376,8 +380,6 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
     def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
         """Whether they are there, the body cannot move as a whole, and no support takes all of a pressure."""
-        from remodel_fenicsx.body.mesh_supports import check_supports
-
         for name in supports:
             if name not in domain.faces:
                 raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
@@ -396,8 +398,6 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
         """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective."""
-        from remodel_fenicsx.body.mesh_supports import GUIDE, add_support
-
         domain: Any = loading.domain
         self.check_faces(domain, supports, loads)
         length = domain.length()
@@ -410,3 +410,43 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
         for name, face in faces_of(loads).items():
             loading.add_follower_pressure(name, face)
+
+
+# ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh
+GMSH_TYPES = {("tetrahedron", 1): (4, 2), ("hexahedron", 1): (5, 3)}  # of elements and facets
+
+
+def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
+    """A mesh of plane elements, split into halves along each edge, as often as asked for."""
+    if (refinement, degree) == (1, file.degree):
+        return file
+    if file.degree != 1:
+        raise MeshFileError(f"has elements of degree {file.degree}: they are taken as they are")
+    solid, flat = GMSH_TYPES[file.kind, 1]
+    with gmsh_model("file") as gmsh:
+        numbers = {3: distinct(file.cell_groups), 2: distinct(file.facet_groups)}
+        entities = {d: {n: gmsh.model.addDiscreteEntity(d) for n in found} for d, found in numbers.items()}
+        first = next(iter(entities[3].values()))
+        gmsh.model.mesh.addNodes(3, first, np.arange(1, len(file.points) + 1), file.points.reshape(-1))
+        parts = {3: (solid, file.cells, file.cell_groups), 2: (flat, file.facets, file.facet_groups)}
+        for dimension, (kind, rows, groups) in parts.items():
+            for number, entity in entities[dimension].items():
+                gmsh.model.mesh.addElementsByType(entity, kind, [], 1 + rows[groups == number].reshape(-1))
+        for _ in range(refinement.bit_length() - 1):
+            gmsh.model.mesh.refine()
+        if degree == 2:
+            before = gmsh.option.getNumber("Mesh.SecondOrderLinear")
+            gmsh.option.setNumber("Mesh.SecondOrderLinear", 1)
+            gmsh.model.mesh.setOrder(2)
+            gmsh.option.setNumber("Mesh.SecondOrderLinear", before)
+        tags, places, _ = gmsh.model.mesh.getNodes()
+        blocks = []
+        for dimension, by_number in entities.items():
+            for number, entity in by_number.items():
+                for kind, elements, nodes in zip(*gmsh.model.mesh.getElements(dimension, entity), strict=True):
+                    rows = np.asarray(nodes, dtype=np.int64).reshape(len(elements), -1)
+                    groups = np.full(len(elements), number, dtype=np.int64)
+                    blocks.append(Block(BY_NUMBER[int(kind)], np.asarray(elements), groups, rows))
+    order = np.argsort(tags)
+    points = np.asarray(places, dtype=np.float64).reshape(-1, 3)[order]
+    return assembled(np.asarray(tags, dtype=np.int64)[order], points, blocks, file.names, file.data)

@@ -307,8 +307,7 @@ class _Numbers:
 
     def row(self, columns: int) -> list[int]:
         """The next row, of whole numbers."""
-        found: list[int] = self.take(1, columns)[0].astype(np.int64).tolist()
-        return found
+        return self.take(1, columns)[0].astype(np.int64).tolist()
 
     def end(self) -> None:
         """Nothing may follow."""

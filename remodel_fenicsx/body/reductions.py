@@ -356,8 +356,7 @@ def elements(scene: Any, name: str) -> int:
     """How many hexahedra, or elements of fewer dimensions, a kinematics has."""
     if KINEMATICS[name].reduced:
         return scene.geometry.reductions[name].elements(scene)
-    number: int = scene.geometry.number_of_elements * scene.mesh.refinement**3
-    return number
+    return scene.geometry.number_of_elements * scene.mesh.refinement**3
 
 
 def check_number(scene: Any) -> None:

@@ -153,15 +153,7 @@ def draw_tendon(length: float, area: float, refinement: int = 1, element: str = 
     corners = range(0, number, quarter)
     spokes = [model.line(inner[k], outer[k], RINGS * refinement) for k in corners]
     section = [model.block([inner_lines], [inner[k] for k in corners], element)]
-    for i, k in enumerate(corners):
-        j, m = (i + 1) % 4, (k + quarter) % number
-        edges = [
-            spokes[i],
-            outer_lines[k : k + quarter],
-            model.reverse(spokes[j]),
-            model.reverse(inner_lines[k : k + quarter]),
-        ]
-        section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
+    section += model.ring(inner, outer, inner_lines, outer_lines, spokes, element)
     model.extrude(section, length, ALONG * refinement, element, {"side": outer_lines})
     # round at the side, ever straighter towards the centre, where the elements are not concentric
     model.raise_degree(degree, lambda mean_radius: np.square(mean_radius / radius))

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
+from remodel_fenicsx.body.mesh_faces import add_support, warn_of_twist
 from remodel_fenicsx.body.reductions import (
     Body,
     Corners,
@@ -380,8 +381,6 @@ class Tube(RoundWall):
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
         """Springs of what surrounds it."""
-        from remodel_fenicsx.body.mesh_supports import add_support, warn_of_twist
-
         for face, support in supports.items():
             add_support(loading, face, support, modulus, None)
             if loading.kinematics.moves_rigidly:
@@ -480,8 +479,7 @@ class Tube(RoundWall):
     def depth(self, coordinates: Array) -> Array:
         """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""
         radii = np.linalg.norm(coordinates[..., :2], axis=-1)
-        depth: Array = np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
-        return depth
+        return np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
 
     def axes_at(self, coordinates: Array) -> Array:
         """Circumferential, axial, radial about the z axis, rows (..., 3, 3)."""
@@ -523,15 +521,6 @@ def draw_tube(wall: Wall, length: float, counts: tuple[int, int], element: str, 
     inner_lines, outer_lines = model.polygon(inner), model.polygon(outer)
     corners = range(0, number, quarter)
     spokes = [_spoke(wall, number, k, inner[k], outer[k]) for k in corners]
-    section = []
-    for i, k in enumerate(corners):
-        j, m = (i + 1) % 4, (k + quarter) % number
-        edges = [
-            spokes[i],
-            outer_lines[k : k + quarter],
-            model.reverse(spokes[j]),
-            model.reverse(inner_lines[k : k + quarter]),
-        ]
-        section.append(model.block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
+    section = model.ring(inner, outer, inner_lines, outer_lines, spokes, element)
     model.extrude(section, length, along, element, {"inner": inner_lines, "outer": outer_lines})
     model.raise_degree(degree, np.ones_like)

@@ -153,8 +153,7 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
 
 def gradient(stretches: Array, axes: Array) -> Array:
     """G (..., 3, 3) of stretches (..., 3) along axes, rows (..., 3, 3)."""
-    found: Array = np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
-    return found
+    return np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
 
 
 # ---------------------------------------------------------------- bodies with a wall between an inner and an outer

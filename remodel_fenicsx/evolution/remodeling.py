@@ -51,7 +51,7 @@ class RemodelingPass:
     def __init__(self, state: State, tissue: Tissue, settings: Remodeling, kappa: Any = None):
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
-        self.cases: Sequence[Any] = ()  # further load cases (`load_cases.OtherCase`), which drive the cells too
+        self.cases: Sequence[Any] = ()  # further load cases (`stepper.OtherCase`), which drive the cells too
         self.weights: Sequence[float] = (1.0,)  # of all cases, this one first
         self.turnover: Any = None  # `TurnoverPass`, which changes content and natural length
         if settings.turnover.is_on:
@@ -259,10 +259,7 @@ class RemodelingPass:
     def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
         """Give the state other cells, or a share of the change; returns the power of remodeling at frozen F."""
         cells, shape = self.state.cells, self.quadrature.shape
-        self._change = (
-            UnitCell(cells.dimension_values.reshape(-1, 3).copy(), cells.axis_values.reshape(-1, 3, 3).copy()),
-            asked,
-        )
+        self._change = cells.point_cells.copy(), asked
         updated = self.law.share(self._change[0], asked, factor)
         increment = self._energy_increment(F, self._change[0], updated)
         power: float = 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
@@ -271,9 +268,8 @@ class RemodelingPass:
 
     def look_ahead(self, time: float, residual: float = 0.0) -> None:
         """What a pass to the limit would make of the present cells, for `residual`; nothing changes."""
-        cells = self.state.cells.point_cells
         asked, _ = self.updated_cells(time, 2 * time, residual)
-        self._change = (UnitCell(cells.dimensions.copy(), cells.axes.copy()), asked)
+        self._change = self.state.cells.point_cells.copy(), asked
 
     def _energy_increment(self, F: Array, old: UnitCell, new: UnitCell) -> Array:
         """`Tissue.energy_increment` at all points, with the sums over the axes compiled."""

@@ -7,17 +7,19 @@ import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Coupling, Maker
+from remodel_fenicsx.evolution.coupling import Coupling, Maker, Staggered
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver
-from remodel_fenicsx.solver.continuation import Work
+from remodel_fenicsx.model.laws import Drive
+from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver, Turnover
+from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.state.state import State, on_mesh
 from remodel_fenicsx.system.interrupts import Paused
@@ -378,3 +380,52 @@ class Pause(Watcher):
         asked = [one for one in self.comm.allgather(reason) if one]
         if asked:
             raise Paused(REASONS[asked[0]], step.time, self.folder)
+
+
+# ---------------------------------------------------------------- further load cases: states with the same cells
+class OtherCase:
+    """A load case beside the first: solved after it in each step, and asked for its drive before the pass."""
+
+    def __init__(
+        self,
+        number: int,
+        state: State,
+        load_values: Callable[[float], LoadValues],
+        stepper: Stepper,
+        solver: Solver,
+        kappa: Any = None,
+    ):
+        self.number, self.state, self.load_values = number, state, load_values
+        self.tissue = stepper.tissue
+        settings = stepper.remodeling.settings.model_copy(update={"turnover": Turnover()})  # the first case makes it
+        self.remodeling = RemodelingPass(state, stepper.tissue, settings, kappa)
+        self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
+        state.stop_signal = lambda: stepper.state.stop_signal()
+
+    def solve(self, time: float) -> Work:
+        """Equilibrium at `time` with the present cells."""
+        try:
+            return self.coupling.solve(time, self.load_values(time))
+        except StepFailure as failure:
+            raise StepFailure(failure.time, f"load case {self.number}: {failure}", failure.refusal) from failure
+
+    def drive(self) -> Drive:
+        """Of the solved state."""
+        return self.remodeling.drive(self.coupling.residual)
+
+    def seen(self, step: Step) -> Step:
+        """A step as it is in this case."""
+        extension = self.coupling.equilibrium.extension()
+        return replace(step, loads=dict(self.state.loading.values), extension=extension, case=self.number)
+
+
+class OtherCaseWatcher(Watcher):
+    """A watcher of the states of another load case: it sees each step as it is there."""
+
+    def __init__(self, case: OtherCase, watcher: Watcher):
+        def as_there(hook: Callable[[Step], None], step: Step) -> None:
+            hook(case.seen(step))
+
+        for name in ("started", "resumed", "solved", "completed", "undone", "committed"):
+            setattr(self, name, partial(as_there, getattr(watcher, name)))
+        self.close = watcher.close  # type: ignore[method-assign]

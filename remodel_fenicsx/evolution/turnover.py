@@ -32,8 +32,7 @@ def turned_over(tissue: Tissue, state: State) -> Tissue:
 def changed(start: Array, rates: Array, duration: float) -> Array:
     """ln m and ln rho (2, n) after a time with rates (2, n)."""
     content, length = rates * duration
-    found: Array = start + [content, np.clip(length, -LARGEST_TURNOVER, LARGEST_TURNOVER)]
-    return found
+    return start + [content, np.clip(length, -LARGEST_TURNOVER, LARGEST_TURNOVER)]
 
 
 class Slowing:
@@ -121,8 +120,7 @@ class TurnoverPass:
     # ------------------------------------------------------------ values
     def logarithms(self) -> Array:
         """ln m and ln rho at all points in one row, (2, n)."""
-        found: Array = np.log([getattr(self.tissue, name).x.array for name in TURNED_OVER])
-        return found
+        return np.log([getattr(self.tissue, name).x.array for name in TURNED_OVER])
 
     def set(self, logarithms: Array) -> None:
         """Other m and rho."""
@@ -153,15 +151,12 @@ class TurnoverPass:
         return float(self.quadrature.mean(self._values(name)))
 
     def _values(self, name: str) -> Array:
-        values: Array = self.quadrature.values(getattr(self.tissue, name), ())
-        return values
+        return self.quadrature.values(getattr(self.tissue, name), ())
 
     def fastest_changes(self) -> Array:
         """Larger one of |d ln m / dt| and |d ln rho / dt| in the solved state, (elements, points)."""
-        found: Array = np.abs(self.rates()).max(axis=0).reshape(self.quadrature.shape)
-        return found
+        return np.abs(self.rates()).max(axis=0).reshape(self.quadrature.shape)
 
     def factors(self, name: str) -> Array:
         """By what `content` or `natural_length` has changed, up or down: 1 or more, (elements, points)."""
-        found: Array = np.exp(np.abs(np.log(self._values(name))))
-        return found
+        return np.exp(np.abs(np.log(self._values(name))))

@@ -31,6 +31,16 @@ TOLERANCE = 1e-12  # relative, of the linear solve: what comes of it has ten dig
 ITERATION_LIMIT = 20_000  # lines of a thousand elements need some thousands
 
 
+def factorised(matrix: Any) -> Any:
+    """A solver by factors, of a matrix that need not be symmetric."""
+    solver = PETSc.KSP().create(matrix.comm)
+    solver.setOperators(matrix)
+    solver.setType(PETSc.KSP.Type.PREONLY)
+    solver.getPC().setType(PETSc.PC.Type.LU)
+    solver.getPC().setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
+    return solver
+
+
 class SolveStopped(ArithmeticError):
     """The iterations did not converge."""
 

@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import Late
+
+ufl, basix = Late("ufl"), Late("basix")
 Array = NDArray[np.float64]
 
 
@@ -157,9 +160,6 @@ class Selective(Formulation):
 
 class _PartsApart(Dilatation):
     def __init__(self, kinematics: Any, unknown: Any, quadrature: Any, degree: int):
-        import basix
-        import ufl
-
         from remodel_fenicsx.fem import jit
 
         super().__init__(quadrature)
@@ -175,8 +175,6 @@ class _PartsApart(Dilatation):
         self.refresh()
 
     def energies(self, tissue: Any, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
-        import ufl
-
         distortional = tissue.distortional_energy(deformation_gradient, cells)
         volumetric = tissue.volumetric_energy(ufl.det(deformation_gradient))
         return [distortional * weight * self.quadrature.dx, volumetric * weight * self.dx]

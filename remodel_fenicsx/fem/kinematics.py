@@ -13,6 +13,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import Late
+
+ufl, basix_ufl, fem = Late("ufl"), Late("basix.ufl"), Late("dolfinx.fem")
 Array = NDArray[np.float64]
 
 
@@ -164,8 +167,6 @@ class FullKinematics(Kinematics):
 
     def deformation_gradient(self, unknown: Any) -> Any:
         """F = I + grad u."""
-        import ufl
-
         return ufl.Identity(3) + ufl.grad(unknown)
 
     def nodal_displacement(self, unknown: Any) -> Array:
@@ -234,14 +235,10 @@ class AxisymmetricKinematics(_Reduced):
 
     def displacement(self, unknown: Any) -> Any:
         """u_r e_x + u_z e_z."""
-        import ufl
-
         return ufl.as_vector([unknown[0], 0.0, unknown[1]])
 
     def deformation_gradient(self, unknown: Any) -> Any:
         """With the circumferential stretch 1 + u_r/r."""
-        import ufl
-
         r, _, _ = ufl.SpatialCoordinate(self.mesh)
         return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + _along(1, unknown[0] / r)
 
@@ -275,14 +272,10 @@ class RadialKinematics(_Reduced):
 
     def displacement(self, unknown: Any) -> Any:
         """u_r e_x: the ray lies in the plane z = 0."""
-        import ufl
-
         return ufl.as_vector([unknown, 0.0, 0.0])
 
     def deformation_gradient(self, unknown: Any) -> Any:
         """Diagonal."""
-        import ufl
-
         r, _, _ = ufl.SpatialCoordinate(self.mesh)
         stretches = _along(1, unknown / r) + _along(2, self.axial_strain)
         return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + stretches
@@ -316,24 +309,17 @@ class PointKinematics(_Reduced):
 
     def unknown(self, mesh: Any, degree: int) -> Any:
         """Three numbers on the one element, zero."""
-        import basix.ufl
-        import dolfinx.fem
-
         self._nodes = lagrange(mesh, degree, ()).function_space
-        element = basix.ufl.element("DG", mesh.topology.cell_name(), 0, shape=(3,))
-        return dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
+        element = basix_ufl.element("DG", mesh.topology.cell_name(), 0, shape=(3,))
+        return fem.Function(fem.functionspace(mesh, element), name="displacement")
 
     def displacement(self, unknown: Any) -> Any:
         """u_i x_i / length."""
-        import ufl
-
         x = ufl.SpatialCoordinate(self.mesh)
         return ufl.as_vector([unknown[i] * x[i] / self.axial_length for i in range(3)])
 
     def deformation_gradient(self, unknown: Any) -> Any:
         """Diagonal and constant."""
-        import ufl
-
         stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
         return sum(stretches, ufl.Identity(3))
 
@@ -376,6 +362,10 @@ class _Around:
             raise AttributeError(name)
         return getattr(self.field, name)
 
+    def elastic_gradient(self, unknown: Any) -> Any:
+        """F_e, UFL: what the tissue feels."""
+        return self.elastic(self.deformation_gradient(unknown))
+
 
 class NaturalConfiguration(_Around):
     """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G."""
@@ -385,18 +375,10 @@ class NaturalConfiguration(_Around):
 
     def elastic(self, deformation_gradient: Any) -> Any:
         """F G."""
-        import ufl
-
         return ufl.dot(deformation_gradient, self.gradient)
-
-    def elastic_gradient(self, unknown: Any) -> Any:
-        """F_e = F G."""
-        return self.elastic(self.field.deformation_gradient(unknown))
 
     def stress_free_weight(self, mesh: Any) -> Any:
         """The mesh's weight over det G."""
-        import ufl
-
         return self.field.weight(mesh) / ufl.det(self.gradient)
 
 
@@ -413,42 +395,29 @@ class FreeLength(_Around):
 
     def unknown(self, mesh: Any, degree: int) -> Any:
         """(u, e), zero."""
-        import basix.ufl
-        import dolfinx.fem
-
         element = self.field.unknown(mesh, degree).function_space.ufl_element()
-        number = basix.ufl.element("DG", mesh.topology.cell_name(), 0)
-        space = dolfinx.fem.functionspace(mesh, basix.ufl.mixed_element([element, number]))
-        unknown = dolfinx.fem.Function(with_one_value(space, 1), name="displacement")
+        number = basix_ufl.element("DG", mesh.topology.cell_name(), 0)
+        space = fem.functionspace(mesh, basix_ufl.mixed_element([element, number]))
+        unknown = fem.Function(with_one_value(space, 1), name="displacement")
         nodes, self._dofs = unknown.function_space.sub(0).collapse()
-        self._nodal = dolfinx.fem.Function(nodes)
+        self._nodal = fem.Function(nodes)
         self._length = _constant(mesh, self.body.axial_length)
         return unknown
 
     def change_of_length(self, unknown: Any) -> Any:
         """e, UFL; linear in the unknown."""
-        import ufl
-
         return ufl.split(unknown)[1]
 
     def displacement(self, unknown: Any) -> Any:
         """u + e z/length e_z."""
-        import ufl
-
         u, change = ufl.split(unknown)
         z = ufl.SpatialCoordinate(unknown.ufl_function_space().mesh)[2]
         return self.field.displacement(u) + ufl.as_vector([0.0, 0.0, change * z / self._length])
 
     def deformation_gradient(self, unknown: Any) -> Any:
         """The field's, and e/length along z."""
-        import ufl
-
         u, change = ufl.split(unknown)
         return self.field.deformation_gradient(u) + _along(2, change / self._length)
-
-    def elastic_gradient(self, unknown: Any) -> Any:
-        """Of the field and the length together."""
-        return self.field.elastic(self.deformation_gradient(unknown))
 
     def subspace(self, space: Any, component: int) -> Any:
         """The field's."""
@@ -520,29 +489,21 @@ def field_degree(space: Any) -> int:
 
 def lagrange(mesh: Any, degree: int, shape: tuple[int, ...]) -> Any:
     """A continuous function "displacement", zero, with values of this shape."""
-    import basix.ufl
-    import dolfinx.fem
-
-    element = basix.ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=shape)
-    return dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element), name="displacement")
+    element = basix_ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=shape)
+    return fem.Function(fem.functionspace(mesh, element), name="displacement")
 
 
 def _constant(mesh: Any, value: float) -> Any:
-    import dolfinx.fem
     from petsc4py import PETSc
 
-    return dolfinx.fem.Constant(mesh, PETSc.ScalarType(value))  # type: ignore[attr-defined]
+    return fem.Constant(mesh, PETSc.ScalarType(value))  # type: ignore[attr-defined]
 
 
 def _along(axis: int, value: Any) -> Any:
     """value e (x) e along an axis, UFL."""
-    import ufl
-
     return ufl.as_tensor([[value if i == j == axis else 0.0 for j in range(3)] for i in range(3)])
 
 
 def _circumference(mesh: Any) -> Any:
     """2 pi r on the half-plane y = 0."""
-    import ufl
-
     return 2 * np.pi * ufl.SpatialCoordinate(mesh)[0]

@@ -41,6 +41,10 @@ class UnitCell(NamedTuple):
     axes: Any
     weight: Any = 1.0
 
+    def copy(self) -> UnitCell:
+        """Arrays of its own."""
+        return UnitCell(self.dimensions.copy(), self.axes.copy(), self.weight)
+
     def squared_stretches(self, deformation_gradient: Any) -> list[Any]:
         """I_I = n_I . C n_I, the squared stretches along the three axes (eq. 5).
 

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.energy import Stresses
 
+ufl = Late("ufl")
 Array = NDArray[np.float64]
 Derivatives = tuple[Array, Any, Any]  # D, and as Mandel matrices dD/dS and dD/dC or None
 
@@ -62,8 +64,6 @@ class Driver:
 
 def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
     """b = F F^T (UFL)."""
-    import ufl
-
     return ufl.dot(deformation_gradient, deformation_gradient.T)
 
 

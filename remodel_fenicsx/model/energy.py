@@ -19,11 +19,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.chains import CHAINS, Chain, NO_PARAMETERS, NO_VALUES, Parameter, WithParameters
 from remodel_fenicsx.model.tensors import component, det, is_array, ln, sqrt, squared_norm
 
+ufl = Late("ufl")
 Array = NDArray[np.float64]
 Term = Callable[..., Any]  # of F or J, lambda and mu; those of a matrix with parameters of its own take them too
 
@@ -332,8 +334,6 @@ class Stresses(NamedTuple):
         second_piola_kirchhoff
             What is added to S, UFL, (3, 3).
         """
-        import ufl
-
         F, S = deformation_gradient, second_piola_kirchhoff
         P = ufl.dot(F, S)
         first, second, cauchy = self
@@ -524,15 +524,11 @@ class Tissue:
         cells
             The unit cell: one whole cell, or shares whose weights add up to one.
         """
-        import ufl
-
         F = ufl.variable(deformation_gradient)
         return _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
 
     def stresses_of_parts(self, deformation_gradient: Any, cells: Sequence[UnitCell], jacobian: Any) -> Stresses:
         """The same with U at another J than det F: P = d(W - U)/dF + J U'(J) F^-T, J U' the Kirchhoff pressure; UFL."""
-        import ufl
-
         F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
         pressure = J * ufl.diff(self.volumetric_energy(J), J)
         return _stresses(F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T)
@@ -591,6 +587,4 @@ class Tissue:
 
 def _stresses(F: Any, first: Any) -> Stresses:
     """All of them from P; UFL."""
-    import ufl
-
     return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))

@@ -372,10 +372,7 @@ def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> Uni
 
 def tensor_target(drive: Drive) -> tensor_law.Target:
     """What the structure tensor tends to (`tensor_law.target`, `tensor_law.awake`)."""
-    tensor = drive.tensor
-    if not drive.driver.material:
-        tensor = drive.frame.tensor(drive.deformation_gradient, tensor)
-    found = tensor_law.target(tensor, drive.floor, drive.exponent)
+    found = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
         return found
     return found._replace(share=found.share * tensor_law.awake(drive.tensor, drive.least_tension))

@@ -23,6 +23,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import Late
+
+ufl = Late("ufl")
+
 
 # ---------------------------------------------------------------- the few tensor operations of the model, on UFL
 # On UFL expressions and on arrays alike. Arrays have shape (..., 3, 3) for tensors and (..., 3) for vectors; what is in
@@ -56,8 +60,6 @@ def ln(value: Any) -> Any:
     """
     if is_array(value):
         return np.log(value)
-    import ufl
-
     return ufl.ln(value)
 
 
@@ -65,8 +67,6 @@ def sqrt(value: Any) -> Any:
     """Square root."""
     if is_array(value):
         return np.sqrt(value)
-    import ufl
-
     return ufl.sqrt(value)
 
 
@@ -75,8 +75,6 @@ def det(tensor: Any) -> Any:
     if is_array(tensor):  # np.linalg.det factorises each tensor by itself, which takes ten times as long
         (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(tensor, (-2, -1), (0, 1))
         return a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
-    import ufl
-
     return ufl.det(tensor)
 
 
@@ -84,8 +82,6 @@ def squared_norm(tensor: Any) -> Any:
     """A : A, the sum of the squares of all nine entries."""
     if is_array(tensor):
         return np.einsum("...ij,...ij->...", tensor, tensor)
-    import ufl
-
     return ufl.inner(tensor, tensor)
 
 
@@ -94,8 +90,6 @@ def squared_stretch(deformation_gradient: Any, directions: Any, row: int) -> Any
     if is_array(deformation_gradient):  # by component, three times as fast as np.einsum
         F, n = np.moveaxis(deformation_gradient, (-2, -1), (0, 1)), np.moveaxis(directions[..., row, :], -1, 0)
         return sum((F[i, 0] * n[0] + F[i, 1] * n[1] + F[i, 2] * n[2]) ** 2 for i in range(3))
-    import ufl
-
     fibre = ufl.dot(deformation_gradient, directions[row, :])
     return ufl.inner(fibre, fibre)
 

@@ -44,11 +44,8 @@ log = logging.getLogger(__name__)
 class Work(Counted):
     """Solver work of one step, failed attempts included."""
 
-    newton_iterations: int = 0
-    linear_iterations: int = 0
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
-    tangents: int = 0  # that were assembled
     extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
     last: Solution | None = None
     held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
@@ -340,9 +337,9 @@ class Blend:
         equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
         length = quadrature.owned(equilibrium.locking_length())
         self.theta.value = done
-        now = quadrature.owned(equilibrium.limit_values()[0])
+        now = quadrature.owned(equilibrium.states()[..., 0])
         self.theta.value = 1.0
-        end = quadrature.owned(equilibrium.limit_values()[0])
+        end = quadrature.owned(equilibrium.states()[..., 0])
         allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
         growth = end - now
         room = np.where(growth > 0, (allowed - now) / np.where(growth > 0, growth, 1.0), np.inf)

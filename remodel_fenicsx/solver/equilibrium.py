@@ -99,8 +99,7 @@ class PointwiseRepulsion:
 
     def _modulus(self) -> Array:
         points = self.tissue.map(lambda name, value: assembly.point_values(value, self.quadrature).reshape(-1))
-        modulus: Array = points.repulsion_modulus
-        return modulus
+        return points.repulsion_modulus
 
 
 class PointStresses:
@@ -237,17 +236,14 @@ class Equilibrium:
     def turns_inside_out(self, before: Array, after: Array) -> bool:
         """Whether J vanishes on the straight way between two states at a point of any rank; `Look.states` of both."""
         at = self.state.cells.kernels.may_turn(before, after)
-        turns = at.size > 0 and bool(passes_through_zero(*(_gradients(ends[at]) for ends in (before, after))).any())
+        turns = at.size > 0 and bool(
+            passes_through_zero(*(ends[at, 2:].reshape(-1, 3, 3) for ends in (before, after))).any()
+        )
         return bool(over_ranks(self.comm, turns, MPI.LOR))
 
     def states(self) -> Array:
         """r^2 in squared link lengths (0 without chains), J and F, eleven numbers: (elements, points, 11)."""
         return self.quadrature.evaluate(self._limits, (11,))
-
-    def limit_values(self) -> tuple[Array, Array]:
-        """r^2 in squared link lengths (0 without chains) and J at all points, each (elements, points)."""
-        states = self.states()
-        return states[..., 0], states[..., 1]
 
     def locking_length(self) -> NDArray[np.float64]:
         """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""
@@ -326,11 +322,6 @@ class Equilibrium:
                 condition.set(target)
             target -= values
         return float(over_ranks(self.comm, float(np.abs(target).max(initial=0.0)), MPI.MAX))
-
-
-def _gradients(states: Array) -> Array:
-    """F (n, 3, 3) of states (n, 11)."""
-    return states[:, 2:].reshape(-1, 3, 3)
 
 
 def _depends_on(form: Any, unknown: Any) -> bool:

@@ -159,7 +159,7 @@ class Limits:
             return 0.0
         quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
         if self._chains is None:
-            length = np.sqrt(squares_of(cells.dimension_values)) / self.equilibrium.locking_length()
+            length = np.sqrt((cells.dimension_values**2).sum(axis=-1)) / self.equilibrium.locking_length()
             self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
         room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, NEAR_LIMIT)
         return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
@@ -170,12 +170,6 @@ def reserved(before: float, after: float) -> bool:
     return not after > NEAR_LIMIT or 1 - after >= RESERVE * (1 - before)
 
 
-def squares_of(vectors: Array) -> Array:
-    """Squared length of vectors (..., 3)."""
-    squares: Array = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
-    return squares
-
-
 log = logging.getLogger(__name__)
 
 
@@ -183,12 +177,13 @@ LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
 
 
+@dataclass(eq=False)
 class Counted:
     """Work of the solver."""
 
-    newton_iterations: int
-    linear_iterations: int
-    tangents: int  # that were assembled
+    newton_iterations: int = 0
+    linear_iterations: int = 0
+    tangents: int = 0  # that were assembled
 
     def count(self, other: Counted) -> None:
         """Add the work of another solve."""
@@ -201,15 +196,12 @@ class Counted:
 class Solution(Counted):
     """A solve that has ended well."""
 
-    newton_iterations: int
-    linear_iterations: int
     residual: float = 0.0
-    tangents: int = 0
     extension: Extension | None = None
     reach: float = 0.0
 
 
-class SolveFailure(Counted, RuntimeError):
+class SolveFailure(RuntimeError, Counted):
     """SNES did not find an admissible equilibrium; the unknowns before the call are restored."""
 
     def __init__(
@@ -275,7 +267,7 @@ class LoadPhase:
 
 
 class GuardedNewton:
-    """Solves an equilibrium from the present unknowns; use `close` (or `with`) when it is needed no more."""
+    """Solves an equilibrium from the present unknowns; use `close` when it is needed no more."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
         self.equilibrium, self.settings, self._robust = equilibrium, settings, robust
@@ -309,7 +301,7 @@ class GuardedNewton:
         self.limits = Limits(equilibrium, bounded)
         snes: Any = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
-        snes.setJacobian(self._assemble_tangent, self._matrix)
+        snes.setJacobian(lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()), self._matrix)
         snes.setLineSearchPreCheck(self._keep_admissible)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=settings.maximum_iterations)
         self._options.apply(snes)
@@ -343,12 +335,6 @@ class GuardedNewton:
         self._linear.close()
         self._snes.destroy()
         self._options.close()
-
-    def __enter__(self) -> GuardedNewton:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def solve(self, origin: Array | None = None) -> Solution:
         """Solve from the present unknowns; on success they are the solution."""
@@ -408,7 +394,7 @@ class GuardedNewton:
             raise SolveFailure(text, newton, linear, extension, left, self._linear.tangents - tangents, relative)
         self._linear.ended(newton)
         norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
-        return Solution(newton, linear, norm, tangents, extension, self._reach())
+        return Solution(newton, linear, tangents, norm, extension, self._reach())
 
     def _reach(self) -> float:
         """`Solution.reach` of the present unknowns."""
@@ -519,9 +505,6 @@ class GuardedNewton:
             residual.set(np.nan)
             return
         self.convergence.displacement = x.norm(PETSc.NormType.NORM_INFINITY)
-
-    def _assemble_tangent(self, snes: Any, x: Any, matrix: Any, preconditioner: Any) -> None:
-        self._linear.tangent(self._present.norm, self.convergence.goal())
 
     def _keep_admissible(self, x: Any, step: Any) -> bool:
         """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step."""

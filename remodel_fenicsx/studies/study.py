@@ -77,10 +77,6 @@ class Run:
             return int(time.progress(len(times) - 1, float(times[-1]))) if len(times) else 0
         return 0
 
-    def is_under_way(self) -> bool:
-        """Whether a process writes in its folder."""
-        return self.folder.is_dir() and writer(self.folder)[1]
-
     def is_complete(self) -> bool:
         """Whether this very scene is recorded to its end."""
         if not all((self.folder / name).exists() for name in (SCENE, HISTORY)):
@@ -214,7 +210,9 @@ class Study:
         for run in list(self._waiting):
             if len(self._running) >= self.jobs:
                 return
-            if run.is_under_way():  # by another command, or by a process whose command was killed and that is ending
+            if (
+                run.folder.is_dir() and writer(run.folder)[1]
+            ):  # by another command, or one that was killed and is ending
                 continue
             self._waiting.remove(run)
             if self._is_left(run) and self.fits(run):

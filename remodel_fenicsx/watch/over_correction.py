@@ -147,13 +147,8 @@ class OverCorrection(WarnsOnce):
 
     def _rested(self, cells: list[Array]) -> bool:
         """Whether one of the passes has left most cells as they were: what goes on after that jumps."""
-        same = [self._at_points(a == b).all(axis=-1) for a, b in pairwise(cells[: ORDER + 1]) if self._may_rest(a, b)]
+        same = [self._at_points(a == b).all(axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
         return any(self.quadrature.mean(passed.astype(np.float64)) > RESTED_SHARE for passed in same)
-
-    def _may_rest(self, a: Array, b: Array) -> bool:
-        """Whether some point has kept its first component: most often none has, and nothing need be summed up."""
-        first = a[:: len(tensors.MANDEL)] == b[:: len(tensors.MANDEL)]
-        return bool(over_ranks(self.state.comm, bool(first.any()), MPI.LOR))
 
     def _evenly(self, step: Step) -> bool:
         """Whether the passes are about as far from each other: of others a single jump looks like a swing."""
@@ -263,5 +258,4 @@ class RestedCells(WarnsOnce):
 
 def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
     """Where tensors (elements, points, 6) are not the same to the last bit."""
-    differ: NDArray[np.bool_] = np.any(one != other, axis=-1)
-    return differ
+    return np.any(one != other, axis=-1)

@@ -64,10 +64,12 @@ class EquilibriumStability(Watcher):
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
             overdue = False
             if step.is_last:
-                self._info(
+                self._say(
+                    logging.INFO,
                     "the stability of equilibria was not checked: with %d unknowns that is done only on request, by "
-                    "the column negative_eigenvalues or solver.unstable = 'stop'", self.unknowns,
-                )  # fmt: skip
+                    "the column negative_eigenvalues or solver.unstable = 'stop'",
+                    self.unknowns,
+                )
         if not (suspicious or overdue or self.every_step):
             return
         step.negative_eigenvalues = count = self._count()
@@ -77,31 +79,37 @@ class EquilibriumStability(Watcher):
         self.signs.settle()
         if count != known:
             self._numbers["known"] = count
-            self._say(step, known, int(count))
+            self._judge(step, known, int(count))
 
     # ------------------------------------------------------------ what it means
     def _count(self) -> float:
         try:
             return self.inertia.negative_eigenvalues()
         except FactorisationFailed as failure:
-            self._warn("the stability of the equilibrium is not known: %s", failure)
+            self._say(logging.WARNING, "the stability of the equilibrium is not known: %s", failure)
             return float("nan")
 
-    def _say(self, step: Step, before: int, now: int) -> None:
+    def _judge(self, step: Step, before: int, now: int) -> None:
         if now < before:
-            self._info("%s: %s of the tangent, %d before", step.moment, eigenvalues(now), before)
+            self._say(logging.INFO, "%s: %s of the tangent, %d before", step.moment, eigenvalues(now), before)
             return
         unloaded, scale = self._of_the_unloaded_body()
         if now <= unloaded:
-            self._info(
+            self._say(
+                logging.INFO,
                 "%s: %s of the tangent. The unloaded body has %d, from the stress of its cells at the start: the "
-                "equilibrium is not lost", step.moment, eigenvalues(now), unloaded,
-            )  # fmt: skip
+                "equilibrium is not lost",
+                step.moment,
+                eigenvalues(now),
+                unloaded,
+            )
             return
         text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
         if self.stops:
             raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
-        self._warn("%s: the equilibrium is unstable, and the body would leave it: %s", step.moment, text)
+        self._say(
+            logging.WARNING, "%s: the equilibrium is unstable, and the body would leave it: %s", step.moment, text
+        )
 
     def _of_the_unloaded_body(self) -> tuple[int, float]:
         """`inertia.of_the_unloaded_body`, once."""
@@ -109,13 +117,9 @@ class EquilibriumStability(Watcher):
             self._unloaded = of_the_unloaded_body(self.inertia)
         return self._unloaded
 
-    def _warn(self, *message: Any) -> None:
+    def _say(self, level: int, *message: Any) -> None:
         if self.state.comm.rank == 0:
-            log.warning(*message)
-
-    def _info(self, *message: Any) -> None:
-        if self.state.comm.rank == 0:
-            log.info(*message)
+            log.log(level, *message)
 
 
 class Signs:
@@ -314,8 +318,7 @@ class BucklingWarning(WarnsOnce):
         cells = self.state.cells.point_cells
         number = len(F)
         cell = UnitCell(cells.dimensions[:number], cells.axes[:number])
-        energies: Array = self._tissue.strain_energy(stretch @ F, [cell])
-        return energies
+        return self._tissue.strain_energy(stretch @ F, [cell])
 
     def _as_elements_take_it(self) -> Array:
         """F, with one J in an element where differences of it cost nothing."""

@@ -396,8 +396,7 @@ class VolumeResponse:
         states = quadrature.owned(self.stepper.coupling.equilibrium.states())
         changes = quadrature.beyond(0, np.log(states[..., 1])[..., None])[..., 0]
         F = states[..., 2:].reshape(*changes.shape, 3, 3)
-        stress: Array = (self.stiffness * changes / states[..., 1])[..., None, None] * cofactor(F)
-        return stress
+        return (self.stiffness * changes / states[..., 1])[..., None, None] * cofactor(F)
 
     def _assemble(self, stress: Array, forces: Any) -> None:
         """Nodal forces of a stress, zero where displacements are prescribed."""
@@ -440,7 +439,8 @@ class VolumeResponse:
 
     def _part_of_the_way(self, first: Any, factor: float) -> float:
         """Of the missing motion, its component along the way: each direction of space counts by what it lacks."""
-        state, number = self.state, self._number_of_nodes
+        state = self.state
+        number = int(state.kinematics.nodal_space(state.unknown).dofmap.index_map.size_local)
         has = state.kinematics.nodal_displacement(state.unknown)[:number].copy()
         lacks = factor * state.kinematics.nodal_displacement(self._function(first))[:number]
         way = has + lacks
@@ -448,12 +448,6 @@ class VolumeResponse:
         lengths = np.sqrt(squares)
         missing = np.abs(along) / np.where(lengths > 0, lengths, 1.0)
         return float(missing @ missing / (missing @ lengths)) if missing.any() else 0.0
-
-    @cached_property
-    def _number_of_nodes(self) -> int:
-        """That this rank owns."""
-        space = self.state.kinematics.nodal_space(self.state.unknown)
-        return int(space.dofmap.index_map.size_local)
 
     def _function(self, vector: Any) -> Any:
         """A change of the unknowns as a dolfinx function, ghosts included."""

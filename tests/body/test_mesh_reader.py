@@ -17,7 +17,7 @@ from remodel_fenicsx import SceneError
 from remodel_fenicsx.body import mesh_file
 from remodel_fenicsx.body.mesh_faces import boundary_of, jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFileError, read_mesh
-from remodel_fenicsx.body.mesh_refinement import refined
+from remodel_fenicsx.body.mesh_body import refined
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.mesh_files import write_tube

@@ -61,7 +61,7 @@ def test_a_full_disk_leaves_whole_rows(room: int, tmp_path: Path) -> None:
 
 
 def test_a_row_holds_each_number_under_its_own_name() -> None:
-    step = Step(3.0, 3, {"force": 2.0}, Extension(0.9, 0.8, (0.0, 0.0, 0.0)), Work(5, 6, 7), 11.0, 12.0)
+    step = Step(3.0, 3, {"force": 2.0}, Extension(0.9, 0.8, (0.0, 0.0, 0.0)), Work(5, 6, substeps=7), 11.0, 12.0)
     equilibrium = SimpleNamespace(stored_energy=lambda: 10.0)
     measurement = SimpleNamespace(step=step, equilibrium=equilibrium)
     row = {name: column.value(measurement) for name, column in COLUMNS.items()}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, Simulation
-from remodel_fenicsx.evolution.predictor import PREDICTORS, Autoregressive, LoadStep, NoPredictor, Responsive
+from remodel_fenicsx.evolution.coupling import PREDICTORS, Autoregressive, LoadStep, Predictor, Responsive
 from remodel_fenicsx.results.checkpoint_file import read_checkpoint
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.solver.equilibrium import Equilibrium
@@ -98,11 +98,11 @@ def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation
 
 def test_with_tolerance_predicts_where_steps_are_chosen() -> None:
     equal = pulled_cube(9.0).with_values({"solver.predictor": "with-tolerance"})
-    for scene, kind in ((equal, NoPredictor), (equal.with_values({"time.tolerance": 1.0}), Responsive)):
+    for scene, kind in ((equal, Predictor), (equal.with_values({"time.tolerance": 1.0}), Responsive)):
         simulation = Simulation(scene, SELF)
         assert type(simulation.stepper.coupling.predictor) is kind  # type: ignore[attr-defined]
         simulation.close()
-    assert PREDICTORS["with-tolerance"] is NoPredictor
+    assert PREDICTORS["with-tolerance"] is Predictor
 
 
 def test_another_rate_is_a_new_beginning(simulation: Simulation) -> None:

@@ -121,15 +121,15 @@ def test_each_part_of_the_exchange_leaves_a_reserve_at_every_point(
     if not predicted:
         monkeypatch.setattr(GuardedNewton, "tangent_direction", lambda *change: np.array([np.nan]))
     coupling.blend.set(0.0)
-    reserve_before = [1 - np.sqrt(coupling.blend.equilibrium.limit_values()[0]) / length]
+    reserve_before = [1 - np.sqrt(coupling.blend.equilibrium.states()[..., 0]) / length]
 
     def watched(newton: GuardedNewton, origin: Any = None) -> Solution:
         if newton is coupling.newton:
             return real(newton, origin)
-        now = 1 - np.sqrt(newton.equilibrium.limit_values()[0]) / length
+        now = 1 - np.sqrt(newton.equilibrium.states()[..., 0]) / length
         reserve.append(float(np.min(now / reserve_before[-1])))
         solution = real(newton, origin)
-        reserve_before.append(1 - np.sqrt(newton.equilibrium.limit_values()[0]) / length)
+        reserve_before.append(1 - np.sqrt(newton.equilibrium.states()[..., 0]) / length)
         return solution
 
     monkeypatch.setattr(GuardedNewton, "solve", watched)
@@ -148,7 +148,7 @@ def test_the_bound_of_a_part_is_where_the_first_point_has_lost_its_share() -> No
 
     def left(theta: float) -> np.ndarray:
         blend.set(theta)
-        return 1 - np.sqrt(blend.equilibrium.limit_values()[0]) / parts.MATERIAL.contour_length
+        return 1 - np.sqrt(blend.equilibrium.states()[..., 0]) / parts.MATERIAL.contour_length
 
     first = blend.largest_part(0.0)
     for done in (0.0, first / 2):

@@ -21,7 +21,7 @@ from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, re
 from remodel_fenicsx.results.recording import FolderTaken, RunLock
 from remodel_fenicsx.schema.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
-from remodel_fenicsx.studies.measurements import read_measurements
+from remodel_fenicsx.studies.fit import read_measurements
 
 ROOT, FITS = Path(__file__).parents[2], Path(__file__).with_name("fits")
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}

@@ -6,6 +6,7 @@ import csv
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,7 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.studies.stability import verdict
-from remodel_fenicsx.watch.amplification import AmplificationWatcher, LinearPass
+from remodel_fenicsx.studies.stability import AmplificationWatcher, LinearPass, verdict
 from tests.conftest import mpirun
 from tests.watch.test_over_correction import Tilt
 
@@ -57,7 +57,7 @@ def test_the_map_is_what_a_solve_and_a_pass_make_of_other_cells(frame: str) -> N
         change[:, 0, 1] = change[:, 1, 0] = 0.0  # l_2 = l_3: a turn there is no change of A
         change[:, 1, 1] = change[:, 0, 0]
         before = [f.x.array.copy() for f in (unknown, cells.dimensions, cells.axes)]
-        with LinearPass(stepper, step.time, step.work.residual) as linear:
+        with closing(LinearPass(stepper, step.time, step.work.residual)) as linear:
             expected = linear(change)
             other = structure_tensor(*linear._changed(1e-5 * change)[:2]) - structure_tensor(*linear.cells[:2])
             np.testing.assert_allclose(other, 1e-5 * change, atol=1e-8)
