@@ -44,7 +44,7 @@ def made(seed: int) -> tuple[Values, Values]:
     scene["cells"] = _cells(random, shape, r0)
     if scene["cells"]["initial"] == "random" and scene["remodeling"]["law"] != "tensor":
         if scene["remodeling"]["coupling"] == "implicit":  # by rank such cells jump, which is refused
-            scene["remodeling"]["coupling"] = "staggered"
+            scene["remodeling"]["coupling"] = "relaxed"
     scene["supports"] = {
         "ends": random.choices(("free", "clamped", "closed"), (12, 1, 2))[0] if shape == "tube" else "free"
     }
