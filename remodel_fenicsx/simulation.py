@@ -22,13 +22,12 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
-from remodel_fenicsx.schema.settings import Cells, Properties
+from remodel_fenicsx.schema.settings import Cells, Properties, missing_for_steps_of_cells
 from remodel_fenicsx.state.state import State, UnitCells, by_region
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
@@ -173,7 +172,7 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
     at_once, solver, settings = scene.time.is_equilibrium, scene.solver, scene.remodeling
     if (at_once or scene.time.tolerance is not None) and solver.predictor != "none":
         solver = solver.model_copy(update={"predictor": "responsive"})  # steps have all lengths
-    if at_once and _jump_by_rank(scene):  # no step is short enough, and passes swing
+    if at_once and scene.has_random_cells and scene.jumps_by_rank:  # no step is short enough, and passes swing
         settings = settings.model_copy(update={"coupling": "relaxed"})
     first, *more = (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, settings, solver, first, coupling, kappa)
@@ -247,11 +246,6 @@ def _states(scene: Scene, domain: Domain) -> list[State]:
     return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 
 
-def _jump_by_rank(scene: Scene) -> bool:
-    """Whether cells are random, and jump from rank to rank."""
-    return scene.has_random_cells and LAWS[scene.remodeling.law].dimensions is not None
-
-
 def _way_to_rest(scene: Scene, stepper: Stepper) -> Any:
     """What goes with the stepper until the cells rest."""
     from remodel_fenicsx.evolution import homeostasis
@@ -261,11 +255,11 @@ def _way_to_rest(scene: Scene, stepper: Stepper) -> Any:
     if tolerance is None:
         falls = any(load.falls for load in scene.loads.values())
         tolerance = homeostasis.UNLOADING if falls else homeostasis.TOLERANCE
-    if _jump_by_rank(scene):
+    if scene.has_random_cells and scene.jumps_by_rank:
         tolerance = homeostasis.COARSE
     control = StepControl(stepper, tolerance, scene.time.step, stops, homeostasis.LONGEST)
     limit = None
-    if scene.missing_for_implicit() is None:
+    if missing_for_steps_of_cells(scene) is None:
         until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
         limit = homeostasis.Limit(stepper.state, stepper.tissue, stepper.remodeling, until)
     return homeostasis.Homeostasis(control, max(stops[:-1], default=0.0), limit)

@@ -237,9 +237,6 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.step.negative_eigenvalues,
             by_case=False,
         ),
-        _of_work(
-            "held_points", "number of points at which the coupling 'implicit' found no cells that fit their own stress"
-        ),
         Column(
             "asleep_share",
             "",

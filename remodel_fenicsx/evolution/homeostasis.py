@@ -53,10 +53,9 @@ LONGEST_HOLD = 100.0  # times 1/kappa under held loads after which cells that do
 
 
 class Limit(Implicit):
-    """A step over a time without end, in one piece or not at all; no point is held."""
+    """A step over a time without end, in one piece or not at all."""
 
     def _solve(self, time: float, loads: LoadValues, work: Work, answering: bool) -> None:
-        self.answering.may_hold = False
         self.state.loading.set(loads)
         work.add(self.newton.solve())
         work.substeps += 1

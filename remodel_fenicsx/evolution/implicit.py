@@ -20,16 +20,16 @@ from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
 from remodel_fenicsx.model import implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.implicit import StepOfCells, jumps_by_rank
+from remodel_fenicsx.model.implicit import StepOfCells
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
 from remodel_fenicsx.model.tensors import det
 from remodel_fenicsx.model.turnover import TurnoverRule
 from remodel_fenicsx.schema.settings import Solver
-from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
+from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.state.state import Numbers, State, at_points
+from remodel_fenicsx.state.state import State, at_points
 
 
 # ---------------------------------------------------------------- cells that answer within a solve
@@ -40,13 +40,9 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-BEFORE_HOLDING = 5
-"""Newton iterations after which cells that still jump are held (by rank there are states without a solution), or after
-which states where cells are not found are refused (where none may be held)."""
+BEFORE_REFUSAL = 5  # Newton iterations after which states are refused where some point has no cells
 PASSES = 8  # with frozen cells, before a second try
 SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
-JUMP = 0.02
-"""Change of A over r0^2 from one iteration to the next that is a jump after so many."""
 
 
 class AnsweringCells:
@@ -58,18 +54,14 @@ class AnsweringCells:
         self.stress = self.quadrature.function("answering_stress", (3, 3))
         self.tangent = self.quadrature.function("answering_tangent", (9, 9))
         self.frozen: UnitCell | None = None
-        self.may_hold = True
-        self.held: Flags
         self._kernels = tensor_kernels(state.comm) if remodeling.law.target is not None else None
         self._points: condensed.CondensedPoints
-        self._jumps: Flags  # points where the law jumps
         self._found: condensed.LocalSolution
         self._gradient: Array | None = None  # F of what was found
         self._tangent_is_there = False
         self._start: Array
         self.accepted: Array
         self._iterations = 0
-        self._last_structure: Array
 
     # ------------------------------------------------------------ a step
     def begin(self, time: float, residual: float) -> None:
@@ -81,7 +73,6 @@ class AnsweringCells:
         step = StepOfCells(self.remodeling.law, drive, old, structure_tensor(*old[:2]), self.state.time, time, rule)
         self._points = condensed_points(self._kernels, at_points(self.tissue, self.quadrature), step)
         self.accepted = self._points.with_cells(drive.deformation_gradient, old).driving_tensor
-        self._jumps = jumps_by_rank(step)
         self.release()
 
     def set_time(self, time: float) -> None:
@@ -91,7 +82,6 @@ class AnsweringCells:
 
     def release(self) -> None:
         """All cells answer again, from the driving tensor of the last accepted state."""
-        self.held = np.zeros_like(self._jumps)
         self._start, self._gradient, self._iterations = self.accepted, None, 0
 
     def freeze(self, cells: UnitCell | None = None) -> None:
@@ -125,35 +115,14 @@ class AnsweringCells:
         """ln m and ln rho (2, n) of the last update, where they change."""
         return None if self._found.turnover is None else self._found.turnover.T
 
-    def jumps_somewhere(self) -> bool:
-        """Whether there are points, on any rank, where the law jumps."""
-        return self._count(self._jumps) > 0
-
     def complete(self) -> bool:
-        """Whether the cells of the present unknowns may end a step: all belong to their stress, or may be held."""
+        """Whether at all points, of all ranks, cells belong to the stress of the present unknowns."""
         self.update()
-        return self._count(self._unanswered & ~self._holdable) == 0
+        return not self._anywhere(~self._found.converged)
 
-    def held_points(self) -> int:
-        """At how many points of all ranks the cells do not belong to the stress."""
-        return self._count(self._unanswered)
-
-    def held_share(self) -> float:
-        """Their share of the body."""
-        return self.quadrature.mean(self._unanswered.reshape(self.quadrature.shape).astype(np.float64))
-
-    @property
-    def _holdable(self) -> Flags:
-        return self._jumps & self.may_hold
-
-    @property
-    def _unanswered(self) -> Flags:
-        points: Flags = self.held | ~self._found.converged
-        return points
-
-    def _count(self, points: Flags) -> int:
+    def _anywhere(self, points: Flags) -> bool:
         owned = self.quadrature.owned(points.reshape(self.quadrature.shape))
-        return int(self.state.comm.allreduce(int(owned.sum())))
+        return bool(self.state.comm.allreduce(int(owned.any())))
 
     # ------------------------------------------------------------ values
     def update(self, tangent: bool = False) -> None:
@@ -165,10 +134,10 @@ class AnsweringCells:
             stress = self._found.first_piola_kirchhoff.reshape(*self.quadrature.shape, 3, 3)
             self.quadrature.values(self.stress, (3, 3))[:] = stress
         if tangent and not self._tangent_is_there:
-            self._hold_what_jumps()
+            self._iterations += 1
             self._start = self._found.driving_tensor
-            held = self.held if self.frozen is None else np.ones_like(self.held)
-            values = self._points.tangent(self._found, held).reshape(*self.quadrature.shape, 9, 9)
+            derivative = self._points.tangent if self.frozen is None else self._points.frozen_tangent
+            values = derivative(self._found).reshape(*self.quadrature.shape, 9, 9)
             self.quadrature.values(self.tangent, (9, 9))[:] = values
             self._tangent_is_there = True
 
@@ -177,18 +146,7 @@ class AnsweringCells:
             F = np.where((det(F) > 0)[:, None, None], F, np.eye(3))
             if self.frozen is not None:
                 return self._points.with_cells(F, self.frozen)
-            before = self._found if self.held.any() else None
-            return self._points.solve(F, self._start, self.held, before)
-
-    def _hold_what_jumps(self) -> None:
-        """From an iteration on; only laws by rank jump, others fail and the step is made in parts."""
-        self._iterations += 1
-        structure = self._found.structure
-        if self._iterations > BEFORE_HOLDING and self.frozen is None:
-            change = np.linalg.norm(structure - self._last_structure, axis=(1, 2))
-            jumps = change > JUMP * self._points.step.drive.end_to_end_length**2
-            self.held = self.held | (self._holdable & (jumps | ~self._found.converged))
-        self._last_structure = structure
+            return self._points.solve(F, self._start)
 
     def squared_lengths(self) -> Array:
         """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
@@ -198,13 +156,13 @@ class AnsweringCells:
 
     @property
     def _refused(self) -> Flags:
-        """Points without a solution, after so many iterations that none is expected, that may not be held."""
-        return ~(self._found.converged | self._holdable) & (self._iterations > BEFORE_HOLDING)
+        """Points without a solution, after so many iterations that none is expected."""
+        return ~self._found.converged & (self._iterations > BEFORE_REFUSAL)
 
     def unsolved(self, locking_length: Array) -> bool:
         """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
         self.update()
-        return self._count(self._refused & (self._found.squared_lengths < locking_length.reshape(-1) ** 2)) > 0
+        return self._anywhere(self._refused & (self._found.squared_lengths < locking_length.reshape(-1) ** 2))
 
 
 class AnsweringEquilibrium(Equilibrium):
@@ -256,7 +214,7 @@ class AnsweringNewton(GuardedNewton):
         self._patient = False  # whether shorter steps are looked for where cells have no solution
 
     def solve(self, origin: Array | None = None) -> Solution:
-        """As of `GuardedNewton`; at first no cells are held."""
+        """As of `GuardedNewton`, or from where passes lead, or at last with shorter steps."""
         # Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
         # equilibrium to which passes with frozen cells come: it often is near.
         start, accepted = self.unknown.x.array.copy(), self.answering.accepted
@@ -265,36 +223,31 @@ class AnsweringNewton(GuardedNewton):
         except SolveFailure as failure:
             if self.answering.frozen is not None:
                 raise
-            log.info("the step is solved once more, from where remodeling passes lead: %s", failure.reason)
+            work = failure
+        for again in (self._solved_after_passes, self._solved_patiently):
             try:
-                return self._after_passes(failure, start, accepted)
-            except SolveFailure:
-                self.unknown.x.array[:], self.answering.accepted = start, accepted
-                raise
-
-    def _after_passes(self, failure: SolveFailure, start: Any, accepted: Any) -> Solution:
-        """Solve from where passes lead; where no law jumps, at last from the start with shorter steps."""
-        try:
-            if not self._pass(failure):
-                log.info("remodeling passes do not converge")
-                raise failure
-            solution = self._solved()
-            solution.count(failure)
-            return solution
-        except SolveFailure as again:
-            if again is not failure:
-                again.count(failure)
-            if self.answering.jumps_somewhere():
-                raise
-            self.unknown.x.array[:], self.answering.accepted, self._patient = start, accepted, True
-            log.info("the step is solved once more, with shorter Newton steps: %s", again.reason)
-            try:
-                solution = self._solved()
-                solution.count(again)
+                solution = again(work)
+                solution.count(work)
                 return solution
-            except SolveFailure as last:
-                last.count(again)
-                raise
+            except SolveFailure as failure:
+                if failure is not work:
+                    failure.count(work)
+                    work = failure
+                self.unknown.x.array[:], self.answering.accepted = start, accepted
+        raise work
+
+    def _solved_after_passes(self, work: SolveFailure) -> Solution:
+        log.info("the step is solved once more, from where remodeling passes lead: %s", work.reason)
+        if not self._pass(work):
+            log.info("remodeling passes do not converge")
+            raise work
+        return self._solved()
+
+    def _solved_patiently(self, work: SolveFailure) -> Solution:
+        log.info("the step is solved once more, with shorter Newton steps: %s", work.reason)
+        self._patient = True
+        try:
+            return self._solved()
         finally:
             self._patient = False
 
@@ -346,8 +299,6 @@ class AnsweringNewton(GuardedNewton):
 
 
 RESIDUAL = "residual of the last step"
-MUCH_MORE = 2.0  # times the share that was said
-STEP_HALVINGS = 1  # of a step, before points are held; where there is no solution parts cost, and do not help
 MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with its parts; then it is refused
 
 
@@ -365,7 +316,6 @@ class Implicit:
         self.newton: GuardedNewton = AnsweringNewton(solved, settings)
         self.turnover, self._power = remodeling.turnover, 0.0
         state.numbers[RESIDUAL] = 0.0
-        self._numbers = Numbers(state, "implicit", {"held": 0.0})  # the largest share that a warning has named
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium at `time` with the cells that belong to it."""
@@ -379,8 +329,6 @@ class Implicit:
         self._solve(time, loads, work, answering=True)
         work.substeps -= int(self.state.number == 0)
         self.state.numbers[RESIDUAL] = work.residual
-        work.held_points = self.answering.held_points()
-        self._say(time, self.answering.held_share())
         work.extension = None  # the row's is with the cells that are taken over now
         self._power = self.remodeling.replace(self.answering.asked, start, time - self.state.time)
         self.state.settle_cells()
@@ -404,45 +352,11 @@ class Implicit:
         weight = weight_of_the_end(self.remodeling.kappa * (step.time_new - step.time_old))
         return relaxed(from_start, self.answering.asked, weight)
 
-    def _say(self, time: float, share: float) -> None:
-        """Warn of cells that do not belong to their stress; again where they are much more."""
-        if share <= MUCH_MORE * self._numbers["held"]:
-            return
-        self._numbers["held"] = share
-        if self.state.comm.rank == 0:
-            log.warning(
-                "time %g: in %.3g %% of the body no cells were found that fit their own stress, in parts of the step "
-                "neither. The cells there keep their last values, so the row is not the implicit solution. "
-                "The column held_points counts the points; smaller steps have fewer, the law 'tensor' has none",
-                time,
-                100 * share,
-            )
-
     def close(self) -> None:
         """Free PETSc's objects."""
         self.newton.close()
 
     def _solve(self, time: float, loads: LoadValues, work: Work, answering: bool) -> None:
-        """With all cells belonging to their stress; where that cannot be, not even in parts, some are held."""
-        answers, unknown, old = self.answering, self.state.unknown.x.array, dict(self.state.loading.values)
-        before, residual, most = unknown.copy(), work.residual, self.settings.maximum_halvings
-        if not answering or not answers.jumps_somewhere():
-            self._solve_or_part(time, loads, work, answering, most)
-            return
-        answers.may_hold = False
-        try:
-            self._solve_or_part(time, loads, work, answering, min(STEP_HALVINGS, most))
-        except StepFailure as failure:
-            log.info("some cells keep their last values: %s", failure)
-            unknown[:] = before
-            self.state.loading.set(old)
-            answers.begin(time, residual)
-            answers.may_hold = True
-            self._solve_or_part(time, loads, work, answering, most)
-        finally:
-            answers.may_hold = True
-
-    def _solve_or_part(self, time: float, loads: LoadValues, work: Work, answering: bool, halvings: int) -> None:
         """In one piece, or in parts of time and loads."""
         loading, answers, start = self.state.loading, self.answering, self.state.time
         old = dict(loading.values)
@@ -456,14 +370,14 @@ class Implicit:
             answers.freeze()
         before, stage = self.state.unknown.x.array.copy(), "the step" if answering else "the change of the loads"
         most = MOST_SOLVES * self.settings.maximum_iterations + work.newton_iterations
+        halvings = self.settings.maximum_halvings
         change = Change(time, stage, set_fraction, self.newton, halvings, most_iterations=most)
         try:
             set_fraction(1.0)
             loading.set(loads)
             work.add(self.newton.solve())
             work.substeps += 1
-            # with cells that are held the way in parts has been tried already
-            if not answers.held_points() and change.look_back(before, work):
+            if change.look_back(before, work):
                 work.add(self.newton.solve())  # the cells that answer the unknowns: there is nothing else to do
         except SolveFailure as failure:
             work.add(failure)

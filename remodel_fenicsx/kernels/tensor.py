@@ -111,10 +111,8 @@ class CompiledPoints(CondensedPoints):
         given = self.step.structure, parameters, drive.floor, drive.rounding, rate, *numbers
         self.kernels.call(name, len(F), F, tensor, *given, *results)
 
-    def solve(
-        self, F: Array, start: Array, held: Flags | None = None, before: LocalSolution | None = None
-    ) -> LocalSolution:
-        """As `CondensedPoints.solve`; no point is held, for the law jumps nowhere."""
+    def solve(self, F: Array, start: Array) -> LocalSolution:
+        """As `CondensedPoints.solve`."""
         tensor, structure, stress = np.empty((3, len(F), 3, 3))
         squared, converged = np.empty(len(F)), np.empty(len(F), np.bool_)
         self._call("solve", F, start, tensor, structure, stress, squared, converged)
@@ -123,11 +121,10 @@ class CompiledPoints(CondensedPoints):
             put(found, lost, self.at(lost).solve(F[lost], start[lost]))
         return found
 
-    def tangent(self, found: LocalSolution, held: Flags) -> Array:
+    def tangent(self, found: LocalSolution) -> Array:
         """As `CondensedPoints.tangent`."""
-        frozen, result = held | ~found.converged, np.empty((len(found.gradient), 3, 3, 3, 3))
-        if not frozen.all():
-            self._call("tangent", found.gradient, found.driving_tensor, result)
-        if frozen.any():
-            result[frozen] = self.at(frozen).tangent(at(found, frozen), held[frozen])
+        lost, result = ~found.converged, np.empty((len(found.gradient), 3, 3, 3, 3))
+        self._call("tangent", found.gradient, found.driving_tensor, result)
+        if lost.any():
+            result[lost] = self.at(lost).frozen_tangent(at(found, lost))
         return result

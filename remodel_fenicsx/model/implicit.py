@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 
 AGREE = 1e-7
 """Relative difference of two principal values below which nothing is known about a turn in their plane."""
-SAME_LENGTH = 1e-9  # over r0: lengths of isotropic cells, but for rounding
 
 
 class StepOfCells(NamedTuple):
@@ -69,18 +68,6 @@ class Response(NamedTuple):
     cells: LocalCells
     by_tensor: Array | None = None
     by_stretch: Array | None = None
-
-
-def jumps_by_rank(step: StepOfCells) -> NDArray[np.bool_]:
-    """Where cells jump when principal values cross, (n,): where equal targets leave the ranks different lengths."""
-    # There the equations of an implicit step may have no solution. Elsewhere cells are continuous in the driving
-    # tensor: from isotropic cells eq. (11) never jumps, and the law for A nowhere.
-    if step.law.dimensions is None:
-        return np.zeros(len(step.structure), dtype=bool)
-    r0 = np.asarray(step.drive.end_to_end_length)
-    lengths = _lengths(step, np.repeat(r0[:, None] / np.sqrt(3), 3, axis=1))
-    apart: NDArray[np.bool_] = np.ptp(lengths, axis=1) > SAME_LENGTH * r0
-    return apart & (np.asarray(step.drive.kappa) > 0.0)
 
 
 def _lengths(step: StepOfCells, target: Any) -> Array:
@@ -139,9 +126,7 @@ def _drive(step: StepOfCells, strain: Strain, tensor: Array, old: UnitCell) -> D
     U = np.zeros_like(tensor)
     U[:, range(3), range(3)] = strain.stretches
     axes = carried_axes(U, old.axes) if step.carries_axes else old.axes
-    # an error may not decide how cells jump; where they do not, axes that stay up to the noise would be the only jump
-    error = np.where(jumps_by_rank(step), step.drive.threshold, step.drive.rounding)
-    steady = spectral.without_noise(tensor, axes, error)
+    steady = spectral.without_noise(tensor, axes, step.drive.rounding)  # more of it would be a jump of its own
     return step.drive._replace(deformation_gradient=U, tensor=steady, kernels=spectral)
 
 
@@ -454,8 +439,6 @@ Flags = NDArray[np.bool_]
 
 LOCAL_ITERATIONS = 25  # of the local Newton method
 PARTS = 8  # of a step where the method does not find its end at once, each twice as long as what is before it
-# of them in a row that do not leave PROGRESS times the residual: without a solution they go in a circle
-STALLED_ITERATIONS, PROGRESS = 3, 0.9
 LOCAL_HALVINGS = 12  # of one of its steps, where it would lead to r >= L
 TOLERANCE = 1e-12  # of D: where the local Newton method stops
 IDENTITY = np.eye(6)
@@ -536,27 +519,19 @@ class CondensedPoints:
         return CondensedPoints(self.tissue.map(lambda name, value: value[chosen]), at(self.step, chosen))
 
     # ------------------------------------------------------------ solutions
-    def solve(
-        self, F: Array, start: Array, held: Flags | None = None, before: LocalSolution | None = None
-    ) -> LocalSolution:
+    def solve(self, F: Array, start: Array) -> LocalSolution:
         """Cells that belong to the stress at F."""
         strain = Strain.of(F)
-        held = np.zeros(len(F), dtype=bool) if held is None else held
-        if self.step.drive.driver.is_stress:
-            trial = self._trial(strain, strain.inside(start))
-            trial.converged[held] = True
-            self._iterate(strain, trial)
-            lost = np.flatnonzero(~trial.converged)
-            if lost.size and self.step.law.dimensions is None:  # by rank there are states without a solution
-                put(trial, lost, self.at(lost)._followed(at(strain, lost)))
-        else:  # D does not depend on the stress
+        if not self.step.drive.driver.is_stress:  # D does not depend on the stress
             trial = self._trial(strain, self._driving(strain, np.zeros_like(F)))
             trial.converged[:] = np.isfinite(trial.stress.value).all(axis=(1, 2))
-        found = self._solution(strain, trial)
-        if held.any():
-            assert before is not None and before.cells is not None
-            put(found, held, self.at(held).with_cells(F[held], at(before.cells, held)))
-        return found
+            return self._solution(strain, trial)
+        trial = self._trial(strain, strain.inside(start))
+        self._iterate(strain, trial)
+        lost = np.flatnonzero(~trial.converged)
+        if lost.size and self.step.law.dimensions is None:  # by rank there are states without a solution
+            put(trial, lost, self.at(lost)._followed(at(strain, lost)))
+        return self._solution(strain, trial)
 
     def with_cells(self, F: Array, cells: UnitCell) -> LocalSolution:
         """The points with cells that do not answer, given in the global basis."""
@@ -654,18 +629,12 @@ class CondensedPoints:
 
     # ------------------------------------------------------------ Newton's method
     def _iterate(self, strain: Strain, trial: Trial) -> None:
-        """Newton's method where there is no solution yet; in vain it ends early only where there may be none."""
-        jumps, stalled = jumps_by_rank(self.step), np.zeros(len(strain.squared), dtype=int)
-        least = np.full(len(stalled), np.inf)
+        """Newton's method where there is no solution yet."""
         for _ in range(LOCAL_ITERATIONS):
-            unsolved = np.flatnonzero(~trial.converged & ~(jumps & (stalled >= STALLED_ITERATIONS)))
+            unsolved = np.flatnonzero(~trial.converged)
             if not unsolved.size:
                 return
-            better = self.at(unsolved)._better(at(strain, unsolved), at(trial, unsolved))
-            put(trial, unsolved, better)
-            missing = np.linalg.norm(better.missing, axis=(1, 2))
-            stalled[unsolved] = np.where(missing < PROGRESS * least[unsolved], 0, stalled[unsolved] + 1)
-            least[unsolved] = np.fmin(least[unsolved], missing)
+            put(trial, unsolved, self.at(unsolved)._better(at(strain, unsolved), at(trial, unsolved)))
 
     def _better(self, strain: Strain, trial: Trial) -> Trial:
         """One step of Newton's method on eq. (i1), not longer than D, halved where it leads to r >= L."""
@@ -700,20 +669,28 @@ class CondensedPoints:
         return trial
 
     # ------------------------------------------------------------ the tangent
-    def tangent(self, found: LocalSolution, held: Flags) -> Array:
-        """dP/dF, (n, 3, 3, 3, 3); of points that are held, and of those that have not converged, at their cells."""
-        strain = Strain.of(found.gradient)
+    def tangent(self, found: LocalSolution) -> Array:
+        """dP/dF, (n, 3, 3, 3, 3); of points that have not converged at their cells."""
+        strain, lost = Strain.of(found.gradient), ~found.converged
         tensor, C_F = strain.inside(found.driving_tensor), strain.by_gradient
-        linear, frozen = self._linearised(strain, tensor), held | ~found.converged
+        linear = self._linearised(strain, tensor)
         left, stress = linear.left, linear.stress
         assert stress.by_strain is not None
-        left[frozen] = IDENTITY
+        left[lost] = IDENTITY
         at_fixed_tensor = stress.by_strain @ C_F + self._answer_to_deformation(strain, linear, tensor)
         right = linear.by_strain @ C_F + linear.by_stress @ at_fixed_tensor
         by_gradient = at_fixed_tensor + linear.answer @ np.linalg.solve(left, right)
-        if frozen.any():  # their cells need not be those of D
-            put((stress.value, by_gradient), frozen, self.at(frozen)._frozen(at(strain, frozen), at(found, frozen)))
-        return _first_by_gradient(strain, stress.value, by_gradient)
+        result = _first_by_gradient(strain, stress.value, by_gradient)
+        if lost.any():
+            result[lost] = self.at(lost).frozen_tangent(at(found, lost))
+        return result
+
+    def frozen_tangent(self, found: LocalSolution) -> Array:
+        """dP/dF of cells that do not answer."""
+        strain = Strain.of(found.gradient)
+        stress = self._stress(strain, self._cells(strain, found.structure, found.cells), derivatives=True)
+        assert stress.by_strain is not None
+        return _first_by_gradient(strain, stress.value, stress.by_strain @ strain.by_gradient)
 
     def _answer_to_deformation(self, strain: Strain, linear: Linearised, tensor: Array) -> Any:
         """S_y y_F, (n, 6, 9): by the rotation where X lives in space, by the stretch where axes are pulled back."""
@@ -724,12 +701,6 @@ class CondensedPoints:
         if linear.answer_to_stretch is None:
             return 0.0
         return linear.answer_to_stretch @ strain.stretch_by_strain @ strain.by_gradient
-
-    def _frozen(self, strain: Strain, found: LocalSolution) -> tuple[Array, Array]:
-        """S and dS/dF of cells that do not answer."""
-        stress = self._stress(strain, self._cells(strain, found.structure, found.cells), derivatives=True)
-        assert stress.by_strain is not None
-        return stress.value, stress.by_strain @ strain.by_gradient
 
 
 def _first_by_gradient(strain: Strain, stress: Array, by_gradient: Array) -> Array:

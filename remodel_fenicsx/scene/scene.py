@@ -156,6 +156,7 @@ PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSION
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
+COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
 FORGOTTEN_AFTER = (
     1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 )
@@ -335,9 +336,9 @@ class Scene(Table):
         """Whether the coupling "implicit" leaves no error in time: steps of any length lead to the same cells.
 
         So it is where the cells depend on the time and the tension that they have then alone. From random cells some
-        points have no such state and are held (docs/couplings.md).
+        points have no such state (docs/couplings.md).
         """
-        depends_on_now = LAWS[self.remodeling.law].of_absolute_time and not self.has_random_cells
+        depends_on_now = LAWS[self.remodeling.law].of_absolute_time and not self.jumps_by_rank
         return depends_on_now and self.missing_for_implicit() is None
 
     @property
@@ -377,6 +378,16 @@ class Scene(Table):
     def has_random_cells(self) -> bool:
         """Whether cells are drawn anywhere."""
         return any(properties.cells.initial == "random" for properties in self.properties().values())
+
+    @property
+    def jumps_by_rank(self) -> bool:
+        """Whether cells whose lengths differ from point to point go from rank to rank, under a law of lengths."""
+        return LAWS[self.remodeling.law].dimensions is not None and (self.has_random_cells or bool(self.measured_cells))
+
+    @property
+    def is_as_run(self) -> bool:
+        """Whether it names its format, as scenes in the folders of runs do."""
+        return "format" in self.model_fields_set
 
     @property
     def measured_cells(self) -> dict[str, Cells]:
@@ -486,7 +497,8 @@ class Scene(Table):
         SceneError
             One line: key, value, what is allowed.
         """
-        values = _plain({name: getattr(self, name) for name in type(self).model_fields}, every_value=True)
+        names = [name for name in type(self).model_fields if name != "format" or self.is_as_run]
+        values = _plain({name: getattr(self, name) for name in names}, every_value=True)
         for key, value in changes.items():
             if not isinstance(key, str):
                 raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
@@ -516,7 +528,14 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
     if written > FORMAT:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
-    return {**values, "format": FORMAT}
+    return {**_without_columns(values, COLUMNS_THAT_WENT), "format": FORMAT}
+
+
+def _without_columns(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    output = values.get("output")
+    if not isinstance(output, Mapping) or not isinstance(asked := output.get("columns"), list | tuple):
+        return dict(values)
+    return {**values, "output": {**output, "columns": [name for name in asked if name not in names]}}
 
 
 def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:

@@ -592,6 +592,17 @@ class CouplingKind:
 
 
 def _missing_for_implicit(scene: Scene) -> str | None:
+    if scene.jumps_by_rank and not scene.is_as_run:  # a run that was begun goes on, up to a step without a solution
+        return (
+            "remodeling.law = 'tensor', or cells.initial 'isotropic', 'aligned' or three lengths: by rank other cells "
+            f"jump, and points have no solution; with remodeling.law = {scene.remodeling.law!r} they can have "
+            "remodeling.coupling 'staggered' or 'relaxed'"
+        )
+    return missing_for_steps_of_cells(scene)
+
+
+def missing_for_steps_of_cells(scene: Scene) -> str | None:
+    """What a scene lacks for cells that are unknowns of a solve, of whatever cells it starts from; None: nothing."""
     from remodel_fenicsx.model.implicit import refused  # six modules that most runs need not load
 
     material, remodeling = scene.material, scene.remodeling
@@ -632,7 +643,7 @@ COUPLINGS = {
     ),
     "implicit": CouplingKind(
         "find cells and equilibrium of the same step together, by Newton's method; for the law 'tensor' (with a "
-        "repulsion that does not depend on axes) and the laws of the paper",
+        "repulsion that does not depend on axes), and for the laws of the paper with cells that are not random",
         "remodel_fenicsx.evolution.implicit:Implicit",
         takes_turnover=True,
         solves_cells=True,

@@ -48,7 +48,6 @@ class Work(Counted):
     residual: float = 0.0  # of the last solution, in the unit of force
     extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
     last: Solution | None = None
-    held_points: int = 0  # points whose cells do not belong to their stress, of the coupling "implicit"
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
         """Count a solve, or the work of a step that was taken back."""

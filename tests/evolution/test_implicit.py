@@ -14,8 +14,9 @@ from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx import Recording
 from remodel_fenicsx.running import resume, run as record
-from remodel_fenicsx.scene.scene import scene_from_dict
+from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.solver.continuation import StepFailure
 from tests.conftest import Case, slowly
 from tests.parts import tube
 
@@ -32,7 +33,7 @@ def short_tube(end: float, step: float = 1.0, law: str = "tensor", comm: Any = M
         "cells": {"initial": changes.pop("cells", "random")},
         "time": {"end": end, "step": step},
         "solver": {"method": changes.pop("method", "auto")},
-        "output": {"columns": ["held_points", "pass_residual"]},
+        "output": {"columns": ["pass_residual"]},
         "remodeling": {"law": law, "coupling": "implicit", "frame": "material"} | changes,
     }
     domain = tube(1.0, 3.0, 1.0, degree=1, divisions=divisions, comm=comm)
@@ -55,10 +56,10 @@ def missed(simulation: Simulation, time: float) -> Array:
 
 @pytest.mark.parametrize("driver", ["cauchy", *slowly("pk2", "finger")])
 def test_random_cells_belong_to_their_stress(driver: str) -> None:
-    """The law for A: no point is held, no step made in parts, four iterations a step in the mean; tr A stays."""
+    """The law for A: no step made in parts, four iterations a step in the mean; tr A stays."""
     simulation = short_tube(8.0, driver=driver, divisions=(8, 2, 1))
     rows = run(simulation)
-    assert all(row["held_points"] == 0 and row["substeps"] == 1 for row in rows)
+    assert all(row["substeps"] == 1 for row in rows)
     assert np.mean([row["newton_iterations"] for row in rows[1:]]) <= 4
     assert missed(simulation, 8.0).max() < 1e-8
     A = simulation.cells.structure_tensor()
@@ -71,7 +72,7 @@ def test_the_printed_law_from_isotropic_cells(driver: str, frame: str) -> None:
     simulation = short_tube(8.0, law="explicit", cells="isotropic", driver=driver, frame=frame, divisions=(8, 3, 1))
     rows = run(simulation)
     assert max(row["newton_iterations"] for row in rows[1:]) <= 6
-    assert all(row["held_points"] == 0 and row["substeps"] == 1 for row in rows)
+    assert all(row["substeps"] == 1 for row in rows)
     assert missed(simulation, 8.0).max() < 1e-6
     radii = np.round(np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1), 6)
     lengths = simulation.cells.dimension_values
@@ -107,7 +108,6 @@ def test_long_steps_run(law: str, cells: str, end: float) -> None:
     divisions = (12, 3, 1) if end == 5.0 else (4, 3, 1)
     simulation = short_tube(end, law=law, cells=cells, kappa=10.0, divisions=divisions, method="direct")
     rows = run(simulation)
-    assert all(row["held_points"] == 0 for row in rows)
     assert rows[-1]["newton_iterations"] <= 4 and rows[-1]["substeps"] == 1
     assert missed(simulation, end).max() < 1e-6
 
@@ -127,27 +127,33 @@ def test_both_laws_have_the_same_biological_equilibrium() -> None:
     np.testing.assert_allclose(angles[0], angles[1], atol=0.1)
 
 
-def test_points_that_jump_are_held_and_counted(caplog: pytest.LogCaptureFixture) -> None:
-    """Random cells by rank: some equations have no solution. A warning says in which share of the body."""
-    simulation = short_tube(2.0, law="explicit", driver="finger")
-    with caplog.at_level("INFO"):
-        rows = run(simulation)
-    held = [row["held_points"] for row in rows]
-    said = [
-        record for record in caplog.records if "no cells were found that fit their own stress" in record.getMessage()
-    ]
-    parted = [
-        record
-        for record in caplog.records
-        if record.getMessage().startswith("some cells keep their last values: no equi")
-    ]
-    assert len(parted) == sum(count > 0 for count in held)  # parts of the step have been tried before, and have failed
-    points = simulation.quadrature.shape[0] * simulation.quadrature.shape[1]
-    first = next(row for row in rows if row["held_points"])
-    time, percent = said[0].args[0], said[0].args[1]  # type: ignore[index]
-    assert time == first["time"] and 0.3 < percent / (100 * first["held_points"] / points) < 3.0  # type: ignore
-    assert 0 < max(held) < 100 and all(count == int(count) for count in held)
-    assert (missed(simulation, 2.0) > 1e-6).sum() <= max(2 * held[-1], 2)
+@pytest.mark.parametrize("where", ["", "regions.inside."])
+@pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
+def test_cells_that_jump_from_rank_to_rank_are_refused(law: str, where: str) -> None:
+    """Random cells and a printed law: one line with key, value, the law 'tensor' and what else is allowed."""
+    scene = {
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0},
+        "cells": {"initial": "isotropic"},
+        "regions": {"inside": {"outer_radius": 1.5}, "outside": {"outer_radius": 2.0}},
+        "remodeling": {"law": law, "coupling": "implicit"},
+        "time": {"end": 2.0},
+    }
+    with pytest.raises(SceneError) as raised:
+        scene_from_dict(scene).with_values({f"{where}cells.initial": "random"})
+    text = str(raised.value)
+    assert text.startswith("remodeling.coupling = 'implicit': needs remodeling.law = 'tensor'") and "\n" not in text
+    assert all(name in text for name in ("'isotropic'", "'aligned'", "'staggered'", "'relaxed'"))
+
+
+def test_a_run_of_before_ends_at_a_step_without_a_solution(tmp_path: Path) -> None:
+    """A scene as 0.3.0 ran it is read, random cells under a printed law or not: exit code 3, and rows are kept."""
+    values = cube(1.0) | {"format": 2, "remodeling": {"law": "explicit", "coupling": "implicit", "driver": "finger"}}
+    values |= {"material": {}, "output": {"fields": False, "report": False, "columns": ["held_points"]}}
+    scene = scene_from_dict(values)
+    assert not scene.output.columns and scene.with_values({"name": "again"}).is_as_run
+    with pytest.raises(StepFailure) as failed:
+        record(scene, tmp_path / "run", MPI.COMM_SELF)
+    assert failed.value.exit_code == 3 and len(Recording(tmp_path / "run").history["time"]) == 1
 
 
 def pulled_cube(force: float, end: float, law: str = "explicit", kappa: float = 0.5, **material: float) -> Simulation:
@@ -159,18 +165,18 @@ def pulled_cube(force: float, end: float, law: str = "explicit", kappa: float = 
         "loads": {"force": {"value": force, "ramp": [[0.0, 1.0]]}},
         "remodeling": {"law": law, "coupling": "implicit", "kappa": kappa},
         "time": {"end": end},
-        "output": {"columns": ["held_points", "mean_fibre_angle", "newton_iterations"]},
+        "output": {"columns": ["mean_fibre_angle", "newton_iterations"]},
     }
     return Simulation(scene_from_dict(values), MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
-def test_isotropic_cells_under_a_weak_load_are_not_held(law: str) -> None:
+def test_isotropic_cells_under_a_weak_load(law: str) -> None:
     """The closed form of eq. (11) under uniaxial tension, across l0 (1 - s): all printed laws have it."""
     for row in run(pulled_cube(0.2, 3.0, law)):
         s = -np.expm1(-0.5 * row["time"])
         expected = np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))
-        assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-6) and row["held_points"] == 0
+        assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -179,7 +185,7 @@ def test_a_nearly_incompressible_cube_comes_to_its_end() -> None:
     row = run(pulled_cube(10.0, 1.0, lame_lambda=3.103e4))[-1]
     s = -np.expm1(-0.5)
     expected = np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))
-    assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-6) and row["held_points"] == 0
+    assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_hard_step_starts_again_from_passes_with_frozen_cells() -> None:
@@ -187,11 +193,11 @@ def test_a_hard_step_starts_again_from_passes_with_frozen_cells() -> None:
     for row in run(pulled_cube(10.0, 2.0, lame_lambda=1e6, lame_mu=1.0)):
         s = -np.expm1(-0.5 * row["time"])
         expected = np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))
-        assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-6) and row["held_points"] == 0
+        assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-6)
         assert row["newton_iterations"] < 150
 
 
-def test_cells_across_the_load_are_not_held(caplog: pytest.LogCaptureFixture) -> None:
+def test_cells_across_the_load_are_solved() -> None:
     """At the strain of the cells before there is no solution, without tension they stay; in equilibrium there is one.
 
     Under uniaxial tension eq. (10) gives l = l_old exp(-kappa dt) + (1 - exp(-kappa dt)) r0 along the load.
@@ -202,14 +208,13 @@ def test_cells_across_the_load_are_not_held(caplog: pytest.LogCaptureFixture) ->
         "loads": {"force": {"value": 0.06, "ramp": [[0.0, 0.0], [20.0, 1.0]]}},
         "remodeling": {"law": "relaxation", "frame": "material", "coupling": "implicit", "kappa": 0.025},
         "time": {"end": 40.0, "step": 20.0},
-        "output": {"columns": ["held_points", "mean_fibre_angle", "newton_iterations"]},
+        "output": {"columns": ["mean_fibre_angle", "newton_iterations"]},
     }
     rows = run(Simulation(scene_from_dict(values), MPI.COMM_SELF))
     for row in rows[1:]:
         left = np.exp(-0.025 * row["time"])
         expected = np.degrees(np.arctan(left / (1 - left)))
-        assert row["held_points"] == 0 and row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-3)
-    assert "no cells were found" not in caplog.text
+        assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-3)
 
 
 def test_the_tangent_is_the_derivative_of_the_residual() -> None:
@@ -260,38 +265,34 @@ def test_other_frozen_cells_have_another_stress_at_the_same_unknowns() -> None:
     np.testing.assert_array_equal(stresses[2], stresses[0])
 
 
-def cube(law: str, end: float) -> dict[str, Any]:
+def cube(end: float) -> dict[str, Any]:
     """Eight elements with random cells, pulled."""
     return {
         "preset": "kuhl-holzapfel-2007",
         "geometry": {"shape": "cube"},
         "mesh": {"refinement": 2},
-        "material": {"repulsion": "log" if law == "tensor" else "axes"},
+        "material": {"repulsion": "log"},
         "cells": {"initial": "random"},
-        "remodeling": {"law": law, "coupling": "implicit", "frame": "material"},
+        "remodeling": {"law": "tensor", "coupling": "implicit", "frame": "material"},
         "time": {"end": end},
         "solver": {"absolute_tolerance": 1e-10, "relative_tolerance": 0.0},
-        "output": {"columns": ["held_points"], "fields": False},
+        "output": {"fields": False},
     }
 
 
-ON_ONE_AND_TWO_RANKS = [{"scene": cube("tensor", 4.0)}]
+ON_ONE_AND_TWO_RANKS = [{"scene": cube(4.0)}]
 
 
-@pytest.mark.parametrize("law, end", [("tensor", 4.0), *slowly(("relaxation", 2.0))])
-def test_one_and_two_ranks_agree(case: Case, law: str, end: float) -> None:
-    """With points that are held too, in the first steps: later it hangs on rounding which of them are."""
-    one, two = (case(cube(law, end), ranks=ranks) for ranks in (1, 2))
+def test_one_and_two_ranks_agree(case: Case) -> None:
+    one, two = (case(cube(4.0), ranks=ranks) for ranks in (1, 2))
     for name in ("u", "l"):
-        np.testing.assert_allclose(two[name], one[name], atol=1e-8 if law == "tensor" else 1e-6)  # held: less smooth
-    np.testing.assert_array_equal(two["held_points"], one["held_points"])
-    assert (max(one["held_points"]) > 0) == (law == "relaxation")
+        np.testing.assert_allclose(two[name], one[name], atol=1e-8)
 
 
 def test_a_run_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
     whole, parts = (tmp_path / name for name in ("whole", "parts"))
-    record(scene_from_dict(cube("tensor", 6.0)), whole, MPI.COMM_SELF)
-    record(scene_from_dict(cube("tensor", 3.0)), parts, MPI.COMM_SELF)
+    record(scene_from_dict(cube(6.0)), whole, MPI.COMM_SELF)
+    record(scene_from_dict(cube(3.0)), parts, MPI.COMM_SELF)
     resume(parts, ["time.end=6.0"], MPI.COMM_SELF)
     histories = [Recording(folder).history for folder in (whole, parts)]
     for name in histories[0]:

@@ -24,7 +24,7 @@ QUICK = (  # half a second or less with what they are held against
     212, 220, 227, 238, 242, 294,
 )  # fmt: skip
 # Implicit steps and equilibria that have no end within the limit (they may have one with more time)
-ENDLESS = (13, 29, 40, 46, 130, 166, 193, 197, 223, 231, 237, 268)
+ENDLESS = (29, 40, 46, 130, 166, 193, 223, 231, 268)
 HELD = ("right", "refused", "unstable", "warned")
 
 
