@@ -21,6 +21,7 @@ from petsc4py import PETSc
 from ufl.algorithms.map_integrands import map_integrands
 from ufl.classes import Determinant, Inner, Sqrt, Trace
 from ufl.corealg.traversal import traverse_unique_terminals, unique_post_traversal
+from ufl.domain import extract_unique_domain
 
 from remodel_fenicsx.fem import jit
 
@@ -109,7 +110,7 @@ def coefficient(mesh: Any, name: str, value: Any) -> Any:
             f"{name} = {value!r:.60}: must be a number, a dolfinx Constant or a DG0 Function of this mesh, "
             f"not a {type(value).__name__}"
         )
-    domain = value.ufl_domain()
+    domain = extract_unique_domain(value)
     if domain is None or domain.ufl_cargo() is not mesh.ufl_domain().ufl_cargo():
         raise ValueError(f"{name}: belongs to another mesh; must be of this one")
     is_function = isinstance(value, dolfinx.fem.Function)
