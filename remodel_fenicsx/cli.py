@@ -486,7 +486,7 @@ def _unseen_files(scene: Scene) -> str:
 )
 def _axes(options: argparse.Namespace) -> None:
     """Write the local axes of a scene's body as a VTU file, before any solve."""
-    from remodel_fenicsx.studies.preparation import write_axes
+    from remodel_fenicsx.running import write_axes
 
     path = options.output or Path(f"{options.scene.name}-axes.vtu")
     with _stopping("nothing is written"):
@@ -503,7 +503,7 @@ def _axes(options: argparse.Namespace) -> None:
 )
 def _unload(options: argparse.Namespace) -> None:
     """Find the unloaded body of a scene whose geometry is the loaded one."""
-    from remodel_fenicsx.studies.preparation import write_unloaded
+    from remodel_fenicsx.running import write_unloaded
 
     if not options.scene.geometry.is_loaded:
         raise SceneError("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'")

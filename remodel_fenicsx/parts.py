@@ -36,7 +36,7 @@ from remodel_fenicsx.schema.settings import (
     Solver as Solver,
 )
 from remodel_fenicsx.solver.continuation import StepFailure as StepFailure
-from remodel_fenicsx.state.state import State as State, UnitCells as UnitCells
+from remodel_fenicsx.state import State as State, UnitCells as UnitCells
 from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception as end_all_ranks_on_exception
 
 if not TYPE_CHECKING:  # type checkers go by the imports

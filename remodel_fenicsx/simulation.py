@@ -28,7 +28,7 @@ from remodel_fenicsx.results.run_folder import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
 from remodel_fenicsx.schema.settings import Cells, Properties, missing_for_steps_of_cells
-from remodel_fenicsx.state.state import State, UnitCells, by_region
+from remodel_fenicsx.state import State, UnitCells, by_region
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch import WATCHERS

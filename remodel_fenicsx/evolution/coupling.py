@@ -22,7 +22,7 @@ from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.state.state import Earlier, Numbers, State
+from remodel_fenicsx.state import Earlier, Numbers, State
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

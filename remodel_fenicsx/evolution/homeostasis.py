@@ -23,7 +23,7 @@ from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.solver.newton import SolveFailure
-from remodel_fenicsx.state.state import Snapshot
+from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)

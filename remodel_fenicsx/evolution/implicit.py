@@ -29,7 +29,7 @@ from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.state.state import State, at_points
+from remodel_fenicsx.state import State, at_points
 
 
 # ---------------------------------------------------------------- cells that answer within a solve

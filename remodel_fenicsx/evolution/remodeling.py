@@ -23,7 +23,7 @@ from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target,
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
-from remodel_fenicsx.state.state import Numbers, Parameters, State, on_mesh, stress_rounding
+from remodel_fenicsx.state import Numbers, Parameters, State, on_mesh, stress_rounding
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]

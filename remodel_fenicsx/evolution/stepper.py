@@ -21,7 +21,7 @@ from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver, Turnover
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.state.state import State, on_mesh
+from remodel_fenicsx.state import State, on_mesh
 from remodel_fenicsx.system.interrupts import Paused
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tenso
 from remodel_fenicsx.model.tensors import largest_change_of_length
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.state.state import Earlier, Numbers
+from remodel_fenicsx.state import Earlier, Numbers
 
 
 # ---------------------------------------------------------------- how far a row is from what smaller steps would

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.turnover import TurnoverRates, rates
 from remodel_fenicsx.schema.settings import Turnover
-from remodel_fenicsx.state.state import Earlier, Numbers, Parameters, State, on_mesh
+from remodel_fenicsx.state import Earlier, Numbers, Parameters, State, on_mesh
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION, UNLOADED
 from remodel_fenicsx.schema import SAME_TIME, same_time
 from remodel_fenicsx.solver.equilibrium import PointStresses
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state import State
 from remodel_fenicsx.system.files import ClosedAtEnd
 
 Array = NDArray[np.float64]

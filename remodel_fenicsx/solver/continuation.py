@@ -21,7 +21,7 @@ from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
-from remodel_fenicsx.state.state import Numbers, State
+from remodel_fenicsx.state import Numbers, State
 
 FAR = 2.0
 """`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube

@@ -27,7 +27,7 @@ from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, whole_structure_tensor
 from remodel_fenicsx.model.tensors import MANDEL, passes_through_zero
-from remodel_fenicsx.state.state import Parameters, State, on_mesh
+from remodel_fenicsx.state import Parameters, State, on_mesh
 
 
 # ---------------------------------------------------------------- the repulsion where it is no closed expression for

@@ -26,7 +26,7 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.linear import EveryTangent
-from remodel_fenicsx.state.state import State, stress_rounding
+from remodel_fenicsx.state import State, stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
 

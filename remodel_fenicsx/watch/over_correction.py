@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
-from remodel_fenicsx.state.state import Earlier
+from remodel_fenicsx.state import Earlier
 from remodel_fenicsx.watch.warnings import WarnsOnce
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
 from remodel_fenicsx.solver.linear import negative_pivots, uneven
-from remodel_fenicsx.state.state import Earlier, Numbers, at_points
+from remodel_fenicsx.state import Earlier, Numbers, at_points
 from remodel_fenicsx.watch.warnings import WarnsOnce
 
 log = logging.getLogger(__name__)

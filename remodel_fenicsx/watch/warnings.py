@@ -22,7 +22,7 @@ from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import cofactor
-from remodel_fenicsx.state.state import Numbers, Occasions, at_points
+from remodel_fenicsx.state import Numbers, Occasions, at_points
 from remodel_fenicsx.system import NOTICE
 
 

@@ -14,7 +14,7 @@ from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import Cells, Load
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state import State
 from tests import parts
 from tests.parts import cube
 

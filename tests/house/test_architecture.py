@@ -94,7 +94,7 @@ def test_the_reader_of_imports_finds_them(tmp_path: Path) -> None:
     found = imports_of(tmp_path / "x.py")
     assert found == [("a.b", "module"), ("c.d", "types"), ("e", "module"), ("f", "module"), ("i.j", "function"),
                      ("i.k", "function"), ("m", "module")]  # fmt: skip
-    assert Import("evolution.stepper", "state.state", "module") in arrows()
+    assert Import("evolution.stepper", "state", "module") in arrows()
     assert Import("body.cube", "body.domain", "function") in arrows()
 
 

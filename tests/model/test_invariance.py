@@ -27,7 +27,7 @@ from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import angle_to_axis, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, material_frame, spatial_frame
 from remodel_fenicsx.schema.settings import Cells, Remodeling
-from remodel_fenicsx.state.state import State, UnitCells
+from remodel_fenicsx.state import State, UnitCells
 from tests import parts
 from tests.parts import cube
 

@@ -39,7 +39,7 @@ from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver.continuation import StepFailure, Work
-from remodel_fenicsx.state.state import State
+from remodel_fenicsx.state import State
 from remodel_fenicsx.system.interrupts import Paused
 from remodel_fenicsx.watch import stability as equilibrium_stability, over_correction
 from remodel_fenicsx.watch.stability import EquilibriumStability

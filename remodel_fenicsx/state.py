@@ -26,7 +26,6 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS
 
-
 Array = NDArray[np.float64]
 
 

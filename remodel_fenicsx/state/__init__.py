@@ -1,1 +1,0 @@
-"""What a step changes, and what a transaction restores: unknown, cells, loads, and the numbers of the tissue."""
