@@ -372,7 +372,7 @@ def test_chains_lie_on_the_deformed_face_along_their_deformed_direction() -> Non
     ends = np.stack([corners[:, [0, 3]].mean(axis=1), corners[:, [1, 2]].mean(axis=1)], axis=1)
     np.testing.assert_allclose(ends.mean(axis=1)[:, 1:], [[0.0, 1.0]] * 4, atol=1e-6)
     lengths = np.abs(ends[:, 1] - ends[:, 0])
-    np.testing.assert_allclose(lengths, [[0.0, 0.0, 2 * 2 * bodies.CHAIN_REACH]] * 4, atol=1e-6)
+    np.testing.assert_allclose(lengths, [[0.0, 0.0, 2 * 2 * bodies.CHAIN_LOOK["reach"]]] * 4, atol=1e-6)
     np.testing.assert_allclose(corners[..., 0], corners[0, 0, 0], atol=1e-6)
 
 
