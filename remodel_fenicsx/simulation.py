@@ -301,6 +301,9 @@ def from_natural(
             asked = f"natural.opening_angle = {natural.opening_angle:g}"
             raise SceneError(f"{asked}: must be smaller, or natural.layers nearer to 1: {error}") from error
         stretches = found.stretches(np.linalg.norm(local_axes.coordinates[..., :2], axis=-1))
+        if quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:  # points outside of a thin wall
+            rule = "must be smaller, or mesh.refinement larger: the sides of elements are chords that leave the wall"
+            raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
         stretches = prestretch(natural, local_axes, domain)
     function = quadrature.function("natural_gradient", (3, 3))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Simulation, cli
+from remodel_fenicsx import SceneError, Simulation, cli
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.model.residual_stress import Layer, closing
 from remodel_fenicsx.scene import scene_from_dict
@@ -34,6 +34,19 @@ def test_a_quarter_and_the_whole_tube_agree_with_one_radius() -> None:
     for kinematics in ("sector", "full"):
         for column, error in (("inner_radius", 2e-3), ("outer_radius", 1e-3), ("fibre_angle_outer", 0.1)):
             assert ends[kinematics][column] == pytest.approx(ends["radial"][column], abs=error), (kinematics, column)
+
+
+def test_a_wall_thinner_than_its_elements_are_flat_is_refused() -> None:
+    """Points outside of the wall would have no stretches: the first row had J below zero."""
+    thin = {
+        "geometry.outer_radius": 1.008,
+        "geometry.length": 1.0,
+        "mesh.degree": 1,
+        "natural.opening_angle": 111.0,
+        "time.end": 1.0,
+    }
+    with pytest.raises(SceneError, match="natural.opening_angle = 111: must be smaller, or mesh.refinement larger"):
+        Simulation(scene("full", **thin), SELF)
 
 
 def own_body(file: Path, elongation: float, **tables: Any) -> Any:
