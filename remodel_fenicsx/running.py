@@ -362,7 +362,7 @@ class _Report(Watcher):
 
 
 # ---------------------------------------------------------------- what may be looked at before any solve
-# What may be looked at before any solve: the scene of an unloaded body, and local axes on the mesh.
+# The scene of an unloaded body, and local axes on the mesh.
 
 
 def write_unloaded(scene: Scene, folder: Path) -> str:

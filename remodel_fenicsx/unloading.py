@@ -96,7 +96,7 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
     return unloaded_mesh(scene, comm, folder)
 
 
-# ---------------------------------------------------------------- what is said where there is no unloaded shape, and
+# ---------------------------------------------------------------- no unloaded shape
 # What is said where there is no unloaded shape, and the shares of the loads in which it is looked for.
 
 Found = TypeVar("Found")
@@ -132,7 +132,7 @@ def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
 
 
 # ---------------------------------------------------------------- the unloaded tube of a loaded one
-# The unloaded tube of a loaded one: radii and length.
+# Radii and length.
 #  They are found by runs of the scene's own kinematics, so that the run that follows comes to the given numbers: a
 # fixed point in the targets of inverse elastostatics of one radius (`model.closing`).
 
@@ -254,7 +254,7 @@ def _with_numbers(scene: Scene, numbers: Array) -> Scene:
 
 
 # ---------------------------------------------------------------- the unloaded mesh of a loaded one
-# The unloaded mesh of a loaded one: the places of all nodes, by Newton's method.
+# The places of all nodes, by Newton's method.
 #  The residual is that of the unloaded body under its loads, displaced to the given places. Its derivative by the
 # places of the unloaded nodes is that of inverse elastostatics (Govindjee and Mihalic 1996): with X the unloaded
 # places, moved by w, and x = X + u the given ones,

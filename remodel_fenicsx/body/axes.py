@@ -180,7 +180,7 @@ def area(mesh: Any, facets: Facets) -> float:
     return float(over_ranks(mesh.comm, local, MPI.SUM))
 
 
-# ---------------------------------------------------------------- local axes, depth and station at the points of any
+# ---------------------------------------------------------------- local axes, depth and station at points
 # Local axes, depth and station at the points of any body, from the fields of `_fields`.
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,7 @@ from remodel_fenicsx.schema.tables import SceneError
 
 
 # ---------------------------------------------------------------- a mesh as the text of a Gmsh file, format 2.2
-# A mesh as the text of a Gmsh file, format 2.2: what `mesh_file` reads.
+# What `mesh_file` reads.
 
 TYPE_OF = {kind: number for number, kind in VOLUMES.items()}
 FACET_OF = {3: 2, 4: 3}  # corners -> Gmsh's number of the type; facets are written by their corners

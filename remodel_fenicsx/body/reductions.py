@@ -24,7 +24,7 @@ from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.schema.tables import fault
 
 
-# ---------------------------------------------------------------- whole bodies for pictures, from the meshes of
+# ---------------------------------------------------------------- whole bodies for pictures
 # Whole bodies for pictures, from the meshes of reductions: extended, revolved or mirrored.
 #  Meshes are points (n, 3) and the corners of the elements (m, 2, 4 or 8) in VTK's order.
 
@@ -104,7 +104,7 @@ def cylinder(radius: float, length: float) -> Body:
     return revolved(*extended(np.array([(0.0, 0.0, 0.0), (radius, 0.0, 0.0)]), np.array([[0, 1]]), length))
 
 
-# ---------------------------------------------------------------- what of a body buckles, and whether a scene's
+# ---------------------------------------------------------------- what of a body buckles
 # What of a body buckles, and whether a scene's loads may make it: a strut under thrust.
 
 NEAR_LOCKING = 0.9  # r/L that chains of the inner face are thought to reach

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------- the columns of a history
-# The columns of a history: those of every shape, those on request, and which a scene has.
+# Those of every shape, those on request, and which a scene has.
 
 Array = NDArray[np.float64]
 

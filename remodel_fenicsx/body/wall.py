@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------- layers of a round wall
-# Layers of a round wall: which regions lie where, and where elements begin and end so that none lies in two.
+# Which regions lie where, and where elements begin and end so that none lies in two.
 
 Array = NDArray[np.float64]
 
@@ -156,8 +156,8 @@ def gradient(stretches: Array, axes: Array) -> Array:
     return np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
 
 
-# ---------------------------------------------------------------- bodies with a wall between an inner and an outer
-# Bodies with a wall between an inner and an outer face: what is measured in it, and its local axes on any mesh.
+# ---------------------------------------------------------------- bodies with a wall between an inner and an outer face
+# What is measured in it, and its local axes on any mesh.
 
 AngleOf = Callable[[Any, Array], float]  # of a measurement and angles at its points
 NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4

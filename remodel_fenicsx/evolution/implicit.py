@@ -33,7 +33,7 @@ from remodel_fenicsx.state import State, at_points
 
 
 # ---------------------------------------------------------------- cells that answer within a solve
-# Cells that answer within a solve: equilibrium with stress and consistent tangent as values at the points.
+# Equilibrium with stress and consistent tangent as values at the points.
 
 log = logging.getLogger(__name__)
 

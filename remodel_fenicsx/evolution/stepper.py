@@ -341,7 +341,7 @@ def times(end: float, step: float) -> Iterator[float]:
 
 
 # ---------------------------------------------------------------- stops on purpose, between two steps
-# Stops on purpose, between two steps: asked for by a signal, or because the time that was given is over.
+# Asked for by a signal, or because the time that was given is over.
 
 MARGIN = 1.2  # how much longer than those before it the next step may take
 NOT_ASKED, BY_SIGNAL, BY_CLOCK = range(3)

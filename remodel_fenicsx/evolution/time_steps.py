@@ -20,8 +20,8 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Earlier, Numbers
 
 
-# ---------------------------------------------------------------- how far a row is from what smaller steps would
-# How far a row is from what smaller steps would give: an estimate from the step itself.
+# ---------------------------------------------------------------- how far a row is from what smaller steps would give
+# An estimate from the step itself.
 
 Array = NDArray[np.float64]
 
@@ -228,7 +228,7 @@ def _same(before: Mapping[str, float], loads: Mapping[str, float]) -> bool:
 
 
 # ---------------------------------------------------------------- steps as long as a tolerance allows
-# Steps as long as a tolerance allows: chosen by the error of those before, taken back where they were too long.
+# Chosen by the error of those before, taken back where they were too long.
 
 log = logging.getLogger(__name__)
 

@@ -98,7 +98,7 @@ def _about(sight: Sight, command: str) -> About:
 
 
 # ---------------------------------------------------------------- a sheet with a body at one or several times
-# A sheet with a body at one or several times: all letters, the scale and the axes stand outside of the body.
+# All letters, the scale and the axes stand outside of the body.
 
 # inches
 ONE, SEVERAL = (5.0, 4.4), (2.5, 3.0)  # room for a body alone, and for each of several

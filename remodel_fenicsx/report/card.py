@@ -18,7 +18,7 @@ Places = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- arrays as text of a page
-# Arrays as text of a page: one block, deflated, in base64; and how numbers become few bytes.
+# One block, deflated, in base64; and how numbers become few bytes.
 
 ANGLE_STEPS = 252  # of a byte for 0 to 90 degrees: 14 for each of the 18 colours, so that all agree about these
 NO_ANGLE = 255
@@ -70,7 +70,7 @@ def of_vectors(vectors: NDArray[np.float32]) -> tuple[NDArray[np.int8], float]:
 
 
 # ---------------------------------------------------------------- a part of the page, and its HTML
-# A part of the page, and its HTML: all text of others goes through `escape`.
+# All text of others goes through `escape`.
 
 
 @dataclass(frozen=True)

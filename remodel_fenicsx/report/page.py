@@ -51,7 +51,7 @@ from remodel_fenicsx.system.terminal import duration
 
 
 # ---------------------------------------------------------------- how a run went, from its folder
-# How a run went, from its folder: whether it has ended and why, what it warned of.
+# Whether it has ended and why, what it warned of.
 
 _STEP = re.compile(r"time (\S+?), ")
 SAID_UNLOADED = "unloaded: "  # as logs say it

@@ -37,7 +37,7 @@ def write_vtu(
         write_new(path, (folder / "grid.vtu").read_bytes())
 
 
-# ---------------------------------------------------------------- the cells of a recorded run as fibres of other
+# ---------------------------------------------------------------- cells as fibres of other programs
 # The cells of a recorded run as fibres of other programs: one structure tensor for each element. It needs no dolfinx.
 #  Elements and nodes have the numbers of the run's mesh file, counted from 1 in text. What is written where:
 # - febio: https://help.febio.org, User Manual 4, sections Mesh and MeshData; read by FEBioMeshDataSection4.cpp. Axis

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
 
-# ---------------------------------------------------------------- what pictures of bodies have in common, figures
+# ---------------------------------------------------------------- what pictures of bodies have in common
 # What pictures of bodies have in common, figures and reports alike: colours of angles, how chains are drawn.
 
 LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
@@ -48,7 +48,7 @@ AMBIENT = 0.8  # share of a colour that does not depend on where its face looks:
 VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}  # where the eye is, from the middle of the body
 
 
-# ---------------------------------------------------------------- which of the recorded times are shown where all
+# ---------------------------------------------------------------- which of the recorded times are shown
 # Which of the recorded times are shown where all would be too many.
 
 Numbers = NDArray[np.float64]

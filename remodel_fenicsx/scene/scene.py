@@ -68,7 +68,7 @@ from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRES
 
 
 # ---------------------------------------------------------------- what a scene may say but hardly means
-# What a scene may say but hardly means: numbers in another unit than the others, told from ratios by decades.
+# Numbers in another unit than the others, told from ratios by decades.
 
 # Decades in which a ratio may lie. Units differ by a thousand and more, choices seldom by a hundred.
 NETWORK = (-2, 2)  # initial stiffness of the network over that of the matrix; the paper's bodies: 1.1 and 1.5

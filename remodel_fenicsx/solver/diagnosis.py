@@ -19,7 +19,7 @@ from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 
 
 # ---------------------------------------------------------------- inertia of the tangent
-# Inertia of the tangent: how many of its eigenvalues are negative, and the lowest of them with its mode.
+# How many of its eigenvalues are negative, and the lowest of them with its mode.
 
 Array = NDArray[np.float64]
 
@@ -200,7 +200,7 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
 
 
 # ---------------------------------------------------------------- why there is no further step
-# Why there is no further step: kinds of refusals, each with its own advice, told apart at the last solved state.
+# Kinds of refusals, each with its own advice, told apart at the last solved state.
 
 log = logging.getLogger(__name__)
 

@@ -30,8 +30,8 @@ from remodel_fenicsx.model.tensors import MANDEL, passes_through_zero
 from remodel_fenicsx.state import Parameters, State, on_mesh
 
 
-# ---------------------------------------------------------------- the repulsion where it is no closed expression for
-# The repulsion where it is no closed expression for UFL: stress and stiffness as values at the quadrature points.
+# ---------------------------------------------------------------- the repulsion where UFL has no closed expression
+# Stress and stiffness as values at the quadrature points.
 
 Array = NDArray[np.float64]
 Shares = Callable[[], Sequence[UnitCell]]

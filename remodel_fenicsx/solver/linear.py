@@ -18,7 +18,7 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 
 # ---------------------------------------------------------------- quasi-Newton steps on a kept factor
-# Quasi-Newton steps on a kept factor: L-BFGS with PETSc's vectors, on any number of ranks.
+# L-BFGS with PETSc's vectors, on any number of ranks.
 
 REMEMBERED_PAIRS = 20  # pairs that are remembered
 CURVED = 1e-8  # cosine between a step and the change of the residual, below which they say nothing of use

@@ -31,7 +31,7 @@ from remodel_fenicsx.system.interrupts import Interrupted
 
 
 # ---------------------------------------------------------------- when Newton's method has converged
-# When Newton's method has converged: a residual below a tolerance that no rounding error can pass.
+# A residual below a tolerance that no rounding error can pass.
 
 FORCE_ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
 ROUNDED_STRAINS = 2.0  # the same of the rounding of displacements; on thin walls 0.07 to 0.96 were measured
@@ -100,7 +100,7 @@ class Convergence:
 
 
 # ---------------------------------------------------------------- admissible states
-# Admissible states: the limits r < L and J > 0 in the line search of Newton's method.
+# The limits r < L and J > 0 in the line search of Newton's method.
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from remodel_fenicsx.errors import RemodelError
 
 
 # ---------------------------------------------------------------- files that somebody else may have put there
-# Files that somebody else may have put there: only regular files are read, no link is written through.
+# Only regular files are read, no link is written through.
 #  Scenes and folders of runs are passed around. A pipe would make whoever opens it wait, a device has no end, and a
 # link (symbolic, or a second name of one file) would lead what is written out of the folder.
 

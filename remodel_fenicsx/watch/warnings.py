@@ -27,7 +27,7 @@ from remodel_fenicsx.system import NOTICE
 
 
 # ---------------------------------------------------------------- what warnings have in common
-# What warnings have in common: they follow the steps of a run, and speak once.
+# They follow the steps of a run, and speak once.
 
 log = logging.getLogger(__name__)
 
@@ -143,7 +143,7 @@ class WarnsOnce(Watcher):
 
 
 # ---------------------------------------------------------------- elements that hold a body back
-# Elements that hold a body back: by a stiff bulk (they lock), or because the strain varies too much inside them.
+# By a stiff bulk (they lock), or because the strain varies too much inside them.
 
 Array = NDArray[np.float64]
 
@@ -458,7 +458,7 @@ class VolumeResponse:
 
 
 # ---------------------------------------------------------------- what a run says of its tissue
-# What a run says of its tissue: volume that is lost, chains that do not lie in the wall, and fronts.
+# Volume that is lost, chains that do not lie in the wall, and fronts.
 
 # Of its volume a soft tissue is measured to lose a few per cent at most: what is beyond is a choice of lambda. The
 # paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
