@@ -52,7 +52,7 @@ SCALE_BOUNDS = (1e-3, 1e3)  # bounds of a scale
 WIDE = 1e3  # a bound that nobody gives over the start
 TWICE = (1.7, 2.4)  # diameters over radii of the model at the start, whose tissue is a guess
 ANOTHER_UNIT = 5.0  # lengths over those of the model, or less than its inverse: units differ by ten and more
-FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look 2e-4 to both sides
+FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look `LOGARITHM_CHANGE` to both sides
 
 
 # ---------------------------------------------------------------- the file as it is written
@@ -271,7 +271,8 @@ def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], 
 
 
 # ---------------------------------------------------------------- what a scene says where a table has measurements
-PRECISE = {"solver.relative_tolerance": 1e-13}  # what differences of runs divide by a small change is rounding alone
+# what differences of runs divide by a small change is rounding alone
+PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
 
 def model_of(scene: Scene, table: Measured, scales: Mapping[str, float]) -> dict[str, Array]:
@@ -317,7 +318,8 @@ def _run(
     """Columns and `time` of all steps; dimensions and axes of the cells at the end."""
     simulation = Simulation(scene, MPI.COMM_SELF)
     cells = simulation.cells
-    simulation.watchers = [one for one in simulation.watchers if not isinstance(one, WarnsOnce)]  # nobody reads them
+    if not log.isEnabledFor(logging.WARNING):  # `unsaid`: nobody hears those who warn
+        simulation.watchers = [one for one in simulation.watchers if not isinstance(one, WarnsOnce)]
     try:
         if start is not None:
             cells.set(*start)
@@ -378,7 +380,7 @@ class Journal:
 def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]) -> str:
     """SHA-256 of all that a fit depends on but its starts."""
     said = [[t.name, t.state, t.time, t.sd, t.scaled, {n: v.tolist() for n, v in t.columns.items()}] for t in tables]
-    text = json.dumps([__version__, scene.to_toml(), [list(vars(u).values()) for u in unknowns], said])
+    text = json.dumps([__version__, PRECISE, scene.to_toml(), [list(vars(u).values()) for u in unknowns], said])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
