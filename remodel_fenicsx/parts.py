@@ -13,7 +13,13 @@ Examples
 
 from typing import TYPE_CHECKING
 
-from remodel_fenicsx.body import Cube as Cube, GeometryError as GeometryError, Tendon as Tendon, Tube as Tube
+from remodel_fenicsx.body import (
+    Cube as Cube,
+    GeometryError as GeometryError,
+    Sheet as Sheet,
+    Tendon as Tendon,
+    Tube as Tube,
+)
 from remodel_fenicsx.body.shape import columns_of as columns_of
 from remodel_fenicsx.body.domain import Domain as Domain
 from remodel_fenicsx.body.loading import Loading as Loading

@@ -29,6 +29,7 @@ PICTURES = {  # of docs/figures: what a page's commands leave
     "tutorial-bent.png": "bent.png",
     "tutorial-residual-stress.png": "angles.png",
     "tutorial-fit.png": "fitted/fit.png",
+    "tutorial-biaxial.png": "biaxial/fit.png",
     "tutorial-sweep.png": "sweep/sweep.png",
 }
 

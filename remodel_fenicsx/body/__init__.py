@@ -6,6 +6,7 @@ from remodel_fenicsx.body.cube import Cube
 from remodel_fenicsx.body.gmsh_model import GeometryError
 from remodel_fenicsx.body.mesh_body import MeshBody
 from remodel_fenicsx.body.shape import LoadKind, Shape
+from remodel_fenicsx.body.sheet import Sheet
 from remodel_fenicsx.body.tendon import Tendon
 from remodel_fenicsx.body.tube import Tube
 
@@ -16,9 +17,10 @@ __all__ = [
     "LoadKind",
     "MeshBody",
     "Shape",
+    "Sheet",
     "Tendon",
     "Tube",
 ]
 
-SHAPES: dict[str, type[Shape]] = {"cube": Cube, "tendon": Tendon, "tube": Tube, "mesh": MeshBody}
+SHAPES: dict[str, type[Shape]] = {"cube": Cube, "tendon": Tendon, "tube": Tube, "sheet": Sheet, "mesh": MeshBody}
 """The shapes that a scene may name; a script adds its own."""

@@ -55,7 +55,7 @@ class Cube(Shape):
     number_of_elements: ClassVar[int] = 1
     face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
     reductions: ClassVar[dict[str, Reduction]] = {
-        "point": homogeneous_bar("z0", "z1", lambda shape: {"side": shape.side}, lambda shape: box(shape.side)),
+        "point": homogeneous_bar("z0", "z1", lambda shape: {"side": shape.side}, lambda shape: box(*3 * (shape.side,))),
     }
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")

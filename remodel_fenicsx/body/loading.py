@@ -152,7 +152,7 @@ class Loading:
             self._take(name, value, way)
 
     # ------------------------------------------------------------ loads
-    def add_dead_force(self, name: str, face: str, component: int) -> None:
+    def add_dead_force(self, name: str, face: str, component: int, length: float | None = None) -> None:
         """A total force on a face: constant nominal traction, force over reference area, along a coordinate axis.
 
         Parameters
@@ -163,7 +163,15 @@ class Loading:
             Its name, of `Domain.faces`.
         component
             0, 1 or 2: x, y or z.
+        length
+            Of the body across the face, in the unit of length: with it kinematics whose strain along this axis is one
+            number need no such face.
         """
+        uniform = self.kinematics.uniform_unknown(self.space, component)
+        if length is not None and uniform is not None:
+            force = self.magnitude(name, length / uniform[1] / self.volume())  # per number u, spread over the body
+            self.add_potential(lambda u: -force * u[component] * self.weight * ufl.dx(domain=self.domain.mesh))
+            return
         traction, measure = self.magnitude(name, 1.0 / self.area(face)), self.surface_measure(face)
         self.add_term(lambda u, v: -traction * v[component] * self.weight * measure)
 
@@ -211,12 +219,26 @@ class Loading:
         change = getattr(self.kinematics, "change_of_length", None)
         if change is None:
             return
-        dx = ufl.Measure("dx", domain=self.domain.mesh)
-        one = dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(1.0))
-        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * dx))
-        volume = float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
-        force = self.magnitude(name, 1.0 / volume)  # spread over the body: the change of the length has no place
-        self.add_potential(lambda u: -force * change(u) * self.weight * dx)
+        force = self.magnitude(name, 1.0 / self.volume())  # spread: the change of the length has no place
+        self.add_potential(lambda u: -force * change(u) * self.weight * ufl.dx(domain=self.domain.mesh))
+
+    def add_prescribed_shear(self, name: str) -> None:
+        """F_xy = magnitude of kinematics whose strain is the same everywhere.
+
+        Parameters
+        ----------
+        name
+            Of the load; `set` gives it a magnitude by this name. It is a number.
+
+        Raises
+        ------
+        SceneError
+            Of other kinematics.
+        """
+        shear = self.kinematics.shear()
+        if shear is None:
+            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for a prescribed shear is 'point'")
+        self._take(name, shear, 1.0)
 
     def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
         """u_component = elongation * length on a face: the engineering strain of the whole length.
@@ -364,6 +386,12 @@ class Loading:
         """Reference area of a named face."""
         one = dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(1.0))
         local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * self.measure_alone(face)))
+        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+
+    def volume(self) -> float:
+        """Reference volume of the body. Collective."""
+        one, dx = self.constant(1.0), ufl.dx(domain=self.domain.mesh)
+        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * dx))
         return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
 
     # ------------------------------------------------------------ inside

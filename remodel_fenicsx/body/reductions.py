@@ -92,11 +92,11 @@ def divided_along(points: Array, hexahedra: Corners) -> Body:
     return levels.reshape(-1, 3)[first], np.ravel(number)[corners]
 
 
-def box(side: float) -> Body:
-    """The cube [0, side]^3, one element."""
+def box(*sides: float) -> Body:
+    """A block from the origin along x, y and z, one element."""
     section = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
     points = np.array([(*place, z) for z in (0.0, 1.0) for place in section])
-    return side * points, np.arange(8)[None]
+    return points * sides, np.arange(8)[None]
 
 
 def cylinder(radius: float, length: float) -> Body:
@@ -333,7 +333,7 @@ def explained(scene: Any) -> list[str]:
 
 def threats(scene: Any) -> list[str]:
     """What may make a body buckle, in words: loads below zero (compression, suction), thrust near Euler's load."""
-    if not scene.geometry.reductions:
+    if not scene.geometry.reductions or not scene.geometry.buckles:
         return []
     return list(dict.fromkeys(words for case in scene.each_case() for words in _threats(case)))
 

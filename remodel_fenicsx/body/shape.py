@@ -366,6 +366,8 @@ class LoadKind:
         Of a force: the reference area that carries it, from the shape.
     doubtful
         Magnitude from which on a value is hardly meant, and what may have been.
+    instead_of
+        Name of another load that a scene may have in its place, not beside it.
 
     Examples
     --------
@@ -396,6 +398,7 @@ class LoadKind:
     frees_length: bool = False
     area: Callable[[Any], float] | None = None
     doubtful: tuple[float, str] | None = None
+    instead_of: str = ""
 
     def column_name(self, name: str) -> str:
         """Of its column, for the load of this name."""
@@ -465,6 +468,8 @@ class Shape(_Is):  # type: ignore[misc]
     reductions
         What is cheaper than the displacement in three dimensions and exact for some scenes, by name of the kinematics,
         the cheapest first.
+    buckles
+        Whether loads that press may bend it.
     ends
         How the body may be held, by what `supports.ends` says: an `End` each.
     depth_in_words
@@ -515,6 +520,7 @@ class Shape(_Is):  # type: ignore[misc]
     number_of_elements: ClassVar[int]
     face_names: ClassVar[tuple[str, ...]] = ()
     reductions: ClassVar[dict[str, Reduction]] = {}
+    buckles: ClassVar[bool] = True
     ends: ClassVar[dict[str, End]] = {"free": End(lambda shape, loading: shape.hold(loading))}
     depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
@@ -737,6 +743,9 @@ class Shape(_Is):  # type: ignore[misc]
     def check_with(self, scene: Any, key: str) -> None:
         """Mesh and regions that the shape can have; where it is the loaded one, whether the unloaded can be found."""
         self.check_size(scene.mesh)
+        for name, other in ((name, scene.load_kinds[name].instead_of) for name in scene.loads):
+            if other in scene.loads:
+                raise fault(f"not allowed beside loads.{other}: either", f"loads.{name}", scene.loads[name].value)
         if isinstance(self, WithRegions):
             self.check_regions(scene.regions, scene.mesh)
         if not self.is_loaded:

@@ -127,6 +127,10 @@ class Kinematics(ABC):
         """Where the strain along x, y or z is an unknown: its part of the space, and its value at strain 1. Or None."""
         return None
 
+    def shear(self) -> Any:
+        """The Constant that is F_xy where it is prescribed as a whole, from now on a part of F; or None."""
+        return None
+
     def nodal_space(self, unknown: Any) -> Any:
         """A space, scalar or blocked, with the mesh's nodes in the order of `nodal_displacement`."""
         return unknown.function_space
@@ -298,14 +302,15 @@ class RadialKinematics(_Reduced):
 
 
 class PointKinematics(_Reduced):
-    """A body with the same strain everywhere: three numbers u, F = I + diag(u)/length."""
+    """A body with the same strain everywhere: three numbers u, F = I + diag(u)/length; F_xy may be prescribed."""
 
     name = "point"
-    meaning = "three numbers, for a cube or tendon with the same strain everywhere"
+    meaning = "three numbers, for a cube, tendon or sheet with the same strain everywhere"
     element_kind = "interval"
     components = (None, None, None)
     homogeneous = True
     cost = 0.2
+    _shear: Any = None
 
     def unknown(self, mesh: Any, degree: int) -> Any:
         """Three numbers on the one element, zero."""
@@ -321,7 +326,13 @@ class PointKinematics(_Reduced):
     def deformation_gradient(self, unknown: Any) -> Any:
         """Diagonal and constant."""
         stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
-        return sum(stretches, ufl.Identity(3))
+        F = sum(stretches, ufl.Identity(3))
+        return F if self._shear is None else F + ufl.as_tensor([[0, self._shear, 0], [0, 0, 0], [0, 0, 0]])
+
+    def shear(self) -> Any:
+        """F_xy."""
+        self._shear = _constant(self.mesh, 0.0) if self._shear is None else self._shear
+        return self._shear
 
     def uniform_unknown(self, space: Any, component: int) -> Any:
         """The number along that axis."""

@@ -54,7 +54,7 @@ def draw_picture(
     view = sight.view(grids, SEVERAL if len(shown) > 1 else ONE, dots)
     images = render(grids, view)
     with matplotlib.rc_context(STYLE):
-        sheet = Sheet(sight, shown, images, view, dots, has_clock=False)
+        sheet = Leaf(sight, shown, images, view, dots, has_clock=False)
         data = as_file(sheet.figure, ending[1:], _about(sight, "picture"), scale_colours())
     return _write(path, sight, shown, ending, data)
 
@@ -76,11 +76,11 @@ def draw_animation(
     view = sight.view(grids, ONE, FRAME_DOTS)
     images = render(grids, view)
     with matplotlib.rc_context(STYLE):
-        drawn = _drawn(Sheet(sight, times[:1], images[:1], view, FRAME_DOTS, has_clock=True), times, images)
+        drawn = _drawn(Leaf(sight, times[:1], images[:1], view, FRAME_DOTS, has_clock=True), times, images)
     return _write(path, sight, [times[0], times[-1]], ending, encode(drawn, _about(sight, "animate")))
 
 
-def _drawn(sheet: Sheet, times: Sequence[float], images: Sequence[Pixels]) -> list[Image.Image]:
+def _drawn(sheet: Leaf, times: Sequence[float], images: Sequence[Pixels]) -> list[Image.Image]:
     canvas, found = FigureCanvasAgg(sheet.figure), []
     for number, (time, image) in enumerate(zip(times, images, strict=True)):
         sheet.show(time, image, number / (len(times) - 1))
@@ -109,7 +109,7 @@ LETTER, NOTE_LETTER = 0.092, 0.049  # mean width in the head and in the notes
 TRIAD = 0.17  # length of an axis that is seen from the side
 
 
-class Sheet:
+class Leaf:
     """A figure with one panel for each time."""
 
     def __init__(

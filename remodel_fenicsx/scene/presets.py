@@ -96,6 +96,13 @@ _PAPER = {
         _CHAINS,
         {"initial": "random", "axes": "cylindrical", "seed": 1},
     ),
+    "sheet": _printed_method(
+        {"length_x": 10.0, "length_y": 10.0, "thickness": 1.0},
+        {"force_x": _load(50.0, 10.0), "force_y": _load(25.0, 10.0)},
+        100.0,
+        _CHAINS,
+        {"initial": "isotropic", "axes": "global"},
+    ),
 }
 
 # Lengths in nm. r0 is the root mean square end-to-end length of the free chain,
@@ -129,7 +136,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 
 PRESET_NOTES = {
     "kuhl-holzapfel-2007": "The printed method on the three bodies of the paper: Fig. 5 (cube), Fig. 6 (tendon), "
-    "Figs. 7 to 11 (tube). The frame is 'spatial', as printed in eq. (9).",
+    "Figs. 7 to 11 (tube); and on a sheet, which the paper has not. The frame is 'spatial', as printed in eq. (9).",
     "consistent": "The paper's bodies and parameters with a law and an energy that depend on the structure tensor "
     "alone (docs/theory.md, The consistent variant). It is of second order in the time step.",
     "sun-2002": "The printed method with collagen I as measured with optical tweezers (paper, Remark 2): contour "

@@ -686,10 +686,10 @@ def preset_scene(preset: str, shape: str) -> Scene:
     >>> scene = preset_scene("kuhl-holzapfel-2007", "tube")  # the artery of Fig. 7
     >>> scene.name, scene.geometry.outer_radius, scene.loads["pressure"].value
     ('tube', 3.0, 4.8)
-    >>> preset_scene("kuhl-holzapfel-2007", "ball")
+    >>> preset_scene("none", "tube")
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.schema.tables.SceneError: geometry.shape = 'ball': allowed are 'cube', 'tendon', 'tube', 'mesh'
+    remodel_fenicsx.schema.tables.SceneError: preset = 'none': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'
     """
     return scene_from_dict({"name": shape, "preset": preset, "geometry": {"shape": shape}})
 

@@ -29,6 +29,7 @@ from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
+from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.tables import Table, fault, shown
 from remodel_fenicsx.schema.toml import read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
@@ -93,6 +94,7 @@ class MeasuredTable(Table):
     sd: dict[str, Positive] = Field(default={}, json_schema_extra={"allowed": "numbers greater than 0 by column"})
     scale: dict[str, Literal["unknown"]] = Field(default={}, json_schema_extra={"allowed": "'unknown' by column"})
     units: dict[str, str] = Field(default={}, json_schema_extra={"allowed": "units by column"})
+    drive: tuple[str, ...] = Field(default=(), strict=False, json_schema_extra={"allowed": "names of columns of loads"})
 
     @model_validator(mode="after")
     def _go_together(self) -> MeasuredTable:
@@ -197,7 +199,7 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
         raise SceneError(f"{place}.state = 'after': takes cells alone, not what remodeling.turnover has changed")
     file = f"{place}.file = {shown(table.file)}"
     columns = _read_columns(folder / table.file, file, scene)
-    loads = tuple(name for name in columns if name in scene.loads)
+    loads = _prescribed(columns, table, scene, place)
     _check_columns(columns, loads, table.state, file, scene)
     for key in ("units", "sd", "scale"):
         for name in getattr(table, key):
@@ -212,6 +214,19 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
             )
             raise SceneError(f"{place}.sd.{name}: {rule}")
     return Measured(table.file, table.state, table.time or 0.0, columns, loads, table.sd, tuple(table.scale))
+
+
+def _prescribed(columns: Mapping[str, Array], table: MeasuredTable, scene: Scene, place: str) -> tuple[str, ...]:
+    """The loads among the columns: those that drive the test; of a force and a strain along one axis the strain."""
+    kinds = scene.load_kinds
+    for name in table.drive:
+        if name not in columns or name not in kinds:
+            known = ", ".join(one for one in columns if one in kinds)
+            raise SceneError(f"{place}.drive = {shown(name)}: allowed are the columns of loads: {known}")
+    if table.drive:
+        return table.drive
+    loads = [name for name in columns if name in scene.loads or (name in kinds and kinds[name].instead_of)]
+    return tuple(name for name in loads if kinds[name].dimension is None or kinds[name].instead_of not in loads)
 
 
 def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
@@ -232,10 +247,16 @@ def _all_columns(scene: Scene) -> tuple[Any, ...]:
 
 def _read_columns(path: Path, place: str, scene: Scene) -> dict[str, Array]:
     known = {column.name for column in _all_columns(scene)} - {"seconds", "substeps"}
+    strains = {name.replace("elongation", "stretch"): name for name in scene.load_kinds if "elongation" in name}
+    allowed = sorted({*scene.loads, *known, "time", *strains})
     try:
-        return read_columns(read_regular(path, LARGEST_TABLE), path.name, sorted({*scene.loads, *known, "time"}))
+        columns = read_columns(read_regular(path, LARGEST_TABLE), path.name, allowed)
     except (OSError, ForeignFileError, TableFileError) as error:
         raise SceneError(f"{place}: {getattr(error, 'strerror', None) or error}") from error
+    for stretch, strain in strains.items():
+        if stretch in columns and strain in columns:
+            raise SceneError(f"{place}: has both {stretch} and {strain}")
+    return {strains.get(name, name): values - (name in strains) for name, values in columns.items()}
 
 
 def _check_columns(columns: Mapping[str, Array], loads: tuple[str, ...], state: str, place: str, scene: Scene) -> None:
@@ -300,6 +321,7 @@ def _with_columns(scene: Scene, table: Measured) -> Scene:
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
+    scene = _with_loads_of(table, scene)
     changes = PASSIVE | {"time.step": 1.0, "time.end": float(table.rows)}
     changes |= {"output.times": [], "output.fields": False, "output.columns": [*table.sd]}  # some need turnover
     for name, load in scene.loads.items():
@@ -310,6 +332,14 @@ def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scen
         ramp = [[0.0, 0.0], *([number + 1.0, float(value / largest)] for number, value in enumerate(values))]
         changes |= {f"loads.{name}.value": largest, f"loads.{name}.ramp": ramp}
     return scene.with_values(changes)
+
+
+def _with_loads_of(table: Measured, scene: Scene) -> Scene:
+    """With the table's loads in place of those of the scene that cannot be beside them."""
+    replaced = {scene.load_kinds[name].instead_of for name in table.loads}
+    loads = {name: load for name, load in scene.loads.items() if name not in replaced}
+    new = {name: Load(value=1.0, ramp=((0.0, 0.0), (1.0, 1.0))) for name in table.loads if name not in loads}
+    return scene.model_copy(update={"loads": loads | new})
 
 
 def _run(

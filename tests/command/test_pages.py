@@ -59,6 +59,7 @@ LEFT_BEHIND = {
     "tutorial_layers": ["layers/report.html", "layers.png", "bent-axes.vtu", "bent/history.csv", "bent.png"],
     "tutorial_residual_stress": ["with/history.csv", "angles.png"],
     "tutorial_fit": ["fitted/fit.csv", "fitted/fit.png", "vessel/history.csv"],
+    "tutorial_biaxial": ["biaxial/fit.csv", "biaxial/fit.png", "held/report.html"],
     "tutorial_sweep": ["sweep/sweep.csv", "sweep/sweep.png", "at-16/history.csv"],
     "howto_accuracy": ["fast/history.csv"],
     "howto_container": [],

@@ -513,7 +513,7 @@ def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "kinematics 'full'" in capsys.readouterr().out
     )
     for preset in ("kuhl-holzapfel-2007", "sun-2002"):
-        for shape in ("cube", "tendon", "tube"):
+        for shape in ("cube", "tendon", "tube", "sheet"):
             assert cli.main(["new", preset, "--shape", shape]) == 0
             scene = tmp_path / f"{preset}-{shape}.toml"
             scene.write_text(capsys.readouterr().out)

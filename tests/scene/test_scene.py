@@ -461,7 +461,7 @@ def test_the_preset_is_the_printed_method():
 def test_every_preset_gives_good_scenes_and_is_explained():
     assert set(PRESETS) == set(PRESET_NOTES)
     for name, shapes in PRESETS.items():
-        assert set(shapes) == {"cube", "tendon", "tube"}
+        assert set(shapes) == set(SHAPES) - {"mesh"}
         for shape in shapes:
             values = changed(TUBE if shape == "tube" else CUBE, {"preset": name, "geometry.shape": shape})
             assert scene_from_dict(values).preset == name
@@ -544,7 +544,7 @@ def test_a_scene_as_run_reads_back_as_the_same_scene(tmp_path, path):
 
 def test_the_demos_are_the_preset():
     of_the_paper = {"artery": "tube", "cube": "cube", "tendon": "tendon"}
-    assert [path.stem for path in DEMOS if path.stem not in of_the_paper] == ["layers", "pulse", "turnover"]
+    assert [path.stem for path in DEMOS if path.stem not in of_the_paper] == ["layers", "pulse", "sheet", "turnover"]
     for path in (path for path in DEMOS if path.stem in of_the_paper):
         shape = of_the_paper[path.stem]
         printed = scene_from_dict({"name": path.stem, "preset": PAPER, "geometry": {"shape": shape}})
@@ -557,7 +557,9 @@ def test_a_preset_by_name():
         SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'$"
     ):
         preset_scene("none", "tube")
-    with pytest.raises(SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'mesh'$"):
+    with pytest.raises(
+        SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh'$"
+    ):
         preset_scene(PAPER, "heart")
 
 

@@ -1,0 +1,194 @@
+"""Planar sheet: the body of a biaxial test, loaded along x and y."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from remodel_fenicsx.body.cube import box_domain
+from remodel_fenicsx.body.reductions import Reduction, box, choice
+from remodel_fenicsx.body.shape import Column, LoadKind, Shape, check_lengths, homogeneous_bar
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.schema.settings import Mesh
+from remodel_fenicsx.schema.tables import fault
+from remodel_fenicsx.schema.units import FORCE, LENGTH
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.body.loading import Loading
+
+SIDES = "xy"
+
+
+def _gradient(row: int, column: int) -> Callable[[Any], float]:
+    """Volume mean of a component of F; of the length from edge to edge where it is on the diagonal."""
+    return lambda m: float(m.quadrature.mean(m.F[..., row, column]))
+
+
+def _cauchy(row: int, column: int) -> Callable[[Any], float]:
+    return lambda m: float(m.quadrature.mean(m.stress[..., row, column]))
+
+
+def _nominal(row: int, column: int) -> Callable[[Any], float]:
+    """Volume mean of P = J sigma F^-T."""
+
+    def value(m: Any) -> float:
+        def mean() -> NDArray[np.float64]:
+            stress = np.linalg.det(m.F)[..., None, None] * m.stress @ np.swapaxes(np.linalg.inv(m.F), -1, -2)
+            return np.array([[m.quadrature.mean(stress[..., i, j]) for j in range(3)] for i in range(3)])
+
+        return float(m.tool_of_step("nominal stress", mean)[row, column])
+
+    return value
+
+
+def _force(side: int) -> LoadKind:
+    axis, other = SIDES[side], SIDES[1 - side]
+    nominal = _nominal(side, side)
+
+    def area(shape: Any) -> float:
+        return float(getattr(shape, f"length_{other}") * shape.thickness)
+
+    return LoadKind(
+        lambda shape, loading, name: loading.add_dead_force(name, f"{axis}1", side, getattr(shape, f"length_{axis}")),
+        f"force along {axis} on the edge {axis} = length_{axis}: given, its direction stays, or what the edge bears",
+        FORCE,
+        value=lambda m: nominal(m) * area(m.observer.shape),
+        reductions=("point",),
+        area=area,
+        instead_of=f"elongation_{axis}",
+    )
+
+
+def _elongation(side: int) -> LoadKind:
+    axis, stretch = SIDES[side], _gradient(side, side)
+    return LoadKind(
+        lambda shape, loading, name: loading.add_prescribed_elongation(
+            name, f"{axis}1", side, getattr(shape, f"length_{axis}")
+        ),
+        f"engineering strain along {axis}: given, or what the sheet comes to",
+        value=lambda m: stretch(m) - 1.0,
+        above=-1.0,
+        reductions=("point",),
+        instead_of=f"force_{axis}",
+    )
+
+
+class Sheet(Shape):
+    """A sheet in the plane of x and y, as biaxial tests have it. It slides on the planes x = y = z = 0.
+
+    Along x and along y a force or an elongation may be given, or neither: then the edge is free. Lengths: 1e-6 to 1e6,
+    one up to 10,000 times the other.
+
+    Its keyword arguments are the keys of `[geometry]`: lengths in the unit `length_unit`, or in any one unit.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> body = parts.Sheet(length_x=20.0, length_y=10.0, thickness=0.5)
+    >>> list(body.loads)
+    ['force_x', 'force_y', 'elongation_x', 'elongation_y', 'shear']
+    >>> body.loads["force_x"].area(body), body.build(parts.Mesh()).number_of_elements
+    (5.0, 16)
+    """
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        **{f"force_{axis}": _force(side) for side, axis in enumerate(SIDES)},
+        **{f"elongation_{axis}": _elongation(side) for side, axis in enumerate(SIDES)},
+        "shear": LoadKind(
+            lambda shape, loading, name: loading.add_prescribed_shear(name),
+            "shear F_xy of the sheet, by which places move along x with y; F_yx is 0",
+            reductions=("point",),
+        ),
+    }
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column("thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)),
+        *(
+            Column(f"cauchy_stress_{words}", "stress", f"Cauchy stress {words}, volume mean", _cauchy(*place))
+            for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)))
+        ),
+        *(
+            Column(
+                f"nominal_stress_{words}",
+                "stress",
+                f"first Piola-Kirchhoff stress P_{words * (3 - len(words))}, force over reference area, volume mean: "
+                f"along {words[0]} on the edges across {words[-1]}",
+                _nominal(*place),
+            )
+            for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)), ("yx", (1, 0)))
+        ),
+        Column(
+            "fibre_angle",
+            "degrees",
+            "angle between chains and x in the reference body, mean over the volume",
+            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
+            by_case=False,
+        ),
+    )
+    number_of_elements: ClassVar[int] = 16
+    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    depth_in_words: ClassVar[tuple[str, str, str]] = ("through the sheet", "lower face", "upper face")
+    angle_in_words: ClassVar[tuple[str, str]] = ("along x", "across x")
+    buckles: ClassVar[bool] = False  # it lies on z = 0
+    reductions: ClassVar[dict[str, Reduction]] = {
+        "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape.sides.values())),
+    }
+
+    shape: Literal["sheet"] = Field(default="sheet", description="Which body it is.")
+    length_x: Annotated[float, LENGTH] = Field(default=10.0, gt=0, description="Side along x.")
+    length_y: Annotated[float, LENGTH] = Field(default=10.0, gt=0, description="Side along y.")
+    thickness: Annotated[float, LENGTH] = Field(default=1.0, gt=0, description="Side along z.")
+
+    @property
+    def sides(self) -> dict[str, float]:
+        """Along x, y and z, by their keys."""
+        return {"length_x": self.length_x, "length_y": self.length_y, "thickness": self.thickness}
+
+    @property
+    def axial_length(self) -> float:
+        """The thickness."""
+        return self.thickness
+
+    @property
+    def section_area(self) -> float:
+        """Of the plane."""
+        return self.length_x * self.length_y
+
+    @model_validator(mode="after")
+    def _can_be_meshed(self) -> Sheet:
+        check_lengths(self, self.sides)
+        return self
+
+    def check_with(self, scene: Any, key: str) -> None:
+        """What all bodies ask, and that the strain is the same everywhere where shear is prescribed."""
+        super().check_with(scene, key)
+        made = choice(scene)
+        if "shear" in scene.loads and not KINEMATICS[made.name].homogeneous:
+            reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
+            rule = f"needs the same strain everywhere, model.kinematics = 'point': {reasons}"
+            raise fault(rule, "loads.shear.value", scene.loads["shear"].value)
+
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+        """Four elements along either side and one through the sheet; times the refinement."""
+        return box_domain(self.name, self.sides, [*self.sides.values()], (4, 4, 1), mesh, comm)
+
+    def hold(self, loading: Loading) -> None:
+        """The planes x = y = z = 0."""
+        for component, face in enumerate(("x0", "y0", "z0")):
+            loading.hold_face(face, component)
+
+    def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
+        """To x."""
+        return angle_to_axis(dimensions, axes, np.array([1.0, 0.0, 0.0]))
