@@ -64,6 +64,7 @@ from remodel_fenicsx.body.shape import (
     Column as Column,
     End as End,
     WithRegions as WithRegions,
+    cauchy_columns as cauchy_columns,
     uniaxial_columns as uniaxial_columns,
 )
 from remodel_fenicsx.body.wall import Walled as Walled

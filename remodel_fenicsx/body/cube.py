@@ -9,7 +9,15 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.shape import Column, LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
+from remodel_fenicsx.body.shape import (
+    Column,
+    LoadKind,
+    Shape,
+    cauchy_columns,
+    check_lengths,
+    homogeneous_bar,
+    uniaxial_columns,
+)
 from remodel_fenicsx.body.reductions import Reduction, box
 from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.units import FORCE, LENGTH
@@ -52,6 +60,7 @@ class Cube(Shape):
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
+    columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
     number_of_elements: ClassVar[int] = 1
     face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
     reductions: ClassVar[dict[str, Reduction]] = {

@@ -328,16 +328,17 @@ def columns_of(
     others = (*shape.columns, *of_regions, *COLUMNS.values())
     chosen = [column for column in others if column.name in requested]
     known = {column.name for column in (*always, *others)}
-    on_request = columns_on_request(shape)
+    on_request = columns_on_request(shape, regions)
     extra = (on_request[name] for name in requested if name not in known)
     found = (*always, *(chosen or others), *extra)
     differ = [column for column in found if column.by_case and not column.after_pass]
     return (*found, *(column.of_case(number) for number in range(2, cases + 1) for column in differ))
 
 
-def columns_on_request(shape: Shape | type[Shape]) -> dict[str, Column]:
+def columns_on_request(shape: Shape | type[Shape], regions: Iterable[str] = ()) -> dict[str, Column]:
     """Columns by name that a history of this shape has only where a scene names them."""
-    return COLUMNS_ON_REQUEST | {column.name: column for column in shape.columns_on_request}
+    of_regions = [column for name in regions for column in shape.region_columns_on_request(name)]
+    return COLUMNS_ON_REQUEST | {column.name: column for column in (*shape.columns_on_request, *of_regions)}
 
 
 @dataclass(frozen=True)
@@ -647,6 +648,11 @@ class Shape(_Is):  # type: ignore[misc]
         """Where regions that lie one behind the other begin and end in `depth`; empty where they do not."""
         return {}
 
+    @classmethod
+    def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
+        """Further columns that a scene may name of its region `name`."""
+        return ()
+
     @abstractmethod
     def hold(self, loading: Loading) -> None:
         """Hold the body as it is held without loads, its ends free.
@@ -884,6 +890,36 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
             "angle between chains and load axis in the reference body, mean over the volume",
             lambda m: m.quadrature.mean_of_known(m.fibre_angle),
         ),
+    )
+
+
+def cauchy_columns(*names: str) -> tuple[Column, ...]:
+    """Columns of Cauchy's stress, volume means: of "x" the normal one along x, of "xy" the shear stress.
+
+    Parameters
+    ----------
+    names
+        Letters of one or two axes.
+
+    Returns
+    -------
+    tuple of Column
+        `cauchy_stress_` with each name.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import cauchy_columns
+    >>> [column.name for column in cauchy_columns("x", "xy")]
+    ['cauchy_stress_x', 'cauchy_stress_xy']
+    """
+
+    def mean(name: str, m: Any) -> float:
+        row, column = "xyz".index(name[0]), "xyz".index(name[-1])
+        return float(m.quadrature.mean(m.stress[..., row, column]))
+
+    return tuple(
+        Column(f"cauchy_stress_{name}", "stress", f"Cauchy stress {name}, volume mean", partial(mean, name))
+        for name in names
     )
 
 

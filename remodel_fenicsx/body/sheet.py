@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body.cube import box_domain
 from remodel_fenicsx.body.reductions import Reduction, box, choice
-from remodel_fenicsx.body.shape import Column, LoadKind, Shape, check_lengths, homogeneous_bar
+from remodel_fenicsx.body.shape import Column, LoadKind, Shape, cauchy_columns, check_lengths, homogeneous_bar
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.settings import Mesh
@@ -30,10 +30,6 @@ SIDES = "xy"
 def _gradient(row: int, column: int) -> Callable[[Any], float]:
     """Volume mean of a component of F; of the length from edge to edge where it is on the diagonal."""
     return lambda m: float(m.quadrature.mean(m.F[..., row, column]))
-
-
-def _cauchy(row: int, column: int) -> Callable[[Any], float]:
-    return lambda m: float(m.quadrature.mean(m.stress[..., row, column]))
 
 
 def _nominal(row: int, column: int) -> Callable[[Any], float]:
@@ -114,11 +110,15 @@ class Sheet(Shape):
         ),
     }
     columns: ClassVar[tuple[Column, ...]] = (
-        Column("thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)),
-        *(
-            Column(f"cauchy_stress_{words}", "stress", f"Cauchy stress {words}, volume mean", _cauchy(*place))
-            for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)))
+        Column(
+            "fibre_angle",
+            "degrees",
+            "angle between chains and x in the reference body, mean over the volume",
+            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
+            by_case=False,
         ),
+        Column("thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)),
+        *cauchy_columns("x", "y", "xy"),
         *(
             Column(
                 f"nominal_stress_{words}",
@@ -128,13 +128,6 @@ class Sheet(Shape):
                 _nominal(*place),
             )
             for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)), ("yx", (1, 0)))
-        ),
-        Column(
-            "fibre_angle",
-            "degrees",
-            "angle between chains and x in the reference body, mean over the volume",
-            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
-            by_case=False,
         ),
     )
     number_of_elements: ClassVar[int] = 16

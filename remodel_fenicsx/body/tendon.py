@@ -11,7 +11,15 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.reductions import Reduction, Strut, cylinder, unturned
-from remodel_fenicsx.body.shape import Column, LoadKind, Shape, check_lengths, homogeneous_bar, uniaxial_columns
+from remodel_fenicsx.body.shape import (
+    Column,
+    LoadKind,
+    Shape,
+    cauchy_columns,
+    check_lengths,
+    homogeneous_bar,
+    uniaxial_columns,
+)
 from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
 
@@ -62,6 +70,7 @@ class Tendon(Shape):
         )
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
+    columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 480
     face_names: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")

@@ -40,6 +40,7 @@ from remodel_fenicsx.body.wall import (
     Wall,
     angle_columns,
     angle_columns_on_request,
+    stress_columns,
     check_layers,
     tube_layers,
 )
@@ -216,6 +217,14 @@ def _mean_radius(face: str) -> Callable[[Any], float]:
     return value
 
 
+def _mean_hoop_stress(m: Any) -> float:
+    """Over dr, the deformed volume over the deformed circumference 2 pi R |F c| and a length."""
+    local = m.state.cells.local_axes
+    around = np.linalg.norm(np.einsum("...ij,...j->...i", m.F, local.axes[..., 0, :]), axis=-1)
+    radii = np.linalg.norm(local.coordinates[..., :2], axis=-1)
+    return float(m.quadrature.mean_of_known(m.wall_stress[..., 0], np.linalg.det(m.F) / (radii * around)))
+
+
 def _layer_angle(share: float) -> AngleOf:
     """Mean angle over the elements that touch R_i + share (R_o - R_i)."""
 
@@ -357,6 +366,13 @@ class Tube(RoundWall):
             of_one_tissue=True,
         ),
         *angle_columns_on_request(MEANS),
+        *stress_columns(MEANS),
+        Column(
+            "mean_hoop_stress",
+            "stress",
+            "Cauchy stress around the wall, mean over the deformed thickness: by the law of Laplace p r_i / h",
+            _mean_hoop_stress,
+        ),
         *RoundWall.columns_on_request,
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")

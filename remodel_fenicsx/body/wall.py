@@ -233,6 +233,32 @@ def _of(mean: AngleOf, name: str, m: Any) -> float:
     return mean(m, getattr(m, name))
 
 
+STRESSES = {"hoop": ("around", 0), "axial": ("along", 1), "radial": ("across", 2)}
+"""Components of Cauchy's stress in the wall, by name: their direction, and where `Measurement.wall_stress` has them."""
+
+
+def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+    """Cauchy's stress in the wall, where the angles are."""
+    return tuple(
+        Column(
+            f"{name}_stress_{where}",
+            "stress",
+            f"mean Cauchy stress {direction} the wall, in local axes that move with it, in the elements {words}",
+            partial(_stress, mean, component),
+        )
+        for name, (direction, component) in STRESSES.items()
+        for where, (words, mean) in means.items()
+    )
+
+
+def _stress(mean: AngleOf, component: int, m: Any) -> float:
+    return mean(m, m.wall_stress[..., component])
+
+
+def _in_region(name: str) -> AngleOf:
+    return lambda m, values: float(m.quadrature.mean_of_known(values, m.elements_of_region(name)))
+
+
 class Walled(Shape):
     """A body with a wall: angles are those in it, and a scene may give it `natural.layers`.
 
@@ -261,6 +287,11 @@ class Walled(Shape):
     }
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
     angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
+
+    @classmethod
+    def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
+        """Stresses in the wall."""
+        return stress_columns({name: (f"of the region `{name}`", _in_region(name))})
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Angle of the chain direction in the wall, degrees, (...,): circumferential 0, axial 90, NaN across."""
@@ -303,6 +334,7 @@ class WalledMesh(Walled):
     columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
     columns_on_request: ClassVar[tuple[Column, ...]] = (
         *angle_columns_on_request(MEANS_ON_A_MESH),
+        *stress_columns(MEANS_ON_A_MESH),
         *Walled.columns_on_request,
     )
     axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")

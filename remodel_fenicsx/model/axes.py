@@ -112,14 +112,19 @@ class LocalAxes:
         deformation_gradient
             F at the points, (..., 3, 3).
         """
-        F, axes = by_component(deformation_gradient), by_component(self.axes)
-        circumferential, axial = (
-            [F[i, 0] * axes[k, 0] + F[i, 1] * axes[k, 1] + F[i, 2] * axes[k, 2] for i in range(3)] for k in (0, 1)
-        )
-        radial = _unit(_cross(circumferential, axial))
-        circumferential = _unit(circumferential)
-        rows = [circumferential, _cross(radial, circumferential), radial]
-        return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+        return moved_axes(self.axes, deformation_gradient)
+
+
+def moved_axes(axes: Array, deformation_gradient: Array) -> Array:
+    """As `LocalAxes.deformed`, of local axes as rows (..., 3, 3)."""
+    F, rows = by_component(deformation_gradient), by_component(axes)
+    circumferential, axial = (
+        [F[i, 0] * rows[k, 0] + F[i, 1] * rows[k, 1] + F[i, 2] * rows[k, 2] for i in range(3)] for k in (0, 1)
+    )
+    radial = _unit(_cross(circumferential, axial))
+    circumferential = _unit(circumferential)
+    found = [circumferential, _cross(radial, circumferential), radial]
+    return np.moveaxis(np.array(found), (0, 1), (-2, -1))
 
 
 def _cross(one: list[Array], other: list[Array]) -> list[Array]:

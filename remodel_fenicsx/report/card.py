@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody
+from remodel_fenicsx.model.axes import moved_axes
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, DIRECTION_FIELDS, TENSOR_FIELDS, WholeBody
 
 Places = NDArray[np.float64]
 
@@ -112,7 +113,7 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 # ---------------------------------------------------------------- the body at the times that a page keeps
 
 CELL = ("cell_dimensions", *AXIS_FIELDS)
-NAMES = ("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_extension", *CELL)
+NAMES = ("displacement", "fibre_angle_deformed", "chain_extension", *CELL, *TENSOR_FIELDS, *DIRECTION_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -126,23 +127,24 @@ class ShownBody:
     angle: NDArray[np.float32] | None
     extension: NDArray[np.float32] | None
     edges: NDArray[np.float32] | None
+    wall_stress: Places | None
     is_deformed: bool
 
     @classmethod
     def of(cls, whole: WholeBody, times: Places) -> ShownBody:
         """What a run has recorded at these times."""
-        rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ("position", "angle", "extension", "edges")}
-        is_deformed = True
+        names = ("position", "angle", "extension", "edges", "wall_stress")
+        rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in names}
+        volume, is_deformed = _volumes(whole.points[whole.elements]), True
         with whole.recording.kept_open():
             for time in times:
                 displacement, found = whole.fields(float(time), NAMES)
                 is_deformed = displacement is not None
                 moved = 0.0 if displacement is None else displacement
                 rows["position"].append((whole.points + moved).astype(np.float32))
-                for name, values in _of_elements(found).items():
+                for name, values in (_of_elements(found) | _of_layers(whole, volume, found)).items():
                     rows[name].append(values.astype(np.float32))
         series: Any = {name: np.stack(values) if values else None for name, values in rows.items()}
-        volume = _volumes(whole.points[whole.elements])
         return cls(whole, times, volume, **series, is_deformed=is_deformed)
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -177,6 +179,25 @@ def _of_elements(fields: dict[str, Places]) -> dict[str, Places]:
             axes = axes @ np.swapaxes(fields["deformation_gradient"].reshape(-1, 3, 3), 1, 2)
         found["edges"] = fields["cell_dimensions"][:, :, None] * axes
     return found
+
+
+def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> dict[str, Places]:
+    """Mean stress around, along and across the wall in each layer, (layers, 3); nothing without a wall or fields."""
+    shape = whole.recording.scene.geometry
+    known = set(fields) >= {*TENSOR_FIELDS, *(DIRECTION_FIELDS if shape.constant_fields else ())}
+    if not shape.is_a("Walled") or not known:
+        return {}
+    centres = whole.points[whole.elements].mean(axis=1)
+    axes = (
+        np.stack([fields[name] for name in DIRECTION_FIELDS], axis=1)
+        if shape.constant_fields
+        else shape.axes_at(centres)
+    )
+    F, stress = (fields[name].reshape(-1, 3, 3) for name in ("deformation_gradient", "cauchy_stress"))
+    moved = moved_axes(axes, F)
+    components = volume[:, None] * np.einsum("nki,nij,nkj->nk", moved, stress, moved)
+    sums = [np.bincount(whole.layer, weights=part) for part in (*components.T, volume)]
+    return {"wall_stress": np.stack(sums[:3], axis=1) / sums[3][:, None]}
 
 
 def _volumes(corners: Places) -> Places:

@@ -184,6 +184,8 @@ def tiles(run: ReportedRun) -> Card | None:
         if column.name not in (*own, "max_chain_extension") or len(found) == MOST_TILES:
             continue
         values, unit = history[column.name][np.isfinite(history[column.name])], run.unit(column)
+        if not values.any():
+            continue
         last, first = (escape(with_unit(float(values[index]), unit)) for index in (-1, 0))
         found.append(
             f'<div class="tile" title="{escape(column.meaning)}"><b>{last}</b>'
@@ -255,6 +257,28 @@ def angles(run: ReportedRun) -> Card | None:
     return Card("angles", f'<div class="stack">{profile if len(body.whole.depth) > 1 else ""}{rose}</div>', data)
 
 
+def stress(run: ReportedRun) -> Card | None:
+    """Stress through the wall, and what the law of Laplace says of its mean around."""
+    body, history = run.body, run.story.history
+    if body is None or body.wall_stress is None or len(body.whole.depth) < 2:
+        return None
+    through, start, end = run.recording.scene.geometry.depth_in_words
+    unit = unit_of(run.recording.scene, "stress")
+    laplace: Any = np.full(len(body.times), np.nan)
+    if {"pressure", "inner_radius", "outer_radius"} <= set(history):
+        inner, outer = history["inner_radius"], history["outer_radius"]
+        laplace = np.interp(body.times, history["time"], history["pressure"] * inner / (outer - inner))
+    data = {"layers": [[[_finite(value) for value in layer] for layer in layers] for layers in body.wall_stress],
+            "laplace": [_finite(value) for value in laplace], "depth": body.whole.depth.tolist(),
+            "through": f"{through} (0 {start}, 1 {end})"}  # fmt: skip
+    legend = "Means of layers, in axes that move with the wall."
+    legend += " Dashed: p r_i / h, by the law of Laplace the mean around." if np.isfinite(laplace).any() else ""
+    html = section(
+        f"Cauchy stress {through}", f'<div id="stress" class="stack"></div><p class="note">{legend}</p>', "half", unit
+    )
+    return Card("stress", html, data)
+
+
 # ---------------------------------------------------------------- curves
 def curves(run: ReportedRun) -> Card | None:
     """The history, columns of one kind together."""
@@ -281,9 +305,11 @@ def curves(run: ReportedRun) -> Card | None:
 
 
 def _together(first: Column, second: Column) -> bool:
-    """Whether two columns are drawn in one frame: of one unit, and their names begin or end alike."""
+    """Whether two columns are drawn in one frame: of one unit, their names begin alike, or are two words and end so."""
     a, b = first.name.split("_"), second.name.split("_")
-    return first.unit == second.unit and len(a) > 1 and len(b) > 1 and (a[-1] == b[-1] or a[:2] == b[:2])
+    ends_alike = len(a) == len(b) == 2 and a[1] == b[1] and len(a[1]) > 1  # no letter of an axis
+    begins_alike = min(len(a), len(b)) > 1 and (a[:2] == b[:2] or a[:-1] == b[:-1])
+    return first.unit == second.unit and (ends_alike or begins_alike)
 
 
 def _title(names: list[str]) -> str:
@@ -419,7 +445,7 @@ def versions(run: ReportedRun) -> Card:
     return Card("versions", folded("Versions and licences", table(rows) + note + licences))
 
 
-PAGE_PARTS: list[Part] = [head, tiles, view, angles, curves, facts, warnings, scene, versions]
+PAGE_PARTS: list[Part] = [head, tiles, view, angles, curves, stress, facts, warnings, scene, versions]
 """In the order of the page."""
 
 
@@ -439,7 +465,7 @@ def data_of(cards_: list[Card]) -> tuple[dict[str, Any], dict[str, Array]]:
 
 REPORT = "report.html"
 PAGE_SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times
-SCRIPTS = ("data.js", "body.js", "angles.js", "curves.js", "page.js")
+SCRIPTS = ("data.js", "body.js", "angles.js", "stress.js", "curves.js", "page.js")
 STYLES = ("report.bundle.css", "page.css")
 GENERATOR_TAG = b'name="generator" content="remodel_fenicsx'  # what bears it may be made anew
 LARGEST_PAGE = 10**9  # bytes

@@ -163,6 +163,12 @@ class Measurement:
         return self.quadrature.evaluate(expression, (3, 3))
 
     @cached_property
+    def wall_stress(self) -> Array:
+        """Cauchy stress around, along and across the wall at all points, (elements, points, 3)."""
+        axes = self.state.cells.local_axes.deformed(self.F)
+        return np.einsum("...ki,...ij,...kj->...k", axes, self.stress, axes)
+
+    @cached_property
     def fibre_angle(self) -> Array:
         """Reference fibre angle at all points (elements, points), degrees; NaN where there is none."""
         cells = self.state.cells

@@ -399,7 +399,7 @@ class Scene(Table):
     def column_names(self) -> list[str]:
         """Of all that a history of it may have; one is there twice where a region's name makes it."""
         always = columns_of(self.geometry, regions=self.regions)
-        return [*columns_on_request(self.geometry), *(column.name for column in always)]
+        return [*columns_on_request(self.geometry, self.regions), *(column.name for column in always)]
 
     def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
         """Of its history, in the order of the file; with `more` of those on request."""
@@ -686,10 +686,10 @@ def preset_scene(preset: str, shape: str) -> Scene:
     >>> scene = preset_scene("kuhl-holzapfel-2007", "tube")  # the artery of Fig. 7
     >>> scene.name, scene.geometry.outer_radius, scene.loads["pressure"].value
     ('tube', 3.0, 4.8)
-    >>> preset_scene("none", "tube")
+    >>> preset_scene("a", "tube")
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.schema.tables.SceneError: preset = 'none': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'
+    remodel_fenicsx.schema.tables.SceneError: preset = 'a': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'
     """
     return scene_from_dict({"name": shape, "preset": preset, "geometry": {"shape": shape}})
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Recording, cli
+from remodel_fenicsx import Recording, cli, run as run_scene
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
 from remodel_fenicsx.report.card import ANGLE_STEPS, NO_ANGLE, of_angles
@@ -71,6 +71,26 @@ class Decoded:
 
 
 # ---------------------------------------------------------------- the data
+@pytest.mark.parametrize("kinematics", ["radial", "sector"])
+def test_stresses_through_the_wall_are_those_of_the_columns(kinematics: str, tmp_path: Path) -> None:
+    """The innermost and the outermost layer, at each time; their mean over the wall as it is now is Laplace's."""
+    names = [f"{name}_stress_{where}" for name in ("hoop", "axial", "radial") for where in ("inner", "outer")]
+    changes = {
+        "cells.initial": "isotropic", "model.kinematics": kinematics, "time.end": 3.0, "loads.pressure.value": 2.0,
+        "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "output.columns": [*names, "inner_radius", "outer_radius"],
+    }  # fmt: skip
+    folder = run_scene(preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes), tmp_path / "run")
+    found, history = Decoded.of(folder).data["parts"]["stress"], Recording(folder).history
+    layers = np.array(found["layers"])
+    assert layers.shape == (4, 8, 3) and found["through"] == "through the wall (0 inside, 1 outside)"
+    for component, name in enumerate(("hoop", "axial", "radial")):
+        for layer, where in ((0, "inner"), (-1, "outer")):
+            column = history[f"{name}_stress_{where}"]
+            np.testing.assert_allclose(layers[:, layer, component], column, rtol=0.02, atol=0.001 * layers.max())
+    inner, outer = (history[f"{face}_radius"][-1] for face in ("inner", "outer"))
+    assert found["laplace"][-1] == pytest.approx(2.0 * inner / (outer - inner), rel=1e-6)
+
+
 @pytest.mark.parametrize("name", ["artery", "tendon", "cube", "tetrahedra", "quadratic"])
 def test_the_page_holds_what_was_recorded(recorded: Recorded, name: str) -> None:
     """Places to half a step, angles to half a level, r/L to half of a 255th, chains by their direction."""

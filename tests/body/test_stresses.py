@@ -1,0 +1,87 @@
+"""Stresses as columns: against the one-dimensional reference, the law of Laplace, and each other's kinematics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
+from remodel_fenicsx.scene import scene_from_dict
+from tests.mesh_files import LENGTH, RADII, write_tube
+from tests.reference.radial import AXIAL, CIRCUMFERENTIAL, RADIAL, solve_radial
+
+ELEMENTS, END = 8, 30.0
+PLACES = {"inner": slice(None, 3), "outer": slice(-3, None)}  # three Gauss points of the first and the last element
+OF_REFERENCE = {"hoop": CIRCUMFERENTIAL, "axial": AXIAL, "radial": RADIAL}
+NAMES = [f"{name}_stress_{where}" for name in OF_REFERENCE for where in ("inner", "middle", "outer")]
+
+
+def artery(**changes: Any) -> Scene:
+    """The paper's, of isotropic cells, on elements of degree 2 in its plane of symmetry."""
+    values = {"cells.initial": "isotropic", "mesh.degree": 2, "model.kinematics": "radial", "time.end": END}
+    columns = {"output.columns": [*NAMES, "mean_hoop_stress", "inner_radius", "outer_radius"]}
+    return preset_scene("kuhl-holzapfel-2007", "tube").with_values(values | columns | changes)
+
+
+def last_row(scene: Scene) -> dict[str, float]:
+    simulation = Simulation(scene, MPI.COMM_SELF)
+    try:
+        return [step.row for step in simulation.steps()][-1]
+    finally:
+        simulation.close()
+
+
+def test_they_are_those_of_the_reference_while_it_remodels() -> None:
+    """The same elements and Gauss points, so the same means."""
+    row = last_row(artery())
+    known = solve_radial(end=END, elements=ELEMENTS)
+    for name, component in OF_REFERENCE.items():
+        for where, points in PLACES.items():
+            expected = np.average(known.cauchy[-1][points, component], weights=known.areas[points])
+            assert row[f"{name}_stress_{where}"] == pytest.approx(expected, rel=1e-6), (name, where)
+
+
+@pytest.mark.parametrize("changes", [{}, {"geometry.outer_radius": 1.2}], ids=["thick", "thin"])
+def test_the_mean_around_is_that_of_the_law_of_laplace(changes: dict[str, Any]) -> None:
+    row = last_row(artery(**changes, **{"loads.pressure.value": 1.0}))
+    thickness = row["outer_radius"] - row["inner_radius"]
+    assert row["mean_hoop_stress"] == pytest.approx(row["pressure"] * row["inner_radius"] / thickness, rel=1e-6)
+
+
+@pytest.mark.parametrize("kinematics", ["axisymmetric", "sector"])
+def test_other_kinematics_of_the_same_body_have_the_same(kinematics: str) -> None:
+    short = {"time.end": 3.0, "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "loads.pressure.value": 1.5}
+    one, other = (last_row(artery(**short, **{"model.kinematics": name})) for name in ("radial", kinematics))
+    for name in (*NAMES, "mean_hoop_stress"):
+        assert other[name] == pytest.approx(one[name], rel=2e-3, abs=2e-3), name
+
+
+def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:
+    """Two layers of a tube; a mesh file of one tissue beside the same tube on one radius."""
+    tables: dict[str, Any] = {
+        "cells": {"initial": "isotropic"}, "remodeling": {"law": "none"}, "time": {"end": 2.0, "step": 1.0},
+        "loads": {"pressure": {"value": 1.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+    }  # fmt: skip
+    names = ["hoop_stress_inner", "hoop_stress_middle", "radial_stress_inner"]
+    round_tube = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
+    regions = {"media": {"outer_radius": 1.5}, "adventitia": {}}
+    wall = [f"{name}_stress_{layer}" for name in ("hoop", "radial") for layer in regions]
+    mesh = {"degree": 2}
+    exact = scene_from_dict({"geometry": round_tube, "mesh": mesh, "output": {"columns": names}, **tables})
+    layered = exact.with_values({"regions": regions, "output.columns": [*wall, "mean_hoop_stress"]})
+    row = last_row(layered)
+    assert row["hoop_stress_media"] > row["mean_hoop_stress"] > row["hoop_stress_adventitia"] > 0.0
+    assert -1.0 < row["radial_stress_media"] < row["radial_stress_adventitia"] < 0.0
+    file = write_tube(tmp_path / "tube.msh", degree=2, counts=(16, 8, 2))
+    own = {"shape": "mesh", "file": str(file), "length_unit": "mm"}
+    supports = {face: {"kind": "guided"} for face in ("inlet", "outlet")}
+    found = scene_from_dict({"geometry": own, "supports": supports, "output": {"columns": names}, **tables})
+    one, other = last_row(exact), last_row(found)
+    for name in names:
+        assert other[name] == pytest.approx(one[name], rel=0.02), name
+    with pytest.raises(SceneError, match="output.columns = .*hoop_stress_intima"):
+        layered.with_values({"output.columns": ["hoop_stress_intima"]})
