@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
+from remodel_fenicsx import Scene, Simulation, preset_scene
 from remodel_fenicsx.model.residual_stress import Layer, closing, cut
 
 
@@ -87,8 +87,3 @@ def test_no_equilibrium_of_the_cut_is_said(monkeypatch: pytest.MonkeyPatch, capl
     with caplog.at_level(logging.WARNING):
         assert np.isnan(angles(scene(**{"time.end": 5.0})))[0]
     assert "no opening_angle: out of balance by 0.1" in caplog.text
-
-
-def test_layers_have_no_cut() -> None:
-    with pytest.raises(SceneError, match="'opening_angle' is for bodies of one tissue; the scene has regions"):
-        scene(**{"regions": {"inside": {"outer_radius": 2.0}, "outside": {}}})

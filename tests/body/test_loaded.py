@@ -163,24 +163,6 @@ def test_what_has_no_unloaded_shape_says_at_which_share(tmp_path: Path, capsys: 
     assert "no unloaded body was found at" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"supports.ends": "clamped"}, "geometry.is = 'loaded': not allowed with supports.ends = 'clamped'"),
-        ({"natural.cells": "equilibrium"}, "natural.cells = 'equilibrium': needs time.end = 'equilibrium'"),
-        (
-            {"geometry.is": "unloaded", "natural.cells": "equilibrium"},
-            "needs geometry.is = 'loaded' of the shape 'tube'",
-        ),
-        ({"geometry.is": "pressed"}, "geometry.is = 'pressed': allowed are 'unloaded', 'loaded'"),
-    ],
-)
-def test_what_cannot_be_loaded_is_refused(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError) as refused:
-        scene("radial" if "supports.ends" not in changes else "auto", **(LOADED | VIRGIN | changes))
-    assert words in str(refused.value)
-
-
 def test_a_loaded_shape_that_turning_cells_leave_is_warned_of(tmp_path: Path) -> None:
     """By scene and run; the way out that the line names has a row with the given radii."""
     ramp = {f"loads.{name}.ramp": [[0.0, 1.0]] for name in ("pressure", "elongation")}
@@ -193,12 +175,6 @@ def test_a_loaded_shape_that_turning_cells_leave_is_warned_of(tmp_path: Path) ->
     assert (tmp_path / "run" / "run.log").read_text().count(line) == 1
     for still in ({"remodeling.law": "none"}, {"geometry.is": "unloaded"}):
         assert not any("geometry.is" in other for other in turning.with_values(still).warnings())
-
-
-def test_load_cases_of_a_loaded_body_are_refused_with_the_way_out() -> None:
-    cases = [{"weight": 0.5}, {"weight": 0.5, "loads": {"pressure": 0.5}}]
-    with pytest.raises(SceneError, match=r"^geometry.is = 'loaded': not allowed with \[\[cases\]\].*unload SCENE"):
-        scene("radial", **(LOADED | VIRGIN | {"cases": cases}))
 
 
 def test_a_simulation_asks_for_the_unloaded_body() -> None:

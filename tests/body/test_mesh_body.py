@@ -193,11 +193,6 @@ def test_supports_and_meshes_that_cannot_be(tube: Path, tables: Any, words: str)
     assert str(error.value).startswith(words)
 
 
-def test_other_shapes_are_held_by_their_ends() -> None:
-    with pytest.raises(SceneError, match="supports.inlet: a cube is held by supports.ends"):
-        scene_from_dict({"geometry": {"shape": "cube"}, "supports": {"inlet": FREE}, "time": {"end": 1.0, "step": 1.0}})
-
-
 # ---------------------------------------------------------------- runs
 
 RUN = """
@@ -307,12 +302,6 @@ def test_loads_on_faces_that_cannot_be_are_refused(tube: Path, loads: dict[str, 
     """One line that names the key."""
     with pytest.raises(SceneError, match=words):
         Simulation(scene_of(tube, loads=loads), MPI.COMM_SELF)
-
-
-def test_other_shapes_have_no_loads_on_faces() -> None:
-    values = {"preset": "consistent", "geometry": {"shape": "tube"}, "loads": {"tissue": _outside()}}
-    with pytest.raises(SceneError, match="loads.tissue.*no such load"):
-        scene_from_dict(values)
 
 
 def test_the_ladder_of_an_own_body_varies_steps_alone(tube: Path) -> None:

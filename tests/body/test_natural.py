@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
+from remodel_fenicsx import Scene, Simulation, preset_scene
 from remodel_fenicsx.model.residual_stress import Closing, Layer, closing
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.studies.page import read_table
@@ -106,20 +106,6 @@ def test_balance_and_driver_see_the_residual_stress(kinematics: str) -> None:
         assert hoop.max() == pytest.approx(2.0, abs=0.2)
     finally:
         simulation.close()
-
-
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"cells.initial": "random"}, "cells.initial"),
-        ({"mesh.formulation": "selective-integration"}, "mesh.formulation"),
-        ({"cells.axes": "global"}, "cells.axes"),
-    ],
-)
-def test_what_does_not_go_with_it_is_refused_by_name(change: dict[str, Any], key: str) -> None:
-    """One line with both keys."""
-    with pytest.raises(SceneError, match=f"natural.opening_angle.*{key}"):
-        scene("auto", **change)
 
 
 TABLE = {  # radii and mean angles of the outer eighth of the wall of an independent radial solver, t = 150

@@ -75,17 +75,3 @@ def test_springs_along_the_wall_need_what_shows_them() -> None:
     assert abs(half["stored_energy"] / across["stored_energy"] - 1) > 1e-3
     assert full["stored_energy"] == pytest.approx(half["stored_energy"], rel=3e-3)
     assert full["outer_radius"] == pytest.approx(half["outer_radius"], abs=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"inner": {"kind": "elastic", "stiffness": 1.0}}, "allowed beside is supports.outer of kind 'elastic'"),
-        ({"outer": {"kind": "held"}}, "supports.outer.kind = 'held': allowed here is 'elastic'"),
-        ({"outer": {"kind": "elastic"}}, "supports.outer.stiffness: missing; a support of kind 'elastic' needs it"),
-    ],
-)
-def test_other_supports_of_a_tube_are_refused(table: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError) as refused:
-        scene("radial", **{"natural.opening_angle": 0.0, "supports": table})
-    assert words in str(refused.value)

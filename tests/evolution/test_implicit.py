@@ -14,7 +14,7 @@ from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx import Recording
 from remodel_fenicsx.running import resume, run as record
-from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
+from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from tests.conftest import Case, slowly
@@ -125,24 +125,6 @@ def test_both_laws_have_the_same_biological_equilibrium() -> None:
         angles.append(np.degrees(np.arctan(np.sqrt(A[..., 2, 2] / along))))
     assert angles[0].min() < 10 and angles[0].max() > 40
     np.testing.assert_allclose(angles[0], angles[1], atol=0.1)
-
-
-@pytest.mark.parametrize("where", ["", "regions.inside."])
-@pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
-def test_cells_that_jump_from_rank_to_rank_are_refused(law: str, where: str) -> None:
-    """Random cells and a printed law: one line with key, value, the law 'tensor' and what else is allowed."""
-    scene = {
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0},
-        "cells": {"initial": "isotropic"},
-        "regions": {"inside": {"outer_radius": 1.5}, "outside": {"outer_radius": 2.0}},
-        "remodeling": {"law": law, "coupling": "implicit"},
-        "time": {"end": 2.0},
-    }
-    with pytest.raises(SceneError) as raised:
-        scene_from_dict(scene).with_values({f"{where}cells.initial": "random"})
-    text = str(raised.value)
-    assert text.startswith("remodeling.coupling = 'implicit': needs remodeling.law = 'tensor'") and "\n" not in text
-    assert all(name in text for name in ("'isotropic'", "'aligned'", "'staggered'", "'relaxed'"))
 
 
 def test_a_run_of_before_ends_at_a_step_without_a_solution(tmp_path: Path) -> None:

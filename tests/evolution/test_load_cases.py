@@ -374,28 +374,6 @@ def test_one_and_two_ranks_agree(cases: Any) -> None:
 
 
 # ---------------------------------------------------------------- refusals
-@pytest.mark.parametrize(
-    ("tables", "words"),
-    [
-        ({"cases": [{"weight": 0.5}, {"weight": 0.4}]}, r"cases\[1\].weight = 0.4: .* sum to 0.9; they must sum to 1"),
-        ({"cases": [{"weight": 0.5}]}, r"cases\[0\].weight = 0.5: .* they must sum to 1"),
-        ({"cases": [{"weight": 1.5}]}, r"cases\[0\].weight = 1.5: must be"),
-        ({"cases": [{}]}, r"cases\[0\].weight: missing"),
-        ({"cases": [{"weight": 1.0, "loads": {"force": 2.0}}]}, r"cases\[0\].loads.force = 2.0: no such load; the"),
-        ({"cases": [{"weight": 1.0, "pressure": 2.0}]}, r"cases\[0\].pressure = 2.0: unknown key"),
-        ({"cases": [{"weight": 1.0, "loads": {"elongation": -20.0}}]}, "loads.elongation.value = 0.1: must be greater"),
-        ({"cases": {"weight": 1.0}}, r"cases = .*: must be a list of tables, each \[\[cases\]\]"),
-        ({"remodeling": {"mean": "target"}, "cases": []}, "remodeling.mean = 'target': needs"),
-        ({"remodeling": {"mean": "median"}}, "remodeling.mean = 'median': allowed are"),
-        ({"remodeling": {"law": "explicit", "coupling": "staggered", "mean": "target"}}, "with a target: 'tensor'"),
-        ({"remodeling": {"coupling": "implicit"}}, "remodeling.coupling = 'implicit'"),
-        ({"geometry": {"shape": "tube", "is": "loaded"}}, r"geometry.is = 'loaded': not allowed with \[\[cases\]\]"),
-    ],
-)
-def test_what_has_no_cases_is_refused(tables: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError, match=words) as refused:
-        scene_from_dict(artery(HALVES) | tables)
-    assert "\n" not in str(refused.value)
 
 
 def test_studies_of_one_load_case_refuse_several(tmp_path: Path) -> None:

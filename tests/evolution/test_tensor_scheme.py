@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body import Cube, LoadKind
 from remodel_fenicsx import Recording
 from remodel_fenicsx.running import resume, run as record
-from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
+from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import Blend
@@ -326,9 +326,3 @@ def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts
     share = -np.expm1(-KAPPA * target.share)[:, None, None]
     expected = before.reshape(-1, 3, 3) + share * (target.direction - before.reshape(-1, 3, 3))
     np.testing.assert_allclose(A.reshape(-1, 3, 3)[points:], expected[points:], atol=1e-13)
-
-
-def test_only_a_law_with_a_target_can_be_extrapolated() -> None:
-    with pytest.raises(SceneError) as caught:
-        scene("cube", remodeling={"law": "explicit", "coupling": "extrapolated"})
-    assert "remodeling.coupling = 'extrapolated'" in str(caught.value) and "'tensor'" in str(caught.value)

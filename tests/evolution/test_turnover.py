@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Recording, SceneError, Simulation, cli
+from remodel_fenicsx import Recording, Simulation, cli
 from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.model import residual_stress as closing
 from remodel_fenicsx.model.chains import CHAINS
@@ -367,33 +367,6 @@ def test_the_figures_show_what_the_page_says() -> None:
         assert of_map["opening_angle"][row] == pytest.approx(angle, abs=1.0)
 
 
-def test_its_columns_and_numbers_need_it() -> None:
-    for name in (*COLUMNS, "turnover_power"):
-        with pytest.raises(SceneError, match=f"'{name}' changes only with remodeling.turnover"):
-            scene_from_dict(wall(40.0, 4.0, None, [name]))
-    with pytest.raises(SceneError, match="remodeling.turnover.time: missing"):
-        scene_from_dict(wall(40.0, 4.0, {"gain": 2.0}, []))
-
-
-@pytest.mark.parametrize(
-    ("remodeling", "time", "words"),
-    [
-        ({"law": "explicit", "coupling": "staggered"}, {}, "remodeling.turnover: needs remodeling.law = 'tensor'"),
-        ({"law": "relaxation", "coupling": "implicit"}, {}, "remodeling.turnover: needs remodeling.law = 'tensor'"),
-        ({"turnover": {"deposition_stretch": 1.6}}, {}, "deposition_stretch = 1.6: must be smaller than"),
-        ({"turnover": {"gain": -1.0}}, {}, "remodeling.turnover.gain = -1"),
-        ({"turnover": {"pace": 1.0}}, {}, "remodeling.turnover.pace = 1.0: unknown key"),
-    ],
-)
-def test_what_has_no_turnover_is_refused(remodeling: dict[str, Any], time: dict[str, Any], words: str) -> None:
-    values = wall(40.0, 4.0, {"time": 40.0, "gain": 1.0}, COLUMNS)
-    turnover = values["remodeling"]["turnover"] | remodeling.pop("turnover", {})
-    values["remodeling"] |= {**remodeling, "turnover": turnover}
-    values["time"] |= time
-    with pytest.raises(SceneError, match=words):
-        scene_from_dict(values)
-
-
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
 def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The end is that of the whole step; half-way ln m is half-way too."""
@@ -489,10 +462,3 @@ def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instabilit
     (said,) = (record for record in caplog.records if "factor of 10" in record.message)
     assert said.levelno == NOTICE and "content has changed" in said.message
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
-
-
-def test_the_error_of_steps_is_no_column_of_the_equilibrium() -> None:
-    values = cube(100.0, 5.0, {})
-    values["time"], values["output"] = {"end": "equilibrium"}, {"fields": False, "columns": ["time_error"]}
-    with pytest.raises(SceneError, match="'time_error' is an error of steps"):
-        scene_from_dict(values)

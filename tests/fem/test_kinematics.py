@@ -243,12 +243,6 @@ def test_every_rule_refuses_a_scene_and_allows_its_neighbour(
     assert chosen.model.kinematics == name
 
 
-def test_a_shape_has_its_own_reductions() -> None:
-    for shape, name in (("tube", "point"), ("cube", "radial"), ("tendon", "sector")):
-        with pytest.raises(SceneError, match=f"a {shape} has no such reduction"):
-            scene(shape, name, 2.0)
-
-
 def test_loads_that_a_reduction_lacks_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     from remodel_fenicsx.body import Cube, LoadKind
 

@@ -32,6 +32,12 @@ TUBE: dict[str, Any] = {
     "time": {"end": 30.0, "step": 1.0},
 }
 CUBE: dict[str, Any] = {"geometry": {"shape": "cube"}, "time": {"end": 10.0}}
+CONSISTENT: dict[str, Any] = {"preset": "consistent", "geometry": {"shape": "tube"}}
+BASES: dict[str, dict[str, Any]] = {
+    "none": {}, "tube": TUBE, "cube": CUBE, "printed": CONSISTENT | {"preset": PAPER}, "consistent": CONSISTENT,
+    "isotropic": CONSISTENT | {"cells": {"initial": "isotropic"}},
+    "layers": TUBE | {"regions": {"media": {"outer_radius": 1.9}, "adventitia": {}}, "cells": {"initial": "isotropic"}},
+}  # fmt: skip
 
 
 def changed(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -64,11 +70,12 @@ def test_a_value_that_a_key_never_has(key: str, value: Any) -> None:
 
 @pytest.mark.parametrize(("base", "changes", "line"), rows(__file__, "bad_scenes.txt"))
 def test_a_bad_scene_gives_one_line_with_key_value_and_what_is_allowed(base, changes, line):
-    message = refusal(changed({"tube": TUBE, "cube": CUBE, "none": {}}[base], values(changes)))
+    message = refusal(changed(BASES[base], values(changes)))
     assert "\n" not in message and re.match(line, message), message
 
 
 def test_the_bases_of_the_bad_scenes_are_good():
+    assert all(scene_from_dict(base) for base in BASES.values() if base)
     assert scene_from_dict(TUBE).geometry == Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
     assert scene_from_dict(CUBE).time == Time(end=10.0, step=1.0)
 

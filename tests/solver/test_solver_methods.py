@@ -20,7 +20,7 @@ from remodel_fenicsx.fem.solver_methods import (
     chosen,
 )
 from remodel_fenicsx import kernels as single
-from remodel_fenicsx.scene import SceneError, preset_scene
+from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear, newton
 from remodel_fenicsx.solver.newton import Limits, LoadPhase
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants, worth
@@ -68,17 +68,6 @@ def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
         assert all(chosen(name, unknowns, ranks, reduced) == name for name in SOLVER_METHODS)
     assert chosen("auto", LARGE + 1, 1, reduced, multigrid=False) == "lagged"
     assert chosen("auto", LARGE_ON_RANKS + 1, 2, reduced, multigrid=False) == "lagged"
-
-
-@pytest.mark.parametrize(
-    "changes", [{"supports.ends": "closed"}, {"loads.axial_force": {"value": 1.0, "ramp": [[0.0, 0.0], [25.0, 1.0]]}}]
-)
-def test_multigrid_is_refused_where_the_length_is_an_unknown(changes: dict[str, Any]) -> None:
-    """One row of the tangent is full then: GMRES with GAMG ends after thousands of iterations, or not."""
-    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"loads.elongation.value": 0.0} | changes)
-    with pytest.raises(SceneError, match="solver.method = 'iterative': allowed where the length is an unknown"):
-        scene.with_values({"solver.method": "iterative"})
-    assert scene.with_values({"solver.method": "lagged"}).has_free_length
 
 
 def test_the_paper_s_tendon_has_few_factors() -> None:
