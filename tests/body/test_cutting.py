@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, Simulation, preset_scene
+from remodel_fenicsx import Scene, preset_scene
 from remodel_fenicsx.model.residual_stress import Layer, closing, cut
+from tests.runs import made
 
 
 def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any) -> Scene:
@@ -21,11 +22,8 @@ def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any
 
 
 def angles(of: Scene) -> list[float]:
-    simulation = Simulation(of)
-    try:
+    with made(of) as simulation:
         return [float(step.row["opening_angle"]) for step in simulation.steps()]
-    finally:
-        simulation.close()
 
 
 @pytest.mark.parametrize("opening_angle", [60.0, 160.0])

@@ -6,8 +6,6 @@ may; `monkeypatch.setitem` stands for the script's own ``REGISTRY["mine"] = mine
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -72,6 +70,7 @@ from remodel_fenicsx.extend import (
     uniaxial_columns,
 )
 from remodel_fenicsx.parts import Cube, Domain, Remodeling, Tube
+from tests.runs import rows_of, simulated
 
 KAPPA = 0.1
 SCENE: dict[str, Any] = {
@@ -97,22 +96,6 @@ def scene(**tables: dict[str, Any]) -> Scene:
 def whole(**tables: dict[str, Any]) -> Scene:
     """The same with the full kinematics, where what is added needs a mesh."""
     return scene(**{"model": {"kinematics": "full"}, **tables})
-
-
-@contextmanager
-def simulated(scene: Scene) -> Iterator[tuple[Simulation, list[dict[str, float]]]]:
-    """A simulation at its end, and its rows."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
-        yield simulation, [step.row for step in simulation.steps()]
-    finally:
-        simulation.close()
-
-
-def rows_of(scene: Scene) -> list[dict[str, float]]:
-    """All rows of a scene."""
-    with simulated(scene) as (_, rows):
-        return rows
 
 
 def column(rows: list[dict[str, float]], name: str) -> list[float]:

@@ -17,17 +17,11 @@ from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.unloading import NoUnloadedShape
 from tests.body.test_natural import scene
 from tests.mesh_files import write_tube
+from tests.runs import last_row
 
 SELF = MPI.COMM_SELF
 LOADED = {"geometry.is": "loaded", "geometry.inner_radius": 1.4, "geometry.outer_radius": 3.05, "geometry.length": 2.2}
 VIRGIN = {"remodeling.law": "none", "time.end": 25.0, "natural.opening_angle": 0.0}
-
-
-def end_of(of: Scene) -> dict[str, float]:
-    simulation = Simulation(of, SELF)
-    row = [dict(step.row) for step in simulation.steps()][-1]
-    simulation.close()
-    return row
 
 
 @pytest.mark.parametrize(
@@ -73,7 +67,7 @@ def test_the_scan_of_a_tube_that_has_remodeled() -> None:
     shape: Any = found.geometry
     assert shape.inner_radius == pytest.approx(0.99114, abs=2e-4)
     assert shape.outer_radius == pytest.approx(2.99557, abs=1e-4)
-    row = end_of(found)
+    row = last_row(found)
     assert row["inner_radius"] == pytest.approx(1.4, abs=1e-6)
     assert row["outer_radius"] == pytest.approx(3.05, abs=1e-6)
 

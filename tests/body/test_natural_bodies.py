@@ -15,6 +15,7 @@ from remodel_fenicsx.model.residual_stress import Layer, closing
 from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_layers import write_layers
 from tests.body.test_natural import layers, scene
+from tests.runs import last_row
 
 SELF = MPI.COMM_SELF
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
@@ -63,13 +64,6 @@ def own_body(file: Path, elongation: float, **tables: Any) -> Any:
         "solver": {"method": "direct"},
     }
     return scene_from_dict(values | tables)
-
-
-def last_row(of: Any) -> dict[str, float]:
-    simulation = Simulation(of, SELF)
-    row = [dict(step.row) for step in simulation.steps()][-1]
-    simulation.close()
-    return row
 
 
 def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(tmp_path: Path) -> None:

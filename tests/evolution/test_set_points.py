@@ -7,17 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Simulation
 from remodel_fenicsx.model import tensor_law
-from remodel_fenicsx.scene import scene_from_dict
-
-
-def last_row(values: dict[str, Any]) -> dict[str, float]:
-    simulation = Simulation(scene_from_dict(values))
-    try:
-        return [dict(step.row) for step in simulation.steps()][-1]
-    finally:
-        simulation.close()
+from tests.runs import last_row
 
 
 @pytest.mark.parametrize(("exponent", "angle"), [(1.0, 35.26), (2.0, 26.57), (4.0, 14.04)])

@@ -19,6 +19,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
+from tests.runs import made
 
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLUMNS = ["content", "natural_length"]
@@ -51,16 +52,13 @@ def opening_angle(simulation: Simulation) -> float:
 
 def simulated(values: dict[str, Any]) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
     """All rows, and content and natural length at the points in the order of their radii."""
-    simulation = Simulation(scene_from_dict(values))
-    try:
+    with made(scene_from_dict(values)) as simulation:
         rows = [dict(step.row) for step in simulation.steps()]
         turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
         known = {} if turnover is None else {name: turnover._values(name).ravel()[order] for name in COLUMNS}
         if turnover is not None:
             known["opening_angle"] = opening_angle(simulation)
         return rows, known
-    finally:
-        simulation.close()
 
 
 def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> None:

@@ -21,6 +21,7 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, slowly
 from tests.reference.radial import solve_radial
+from tests.runs import columns_of
 
 SELF = MPI.COMM_SELF
 ISOTROPIC = {"initial": "isotropic"}
@@ -37,17 +38,9 @@ def scene(*arguments: Any, **tables: Any) -> Scene:
     return scene_from_dict(values(*arguments, **tables))
 
 
-def history(scene: Scene) -> dict[str, np.ndarray]:
-    """Columns of a scene's steps."""
-    simulation = Simulation(scene, SELF)
-    rows = [step.row for step in simulation.steps()]
-    simulation.close()
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
-
-
 def difference(one: Scene, other: Scene) -> float:
     """Largest difference of a column, relative to its largest value; the power of remodeling has fewer digits."""
-    first, second = history(one), history(other)
+    first, second = columns_of(one), columns_of(other)
     assert list(first) == list(second)
     found = 0.0
     for name in [name for name in first if name not in OF_THE_SOLVER]:
@@ -116,7 +109,7 @@ def test_the_implicit_coupling_is_that_of_every_kinematics() -> None:
     changes = {"coupling": "implicit", "frame": "material"}
     assert difference(*(scene("tube", name, 3.0, remodeling=changes) for name in ("axisymmetric", "radial"))) < 1e-9
     steps = (scene("tube", "radial", 10.0, remodeling=changes, time={"end": 10.0, "step": h}) for h in (1.0, 5.0))
-    ends = [history(each)["inner_radius"][-1] for each in steps]
+    ends = [columns_of(each)["inner_radius"][-1] for each in steps]
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-8)
 
 
@@ -152,13 +145,13 @@ def test_elements_of_a_half_plane_are_those_of_a_ray(mesh: dict[str, Any]) -> No
 def clamped(name: str, end: float, refinement: int = 1) -> float:
     """Inner radius of a tube with clamped ends."""
     ends, mesh = {"ends": "clamped"}, {"refinement": refinement}
-    return float(history(scene("tube", name, end, supports=ends, mesh=mesh))["inner_radius"][-1])
+    return float(columns_of(scene("tube", name, end, supports=ends, mesh=mesh))["inner_radius"][-1])
 
 
 def test_clamped_ends_hold_a_half_plane_as_a_quarter() -> None:
     """The quarter has plane elements around: 0.2 % away on the paper's mesh. Free ends would let it widen more."""
     half_plane, quarter = (clamped(name, 3.0) - 1.0 for name in ("axisymmetric", "sector"))
-    free = float(history(scene("tube", "radial", 3.0))["inner_radius"][-1]) - 1.0
+    free = float(columns_of(scene("tube", "radial", 3.0))["inner_radius"][-1]) - 1.0
     assert half_plane == pytest.approx(quarter, rel=0.03)
     assert half_plane < 0.85 * free
 
@@ -250,7 +243,7 @@ def test_loads_that_a_reduction_lacks_are_refused(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(Cube.loads, "shear", shear)
     sheared = scene("cube", AUTO, 2.0, loads={"shear": {"value": 1.0, "ramp": [[0, 0], [2, 1]]}})
     assert choice(sheared).name == "full" and "loads.shear" in objections(sheared, "point")[0]
-    assert history(scene("cube", "point", 2.0))["shear"].tolist() == [0.0, 0.0]
+    assert columns_of(scene("cube", "point", 2.0))["shear"].tolist() == [0.0, 0.0]
 
 
 def test_a_load_is_for_the_reductions_that_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -364,9 +357,9 @@ def test_validate_says_it_and_a_forbidden_one_ends_with_2(tmp_path: Path, capsys
 )  # fmt: skip
 def test_another_size_compiles_nothing(shape: str, name: str, size: dict[str, float]) -> None:
     """The size of the body is no literal of the kernels."""
-    history(scene(shape, name, 1.0))
+    columns_of(scene(shape, name, 1.0))
     before = len(jit.compiled_kernels())
-    history(scene(shape, name, 1.0, geometry={"shape": shape, **size}))
+    columns_of(scene(shape, name, 1.0, geometry={"shape": shape, **size}))
     assert len(jit.compiled_kernels()) == before
 
 

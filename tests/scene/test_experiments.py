@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx import Simulation, read_scene
+from remodel_fenicsx import read_scene
 from remodel_fenicsx.scene.scene import scene_from_dict
+from tests.runs import made
 
 
 def cube(**changes: Any) -> dict[str, Any]:
@@ -36,11 +37,8 @@ def test_the_initial_stiffness_is_what_a_run_shows(factor: int) -> None:
     """Young's modulus of the matrix and that of the network add up along the chains: across, these bear nothing."""
     keys = {"material.initial_stiffness": "0.05 kPa", "material.energy_factor": factor, "cells.end_to_end_length": 0.8}
     scene = scene_from_dict(cube(**keys))
-    simulation = Simulation(scene)
-    try:
+    with made(scene) as simulation:
         stretch = list(simulation.steps())[-1].row["mean_stretch"]
-    finally:
-        simulation.close()
     lame_lambda, mu = scene.material.lame_lambda, scene.material.lame_mu
     matrix = mu * (3 * lame_lambda + 2 * mu) / (lame_lambda + mu)
     strain = 1e-4 / scene.geometry.section_area / (matrix + 50.0)
