@@ -18,3 +18,8 @@ def rows(test: str, name: str) -> list[list[str]]:
 def values(text: str) -> dict[str, Any]:
     """Keys and values of TOML on one line; dotted keys in quotes."""
     return dict(tomllib.loads(f"row = {{{text.replace('HUGE', HUGE)}}}")["row"])
+
+
+def unescaped(text: str) -> str:
+    """With the line ends and other characters that a line of a table can only name."""
+    return text.encode("latin-1").decode("unicode_escape")
