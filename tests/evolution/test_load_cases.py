@@ -15,12 +15,13 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.laws import Drive, largest_tension, mean_target, mean_tensor
 from remodel_fenicsx.model.tensor_law import Target, target
+from remodel_fenicsx.running import resume
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.fit import fit
 from remodel_fenicsx.studies.stability import stability
 from tests.reference.radial import CIRCUMFERENTIAL, RadialMaterial, Tube, cauchy_stress, structure
-from tests.runs import rows_of
+from tests.runs import goes_on, rows_of
 
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 TURNOVER = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
@@ -292,22 +293,12 @@ def test_the_mean_of_targets_has_their_shares() -> None:
 
 # ---------------------------------------------------------------- runs
 def test_a_run_goes_on_with_all_cases(tmp_path: Path) -> None:
-    """Two parts are the whole, to the last digit."""
-    (tmp_path / "scene.toml").write_text(scene_from_dict(artery(pulse(0.4), 20.0)).to_toml())
-    command = ["run", str(tmp_path / "scene.toml"), "-q"]
-    assert cli.main([*command, "-o", str(tmp_path / "all")]) == 0
-    page = (tmp_path / "all" / "report.html").read_text()
+    found = goes_on(artery(pulse(0.4), 20.0), tmp_path, 10.0)
+    page = (tmp_path / "whole" / "report.html").read_text()
     assert "0.667 of the time: pressure times 0.6; 0.333 of the time: pressure times 1.8" in page
-    assert cli.main([*command, "-o", str(tmp_path / "run"), "--set", "time.end=10"]) == 0
-    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "time.end=20", "-q"]) == 0
-    tables = [(tmp_path / name / "history.csv").read_text().splitlines() for name in ("run", "all")]
-    seconds = tables[0][0].split(",").index("seconds")
-    rows = [[line.split(",") for line in table] for table in tables]
-    assert [row[:seconds] + row[seconds + 1 :] for row in rows[0]] == [
-        row[:seconds] + row[seconds + 1 :] for row in rows[1]
-    ]
-    assert "inner_radius@2" in rows[0][0]
-    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "cases=[]", "-q"]) == 2
+    assert "inner_radius@2" in found.history
+    with pytest.raises(SceneError):
+        resume(found.path, ["cases=[]"])
 
 
 def test_the_demo(tmp_path: Path) -> None:

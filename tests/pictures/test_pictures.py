@@ -96,17 +96,6 @@ def test_all_that_is_written_lies_outside_of_the_body(drawn: Drawn) -> None:
     assert levels(scale, 0.0005) == set(range(18))
 
 
-def test_other_times_are_other_pictures_at_one_scale(recorded: Recorded, drawn: Drawn) -> None:
-    run = Recording(recorded("tendon"))
-    body = panel(drawn("tendon", "--time", "0", "5", FROM_THE_FRONT))
-    left, right = np.array_split(body, 2, axis=1)
-    heights = [np.ptp(run.points[:, 2] + run.fields(time)["displacement"][:, 2]) for time in (0.0, 5.0)]
-    assert outline(right)[0] / outline(left)[0] == pytest.approx(heights[1] / heights[0], rel=0.02)
-    angles = [Recording(recorded("tendon")).fields(time)["fibre_angle_deformed"].mean() for time in (0.0, 5.0)]
-    red = [np.mean(half[..., 0].astype(int) - half[..., 2] > 60) / np.mean(half < 245) for half in (left, right)]
-    assert angles[1] < angles[0] - 3 and red[1] > 1.2 * red[0]
-
-
 def test_a_cut_shows_the_inside_and_layers_are_taken_off(recorded: Recorded, drawn: Drawn) -> None:
     """A tube of equal cells has one angle in each layer."""
     whole = WholeBody(Recording(recorded("radial")))
