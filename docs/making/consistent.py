@@ -162,9 +162,8 @@ def page_values(folder: Path) -> dict[str, str]:
 def layer_table(layers: Columns) -> str:
     """Angles of Figs. 8, 10 and 11, layer by layer."""
     cases, short = {"σ": "10_4.8", "S": "pk2", "b": "finger"}, {"paper": "the paper's", "once": "κ", "twice": "2κ"}
-    return by_layer([
-        (f"{symbol}, {short[variant]}", layers[f"{case}_{variant}"]) for symbol, case in cases.items() for variant in short
-    ])  # fmt: skip
+    of_all = [(symbol, case, variant) for symbol, case in cases.items() for variant in short]
+    return by_layer([(f"{symbol}, {short[variant]}", layers[f"{case}_{variant}"]) for symbol, case, variant in of_all])
 
 
 def make(keep: bool) -> None:
