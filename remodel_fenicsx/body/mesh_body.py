@@ -412,7 +412,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
 # ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh
 # Gmsh's number of elements and facets of degree 1; meshio's names of those of degree 1 and 2
-SPLIT = {
+SPLIT: dict[str, dict[int, tuple[Any, ...]]] = {
     "tetrahedron": {3: (4, "tetra", "tetra10"), 2: (2, "triangle", "triangle6")},
     "hexahedron": {3: (5, "hexahedron", "hexahedron27"), 2: (3, "quad", "quad9")},
 }

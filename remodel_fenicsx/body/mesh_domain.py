@@ -12,8 +12,8 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.axes import cells_of, facets_of
-from remodel_fenicsx.body.domain import Domain, MeshArrays, share_mesh
+from remodel_fenicsx.body.axes import facets_of
+from remodel_fenicsx.body.domain import Domain, MeshArrays, cells_of, share_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims
 from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
 from remodel_fenicsx.fem import jit

@@ -254,10 +254,10 @@ def _group_names(sections: dict[bytes, bytes]) -> list[tuple[int, int, str]]:
 def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]]:
     """Numbers of the groups of points, curves, faces and volumes, by dimension and number."""
     counts, *rows = [line.split() for line in text.splitlines() if line.strip()]
-    dimensions = np.repeat(np.arange(4), np.array(counts, dtype=np.int64)).tolist()
+    dimensions: Any = np.repeat(np.arange(4), np.array(counts, dtype=np.int64)).tolist()
     if len(rows) != len(dimensions):
         raise UnreadableFile(f"$Entities has {len(rows)} lines, but announces {len(dimensions)}")
-    found = {}
+    found: dict[tuple[int, int], list[int]] = {}
     for dimension, row in zip(dimensions, rows, strict=True):
         start = 8 if dimension else 5  # behind the number, the box around it, and how many groups there are
         groups = row[start : start + int(row[start - 1])]

@@ -175,7 +175,8 @@ def _angle_at(face: str) -> AngleOf:
     """Mean angle over the elements that have a facet on a face."""
 
     def elements(m: Any) -> NDArray[np.bool_]:
-        from remodel_fenicsx.body.axes import cells_of, facets_of
+        from remodel_fenicsx.body.axes import facets_of
+        from remodel_fenicsx.body.domain import cells_of
 
         found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
         found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
