@@ -45,7 +45,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
 from remodel_fenicsx.system.files import TakenError, part_of, read_regular, temporary_folder
-from remodel_fenicsx.system.guarded import LARGEST_FILE
+from remodel_fenicsx.system.children import LARGEST_FILE
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 from remodel_fenicsx.unloading import as_unloaded, unloaded
 

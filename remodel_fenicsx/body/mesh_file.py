@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.system.guarded import DAMAGED, UnreadableFile, read_guarded
+from remodel_fenicsx.system.children import DAMAGED, UnreadableFile, read_guarded
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -33,7 +33,7 @@ VOLUMES = {
     "tetra10": ("tetrahedron", 2),
     "hexahedron27": ("hexahedron", 2),
 }
-CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of facets
+FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of facets
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27"
 # Gmsh's order of nodes, as places in VTK's, which meshio has
 # https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering, https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron)
@@ -323,7 +323,7 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
     starts = np.cumsum([0, *(len(block.nodes) for block in blocks)])
     numbers = [np.arange(start, start + len(block.nodes)) for start, block in zip(starts + 1, blocks, strict=False)]
     for number, block in zip(numbers, blocks, strict=True):
-        if block.kind not in (*VOLUMES, *CORNERS) and not block.kind.startswith(("vertex", "line")):
+        if block.kind not in (*VOLUMES, *FACET_CORNERS) and not block.kind.startswith(("vertex", "line")):
             raise MeshFileError(f"elements of type {block.kind!r}; allowed are {ALLOWED_ELEMENTS}")
         if (lost := ((block.nodes < 0) | (block.nodes >= len(points))).any(axis=1)).any():
             raise MeshFileError(f"element {number[lost][0]} has a node that is not there")
@@ -336,7 +336,7 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
         raise MeshFileError(f"elements of several types: {listed}; allowed is one")
     kind, degree = kinds[0]
     corners = 3 if kind == "tetrahedron" else 4
-    flat = [block for block in blocks if CORNERS.get(block.kind) == corners]
+    flat = [block for block in blocks if FACET_CORNERS.get(block.kind) == corners]
     facets = np.concatenate([np.empty((0, corners), dtype=np.int64), *(block.nodes[:, :corners] for block in flat)])
     cells = np.concatenate([block.nodes for _, block in solid])
     used, rows = np.unique(cells, return_inverse=True)  # Gmsh also writes nodes that no element of the body has

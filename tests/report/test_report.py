@@ -22,7 +22,7 @@ import pytest
 from remodel_fenicsx import Recording, cli
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
-from remodel_fenicsx.report.card import ANGLE_STEPS, NO_ANGLE, of_angles
+from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, of_angles
 from remodel_fenicsx.report.page import Story
 from remodel_fenicsx.results.recording import ANGLE_COLOURS, HistoryColumns, kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
