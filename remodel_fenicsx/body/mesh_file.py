@@ -204,6 +204,7 @@ def _tags(arrays: dict[str, Any], asked: str | None) -> list[Integers]:
 
 _FORMAT = re.compile(rb"\$MeshFormat\s+(2\.2|4\.1) 0 \d+\s+\$EndMeshFormat")
 _SECTION = re.compile(rb"^\$(\w+)\s*?\n(.*?)^\$End\1\b", re.DOTALL | re.MULTILINE)
+_OTHER_NUMBERS = "has other numbers than $Nodes and $Elements announce"
 _GROUP_NAME = re.compile(r'([0-3])\s+(\d{1,9})\s+"([^"\x00-\x1f]{0,127})"')
 _NO_NODE = re.compile(rb"^[ \t]*(\d+)(?:[ \t]+-?\d+){4}.*[ \t](0|-\d+)(?!\S)", re.MULTILINE)
 
@@ -223,17 +224,14 @@ def arrays_msh(file: str) -> dict[str, Any]:
             raise UnreadableFile(f"must have one section ${name.decode()}")
     sections = dict(found)
     groups, names = _groups_of_entities(sections.get(b"Entities", b"0 0 0 0")), _group_names(sections)
-    _check_nodes(sections, version[1])
     # without its groups, for meshio reads those of all parts or none
     plain = version[0] + b"".join(b"\n$%s\n%s$End%s" % (k, sections[k], k) for k in (b"Nodes", b"Elements"))
     Path(file).write_bytes(plain)  # in this process' memory
     try:
         mesh = importlib.import_module("meshio.gmsh").read(file)
     except (IndexError, ValueError) as error:
-        raise UnreadableFile(
-            f"$Elements has other numbers than it announces, or nodes not in $Nodes: {error}"
-        ) from None
-    _check_elements(sections, version[1], mesh)
+        raise UnreadableFile(f"{_OTHER_NUMBERS}, or nodes that are not there: {error}") from None
+    _check_numbers(sections, version[1], mesh)
     if version[1] == b"4.1":
         _add_groups(mesh, groups)
     mesh.point_data = {}
@@ -265,41 +263,22 @@ def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]]:
     return found
 
 
-def _numbers(name: str, sections: dict[bytes, bytes]) -> Array:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy reads up to what is no number, and warns
-        try:
-            return np.fromstring(sections[name.encode()], sep=" ")
-        except (ValueError, DeprecationWarning):
-            raise UnreadableFile(f"${name} has words among its numbers") from None
-
-
-def _check_nodes(sections: dict[bytes, bytes], version: bytes) -> None:
-    """Whether there are the numbers that are announced, and each node once."""
-    values = _numbers("Nodes", sections)
-    if version == b"2.2":
-        numbers, end = values[1::4], 1 + 4 * values[0]
-    else:
-        parts, end = [], 4
-        while end + 3 < len(values):
-            count = int(values[end + 3])
-            parts.append(values[end + 4 : end + 4 + count])
-            end += 4 + 4 * count
-        numbers = np.concatenate(parts)
-    if len(values) != end:
-        raise UnreadableFile("$Nodes has other numbers than it announces")
-    if len(numbers) != len(np.unique(numbers)) or (numbers < 1).any():
-        raise UnreadableFile("$Nodes must have numbers of nodes above zero, each once")
-
-
-def _check_elements(sections: dict[bytes, bytes], version: bytes, mesh: Any) -> None:
-    """Whether there are no other numbers than those that were read, and no nodes below 1."""
-    beside = 5 if version == b"2.2" else 1  # its number; its type, how many tags it has, and these
-    read = sum(len(block.data) * (beside + block.data.shape[1]) for block in mesh.cells)
-    heads = 1 if version == b"2.2" else 4 + 4 * len(mesh.cells)
-    if len(_numbers("Elements", sections)) != heads + read:
-        raise UnreadableFile("$Elements has other numbers than it announces")
-    if version == b"2.2" and (lost := _NO_NODE.search(sections[b"Elements"])):
+def _check_numbers(sections: dict[bytes, bytes], version: bytes, mesh: Any) -> None:
+    """Whether the file has no other numbers than those that were read, and no nodes below 1."""
+    is_old, found = version == b"2.2", {}
+    for name in (b"Nodes", b"Elements"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # NumPy reads up to what is no number, and warns
+            try:
+                found[name] = np.fromstring(sections[name], sep=" ")
+            except (ValueError, DeprecationWarning):
+                raise UnreadableFile(f"${name.decode()} has words among its numbers") from None
+    beside = 5 if is_old else 1  # an element's number; its type, how many tags it has, and these
+    in_elements = sum(len(block.data) * (beside + block.data.shape[1]) for block in mesh.cells)
+    heads = (1, 1) if is_old else (4 + 4 * int(found[b"Nodes"][0]), 4 + 4 * len(mesh.cells))
+    if [*map(len, found.values())] != [heads[0] + 4 * len(mesh.points), heads[1] + in_elements]:
+        raise UnreadableFile(_OTHER_NUMBERS)
+    if is_old and (lost := _NO_NODE.search(sections[b"Elements"])):
         raise UnreadableFile(f"element {int(lost[1])} has the node {int(lost[2])}: nodes have numbers above zero")
 
 

@@ -29,24 +29,24 @@ def refusal(file: Path, **geometry: Any) -> str:
 
 FIRST = "\n81 5 2 5 1 1 17 81 2 41 43 89 55\n"  # of the hexahedra; 41 43 89 55 are corners of the second one too
 INNER = "\n23 3 2 3 61 2 55 53 3\n"
-COUNT = "other numbers than it announces"
+COUNT = r"other numbers than \$Nodes and \$Elements announce"
 DAMAGED = {
     "a place that is none": ("\n1 1 0 0\n", "\n1 1 nan 0\n", "a node is at .*nan.*: its place must be finite"),
     "a place at infinity": ("\n1 1 0 0\n", "\n1 1 1e999 0\n", "a node is at .*inf.*: its place must be finite"),
-    "a word as a place": ("\n1 1 0 0\n", "\n1 1 one 0\n", r"\$Nodes has words"),
-    "a node that is there twice": ("\n3 0 1 0\n", "\n2 0 1 0\n", r"\$Nodes must have numbers .* each once"),
-    "a million nodes": ("$Nodes\n96\n", "$Nodes\n1000000000000000\n", rf"\$Nodes has {COUNT}"),
-    "a node less": ("\n1 1 0 0\n", "\n", rf"\$Nodes has {COUNT}"),
-    "a node more": ("\n1 1 0 0\n", "\n1 1 0 0\n99 1 2 3\n", rf"\$Nodes has {COUNT}"),
+    "a word as a place": ("\n1 1 0 0\n", "\n1 1 one 0\n", COUNT),
+    "a node that is there twice": ("\n3 0 1 0\n", "\n2 0 1 0\n", "has a node that is not there"),
+    "a million nodes": ("$Nodes\n96\n", "$Nodes\n1000000000000000\n", "MB to read"),
+    "a node less": ("\n1 1 0 0\n", "\n", COUNT),
+    "a node more": ("\n1 1 0 0\n", "\n1 1 0 0\n99 1 2 3\n", COUNT),
     "a script among nodes": ("$EndNodes", "SystemCall\n$EndNodes", r"\$Nodes has words"),
-    "a million elements": ("$Elements\n128\n", "$Elements\n1000000000000000\n", rf"\$Elements has {COUNT}"),
-    "an element less": (FIRST, "\n", rf"\$Elements has {COUNT}"),
-    "an element more": ("$Elements\n128\n", "$Elements\n127\n", rf"\$Elements has {COUNT}"),
-    "a number less in an element": (FIRST, FIRST.replace(" 81 2", " 81"), rf"\$Elements has {COUNT}"),
-    "tags below zero": (FIRST, FIRST.replace("5 2 5 1", "5 -2 5 1"), r"\$Elements"),
-    "a node that is not there": (FIRST, FIRST.replace("55", "777"), r"nodes not in \$Nodes"),
+    "a million elements": ("$Elements\n128\n", "$Elements\n1000000000000000\n", COUNT),
+    "an element less": (FIRST, "\n", COUNT),
+    "an element more": ("$Elements\n128\n", "$Elements\n127\n", COUNT),
+    "a number less in an element": (FIRST, FIRST.replace(" 81 2", " 81"), COUNT),
+    "tags below zero": (FIRST, FIRST.replace("5 2 5 1", "5 -2 5 1"), COUNT),
+    "a node that is not there": (FIRST, FIRST.replace("55", "777"), "nodes that are not there"),
     "a node zero": (FIRST, FIRST.replace("55", "0"), "element 81 has the node 0"),
-    "a prism": (FIRST, FIRST.replace("81 5", "81 6"), r"\$Elements|elements of type 'wedge'"),
+    "a prism": (FIRST, FIRST.replace("81 5", "81 6"), COUNT),
     "corners exchanged": (FIRST, FIRST.replace("89 55", "55 89"), r"81 at \(.*\) is twisted .* \(1 such"),
     "a tetrahedron": (
         "$Elements\n128\n",
@@ -101,7 +101,7 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(version: float, tmp_path: Pa
 def test_words_and_numbers_more_in_format_4_are_refused(tmp_path: Path, section: str, more: str) -> None:
     source = write_tube(tmp_path / "tube.msh")
     end = (f"$End{section}", f"{more}\n$End{section}")
-    assert f"${section} has" in refusal(changed(tmp_path / "bad.msh", end, source=source))
+    assert re.search(rf"has other numbers|\${section} (has|announces)", refusal(changed(tmp_path / "bad.msh", end, source=source)))
 
 
 def test_parts_without_a_group_are_read_too(tmp_path: Path) -> None:
