@@ -6,6 +6,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -65,25 +66,29 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 
 def build_ray(scene: Any, comm: Any = None) -> Domain:
     """The wall on the x axis, as many elements as the body has through it."""
-    from remodel_fenicsx.body.domain import lattice_domain
-
-    shape, degree, faces = scene.geometry, scene.mesh.degree, _faces(scene.geometry, "inner", "outer")
-    through = _counts(scene.mesh)[1]
-    wall = _wall(shape, through, scene.regions)
-    share = wall.shares(degree)[:, None]
-    points = (1.0 - share) * np.array([shape.inner_radius, 0, 0]) + share * np.array([shape.outer_radius, 0, 0])
-    return wall.marked(lattice_domain(points, [through], degree, faces, shape.name, _dimensions(shape), comm))
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:2], ("inner", "outer"))
 
 
 def build_half_plane(scene: Any, comm: Any = None) -> Domain:
     """The wall in the half-plane y = 0, x > 0, with the body's elements through the wall and along."""
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:], ("bottom", "top", "inner", "outer"))
+
+
+def _in_half_plane(scene: Any, comm: Any, counts: tuple[int, ...], names: tuple[str, ...]) -> Domain:
     from remodel_fenicsx.body.domain import lattice_domain
 
     shape, degree = scene.geometry, scene.mesh.degree
-    faces, counts = _faces(shape, "bottom", "top", "inner", "outer"), _counts(scene.mesh)[1:]
     wall = _wall(shape, counts[0], scene.regions)
-    z, radii = np.meshgrid(np.linspace(0.0, shape.length, degree * counts[1] + 1), wall.nodes(degree), indexing="ij")
+    along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [np.zeros(1)]
+    z, radii = np.meshgrid(*along, wall.nodes(degree), indexing="ij")
     points = np.stack([radii.ravel(), np.zeros(radii.size), z.ravel()], axis=1)
+    places = {
+        "bottom": lambda x: np.isclose(x[2], 0.0, atol=1e-9 * shape.length),
+        "top": lambda x: np.isclose(x[2], shape.length),
+        "inner": lambda x: np.isclose(x[0], shape.inner_radius),
+        "outer": lambda x: np.isclose(x[0], shape.outer_radius),
+    }
+    faces = {name: places[name] for name in names}
     return wall.marked(lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm))
 
 
@@ -105,17 +110,6 @@ def _spoke(wall: Wall, number: int, corner: int, start: model.Point, stop: model
     inside = [model.points(model.circle(radius, number)[[corner]])[0] for radius in wall.radii[1:-1]]
     pairs = itertools.pairwise([start, *inside, stop])
     return [curve for pair, count in zip(pairs, wall.counts, strict=True) for curve in model.line(*pair, count)]
-
-
-def _faces(shape: Any, *names: str) -> dict[str, Any]:
-    """Where the faces of a tube are in a half-plane."""
-    places = {
-        "bottom": lambda x: np.isclose(x[2], 0.0, atol=1e-9 * shape.length),
-        "top": lambda x: np.isclose(x[2], shape.length),
-        "inner": lambda x: np.isclose(x[0], shape.inner_radius),
-        "outer": lambda x: np.isclose(x[0], shape.outer_radius),
-    }
-    return {name: places[name] for name in names}
 
 
 def _counts(mesh: Mesh) -> tuple[int, int, int]:
@@ -222,12 +216,9 @@ def _elongation(m: Any) -> float:
     return float(m.step.loads.get("elongation", 0.0)) if strain is None else float(strain(m.state.unknown))
 
 
-def _axial_force(m: Any) -> float:
-    return float(m.end_force("inner").of_the_wall(m.state.loading.values.get("pressure", 0.0)))
-
-
-def _reduced_axial_force(m: Any) -> float:
-    return float(m.end_force("inner").reduced(m.state.loading.values.get("pressure", 0.0)))
+def _of_the_end(name: str, m: Any) -> float:
+    """`of_the_wall` or `reduced` of an `EndForce`."""
+    return float(getattr(m.end_force("inner"), name)(m.state.loading.values.get("pressure", 0.0)))
 
 
 def _opening_angle(m: Any) -> float:
@@ -306,7 +297,7 @@ class Tube(RoundWall):
             FORCE,
             reductions=("radial", "axisymmetric", "sector"),
             frees_length=True,
-            value=_axial_force,
+            value=partial(_of_the_end, "of_the_wall"),
             area=lambda shape: shape.section_area,
         ),
     }
@@ -324,7 +315,7 @@ class Tube(RoundWall):
             "reduced_axial_force",
             "force",
             "what a testing machine measures: `axial_force` less the pressure on the lumen at that end, p pi r_i^2",
-            _reduced_axial_force,
+            partial(_of_the_end, "reduced"),
         ),
         Column(
             "opening_angle",

@@ -50,12 +50,6 @@ class Wall(NamedTuple):
         """Radii of the nodes of elements of this degree, equally spaced within a layer."""
         return lattice(self.radii, self.counts, degree)
 
-    def shares(self, degree: int) -> Array:
-        """The same as shares of the way through the wall, from 0 to 1."""
-        inner, outer = self.radii[0], self.radii[-1]
-        inside = [(radius - inner) / (outer - inner) for radius in self.radii[1:-1]]
-        return lattice([0.0, *inside, 1.0], self.counts, degree)
-
     def marked(self, domain: Domain) -> Domain:
         """The domain with its layers as regions: an element is where the middle of its radii is."""
         from remodel_fenicsx.fem import compat

@@ -42,8 +42,6 @@ from remodel_fenicsx.results.recording import (
 )
 from remodel_fenicsx.results.status import log_entries, state_of
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, has_a_body
-from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.schema.settings import Load, Properties
 from remodel_fenicsx.schema.tables import Table
 from remodel_fenicsx.system.files import read_regular, typed, write_new, write_whole
 from remodel_fenicsx.system.terminal import duration
@@ -477,77 +475,42 @@ def _finite(value: float) -> float | None:
 def facts(run: ReportedRun) -> Card:
     """What was run."""
     scene, story = run.recording.scene, run.story
-    shape, mesh, remodeling = scene.geometry, scene.mesh, scene.remodeling
-    sizes = ", ".join(
-        f"{words(name)} {value:g}" for name, value in shape.model_dump().items() if isinstance(value, (int, float))
-    )
-    given = f"; {story.unloaded}" if story.unloaded else ""
-    count = f", {len(run.recording.elements):,} in number" if run.body else ""
-    name = KINEMATICS[scene.model.kinematics].element(mesh.element)
-    seed = f", seed {scene.cells.seed}" if scene.has_random_cells else ""
-    cells, kappa = _by_region(scene, _cells), _by_region(scene, lambda properties: f"{properties.kappa:g}")
-    loads = "; ".join(f"{words(name)} {load.value:g}{_ramp(load)}" for name, load in scene.loads.items())
+    kinematics = KINEMATICS[scene.model.kinematics]
+    count = f"{len(run.recording.elements):,} " if run.body else ""
     seconds = story.history.get("seconds", np.zeros(0))
     solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
     steps = f"{max(0, len(story.history['time']) - 1)}{'' if scene.time.chooses else ' of'}"
     ranks = f", {story.ranks} ranks" if story.ranks not in ("", "1") else ""
     rows = [
-        ("Body", f"{shape.name}: {sizes}{f' in {shape.length_unit}' if shape.length_unit else ''}{given}"),
-        *([] if scene.natural.is_of_the_mesh else [("Free of stress", _natural(scene))]),
-        ("Mesh", f"{name} elements{count}, degree {mesh.degree}, refinement {mesh.refinement}, {mesh.formulation}"),
-        ("Kinematics", f"{scene.model.kinematics}: {KINEMATICS[scene.model.kinematics].meaning}"),
-        ("Supports", f"ends {scene.supports.ends}"),
-        ("Cells", f"{cells}{seed}, axes {scene.cells.axes}"),
-        ("Loads", loads or "none"),
-        *([("Load cases", _load_cases(scene))] if scene.cases else []),
+        ("Body", "; ".join(filter(None, (_keys(scene.geometry, "file", "sha256"), story.unloaded)))),
+        ("Free of stress", "" if scene.natural.is_of_the_mesh else _keys(scene.natural)),
+        ("Mesh", f"{count}{kinematics.element(scene.mesh.element)}: {_keys(scene.mesh)}"),
+        ("Kinematics", f"{scene.model.kinematics}: {kinematics.meaning}"),
+        ("Supports", _keys(scene.supports)),
+        ("Cells", _keys(scene.cells)),
+        *((f"Region {words(name)}", _keys(region)) for name, region in scene.regions.items()),
+        *((words(name).capitalize(), _keys(load)) for name, load in scene.loads.items()),
+        *((f"Load case {number}", _keys(case)) for number, case in enumerate(scene.cases, start=1)),
         ("Material", scene.summary()),
-        ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
-                       f"coupling {remodeling.coupling}, kappa {kappa}"),
-        *([("Turnover", _keys(remodeling.turnover))] if remodeling.turnover.is_on else []),
+        ("Remodeling", _keys(scene.remodeling, "turnover")),
+        ("Turnover", _keys(scene.remodeling.turnover) if scene.remodeling.turnover.is_on else ""),
         ("Time", f"{steps} {scene.time.in_words()}{solving}{ranks}"),
-    ]  # fmt: skip
-    return Card("facts", section("What was run", table(rows)))
+    ]
+    return Card("facts", section("What was run", table(row for row in rows if row[1])))
 
 
-def _ramp(load: Load) -> str:
-    """By what it is multiplied over time."""
-    return f", times {', '.join(f'{factor:g} at t = {time:g}' for time, factor in load.ramp)}"
-
-
-def _natural(scene: Scene) -> str:
-    """In which pieces the tissue is, and how they were stretched."""
-    layers = [_keys(layer) for layer in scene.natural.layers]
-    return "; ".join([f"opening angle {scene.natural.opening_angle:g}°", *(f"layer {layer}" for layer in layers)])
-
-
-def _keys(table: Table) -> str:
+def _keys(keys: Table, *but: str) -> str:
     """All keys of a table that have a value."""
-    found = table.model_dump(exclude_none=True).items()
-    return ", ".join(
-        f"{words(name)} {value:g}" if isinstance(value, float) else f"{words(name)} {value}" for name, value in found
-    )
+    return _as_text(keys.model_dump(exclude_none=True, exclude=set(but)))
 
 
-def _by_region(scene: Scene, in_words: Callable[[Properties], str]) -> str:
-    """What holds in the body, or in each region by its name where they differ."""
-    found = {name: in_words(properties) for name, properties in scene.properties().items()}
-    if len(set(found.values())) == 1:
-        return next(iter(found.values()))
-    return "; ".join(f"{name or 'elsewhere'}: {text}" for name, text in found.items())
-
-
-def _load_cases(scene: Any) -> str:
-    """Weight and factors of each."""
-    factors = (
-        ", ".join(f"{words(name)} times {factor:g}" for name, factor in case.loads.items()) for case in scene.cases
-    )
-    return "; ".join(
-        f"{case.weight:.3g} of the time{': ' if f else ''}{f}" for case, f in zip(scene.cases, factors, strict=True)
-    )
-
-
-def _cells(properties: Properties) -> str:
-    return f"{properties.cells.initial}, r0 = {properties.cells.end_to_end_length:g}"
+def _as_text(value: Any) -> str:
+    """A value of a scene."""
+    if isinstance(value, dict):
+        return ", ".join(f"{words(str(name))} {_as_text(one)}" for name, one in value.items() if one not in ({}, ()))
+    if isinstance(value, (list, tuple)):
+        return f"({', '.join(map(_as_text, value))})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def warnings(run: ReportedRun) -> Card:

@@ -101,7 +101,9 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(version: float, tmp_path: Pa
 def test_words_and_numbers_more_in_format_4_are_refused(tmp_path: Path, section: str, more: str) -> None:
     source = write_tube(tmp_path / "tube.msh")
     end = (f"$End{section}", f"{more}\n$End{section}")
-    assert re.search(rf"has other numbers|\${section} (has|announces)", refusal(changed(tmp_path / "bad.msh", end, source=source)))
+    assert re.search(
+        rf"has other numbers|\${section} (has|announces)", refusal(changed(tmp_path / "bad.msh", end, source=source))
+    )
 
 
 def test_parts_without_a_group_are_read_too(tmp_path: Path) -> None:
