@@ -254,18 +254,7 @@ def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:
 
 def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None:
     """Give points without axes those of the nearest one that has some. Collective."""
-    comm, wanted = quadrature.mesh.comm, quadrature.coordinates[~known]
-    asked = of_all_ranks(comm, wanted)
     good = quadrature.owned(known)
-    places, candidates = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
-    answers = []
-    for part in asked:
-        if len(candidates):
-            distance, index = spatial.cKDTree(places).query(part)
-            answers.append((distance, candidates[index]))
-        else:
-            answers.append((np.full(len(part), np.inf), np.zeros((len(part), 3, 3))))
-    mine = [answers] if comm.size == 1 else comm.alltoall([[answer] for answer in answers])
-    distances = np.stack([answer[0][0] for answer in mine])
-    choices = np.stack([answer[0][1] for answer in mine])
-    axes[~known] = choices[distances.argmin(axis=0), np.arange(len(wanted))]
+    own = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
+    places, candidates = map(np.concatenate, zip(*of_all_ranks(quadrature.mesh.comm, own), strict=True))
+    axes[~known] = candidates[spatial.cKDTree(places).query(quadrature.coordinates[~known])[1]]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -215,28 +216,24 @@ def build_domain(
     comm = comm or MPI.COMM_WORLD
     # with several threads Scotch parts the same mesh differently from run to run
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
-    if comm.rank != 0:
-        verdict, groups = comm.bcast(None, root=0)
-        if verdict:
-            raise GeometryError(verdict)
-        return _domain_from_gmsh(None, comm, groups, shape, dimensions)
-    # the verdict goes out exactly once, whether Gmsh is missing, fails or is interrupted: nobody waits for ever
-    told = False
-    try:
-        with gmsh_model(shape) as gmsh:
-            draw()
-            groups = named_groups()
-            told = True
-            comm.bcast(("", groups), root=0)
-            return _domain_from_gmsh(gmsh.model, comm, groups, shape, dimensions)
-    except BaseException as error:
-        if told:
-            raise
-        verdict = f"Gmsh could not mesh the {shape}: {str(error) or type(error).__name__}"
-        comm.bcast((verdict, None), root=0)
-        if not isinstance(error, Exception):  # Ctrl-C on rank 0 stays what it is there
-            raise
-        raise GeometryError(verdict) from error
+    with ExitStack() as stack:
+        model: Any = None
+        groups: NamedGroups | None = None
+        failure: BaseException | None = None
+        if comm.rank == 0:
+            try:
+                model = stack.enter_context(gmsh_model(shape)).model
+                draw()
+                groups = named_groups()
+            except BaseException as error:  # whatever it is, nobody waits for ever
+                failure = error
+        verdict = failure and f"Gmsh could not mesh the {shape}: {str(failure) or type(failure).__name__}"
+        verdict, groups = comm.bcast((verdict, groups), root=0)
+        if failure is not None and not isinstance(failure, Exception):  # Ctrl-C on rank 0 stays what it is there
+            raise failure
+        if groups is None:
+            raise GeometryError(verdict) from failure
+        return _domain_from_gmsh(model, comm, groups, shape, dimensions)
 
 
 def _domain_from_gmsh(

@@ -17,9 +17,8 @@ from remodel_fenicsx.body.domain import Domain, MeshArrays, cells_of, share_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims
 from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import over_ranks, solve_positive
+from remodel_fenicsx.fem.assembly import agreed, over_ranks, solve_positive
 from remodel_fenicsx.fem.kinematics import lagrange
-from remodel_fenicsx.schema.tables import SceneError
 
 
 # ---------------------------------------------------------------- a mesh as the text of a Gmsh file, format 2.2
@@ -108,18 +107,7 @@ class MeshDomain(Domain):
 
 def shared(read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm) -> MeshDomain:
     """What rank 0 reads, on all ranks. Collective."""
-    verdict, found = "", None
-    if comm.rank == 0:
-        try:
-            found = read()
-        except SceneError as error:
-            verdict = str(error)
-        except BaseException:
-            comm.bcast("rank 0 could not read the mesh")
-            raise
-    verdict = comm.bcast(verdict)
-    if verdict:
-        raise SceneError(verdict)
+    found = agreed(comm, lambda: read() if comm.rank == 0 else None)
     arrays = None if found is None else _arrays(*found)
     extent = comm.bcast(arrays and float(np.ptp(arrays.points, axis=0).max()))
     domain = share_mesh(arrays, "mesh", {"extent": extent}, comm)
