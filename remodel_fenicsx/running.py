@@ -20,6 +20,7 @@ from remodel_fenicsx.evolution.stepper import Pause, Step, Watcher
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.fem.solver_methods import WORTH_RANKS
+from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.export import write_vtu
@@ -28,7 +29,6 @@ from remodel_fenicsx.results.recording import LOG, RecordingError, SCENE, scene_
 from remodel_fenicsx.results.run_folder import (
     LastStep,
     RunFolder,
-    agreed,
     check_before_resuming,
     chosen_folder,
     forget_steps,
@@ -45,7 +45,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
 from remodel_fenicsx.system.files import TakenError, part_of, read_regular, temporary_folder
-from remodel_fenicsx.system.guarded import LARGEST_FILE
+from remodel_fenicsx.system.children import LARGEST_FILE
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 from remodel_fenicsx.unloading import as_unloaded, unloaded
 

@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError
-from remodel_fenicsx.report.card import Card, folded, section, table as card_table
+from remodel_fenicsx.report.page import Card, folded, section, table as card_table
 from remodel_fenicsx.report.page import page_with
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body import Cube, Tendon, Tube
-from remodel_fenicsx.body.domain import interval_domain
+from remodel_fenicsx.body.domain import lattice_domain
 from remodel_fenicsx.body.mesh_file import read_mesh
 from tests import parallel_geometry
 from tests.parts import cube, tendon, tube
@@ -199,10 +199,9 @@ def test_the_tube_is_equally_divided_through_the_wall_around_and_along(element, 
 @pytest.mark.parametrize("kind", ["drawn", "points"])
 def test_ufls_side_of_a_mesh_is_ufls_own_but_for_the_number_of_its_cells(kind):
     """The same forms, so that kernels have the same names; one cell, however often it is asked for."""
-    line, faces = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), np.linspace(0.0, 1.0, 7), 2), {
-        "inner": lambda x: np.isclose(x[0], 1.0)
-    }
-    domain = domain_of("tube") if kind == "drawn" else interval_domain(*line, faces, "tube", {}, MPI.COMM_SELF)
+    points, faces = np.linspace([1.0, 0, 0], [2.0, 0, 0], 7), {"inner": lambda x: np.isclose(x[0], 1.0)}
+    line = points, [3], 2, faces, "tube", {}, MPI.COMM_SELF
+    domain = domain_of("tube") if kind == "drawn" else lattice_domain(*line)
     ours = domain.mesh.ufl_domain()
     theirs = ufl.Mesh(ours.ufl_coordinate_element())
     assert ours.ufl_cell() == theirs.ufl_cell() and ours.ufl_cell() is ours.ufl_cell()

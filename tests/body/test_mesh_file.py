@@ -11,6 +11,7 @@ import pytest
 
 from remodel_fenicsx import SceneError
 from remodel_fenicsx.body.gmsh_model import gmsh_model
+from remodel_fenicsx.body.mesh_file import read_mesh
 from remodel_fenicsx.scene import read_scene, scene_from_dict
 from tests.mesh_files import TUBE, changed, write_tube
 from tests.tables import rows, unescaped
@@ -44,21 +45,32 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(version: float, tmp_path: Pa
     bad = tmp_path / "bad.msh"
     for share in (0.0, 0.001, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99):
         bad.write_bytes(data[: int(share * len(data))])
-        assert re.search(r"must begin with \$MeshFormat|the file ends with", refusal(bad))
+        assert re.search(r"is no mesh by Gmsh|cut off|one section", refusal(bad))
 
 
+@pytest.mark.parametrize("more", ["1 2 x", "1 2 3"])
 @pytest.mark.parametrize("section", ["Nodes", "Elements", "Entities"])
-def test_words_in_format_4_are_refused(tmp_path: Path, section: str) -> None:
+def test_words_and_numbers_more_in_format_4_are_refused(tmp_path: Path, section: str, more: str) -> None:
     source = write_tube(tmp_path / "tube.msh")
-    end = (f"$End{section}", f"1 2 x\n$End{section}")
-    assert f"${section} has 'x'" in refusal(changed(tmp_path / "bad.msh", end, source=source))
+    end = (f"$End{section}", f"{more}\n$End{section}")
+    assert re.search(
+        rf"has other numbers|\${section} (has|announces)", refusal(changed(tmp_path / "bad.msh", end, source=source))
+    )
+
+
+def test_parts_without_a_group_are_read_too(tmp_path: Path) -> None:
+    """As `Mesh.SaveAll` of Gmsh writes them: lines and points here."""
+    file = write_tube(tmp_path / "tube.msh", every=True)
+    one, other = read_mesh(write_tube(tmp_path / "named.msh")), read_mesh(file)
+    np.testing.assert_array_equal(one.points[one.cells], other.points[other.cells])
+    np.testing.assert_array_equal(one.facet_groups, other.facet_groups[other.facet_groups > 0])
 
 
 def test_no_script_runs_under_the_name_of_a_mesh(tmp_path: Path) -> None:
     mark, file = tmp_path / "mark", tmp_path / "vessel.msh"
     for before in ("", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"):
         file.write_text(f'{before}SystemCall "touch {mark}";\n')
-        assert re.search("not a mesh by Gmsh|between two sections", refusal(file))
+        assert re.search("no mesh by Gmsh|outside of its sections", refusal(file))
         assert not mark.exists()
 
 

@@ -21,7 +21,7 @@ import pytest
 from remodel_fenicsx import Recording, cli
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
-from remodel_fenicsx.report.card import ANGLE_STEPS, NO_ANGLE, of_angles
+from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, of_angles
 from remodel_fenicsx.report.page import Story
 from remodel_fenicsx.results.recording import ANGLE_COLOURS, HistoryColumns, kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
@@ -112,7 +112,7 @@ def test_regions_are_shown_by_name(recorded: Recorded) -> None:
     places = ("inner", "middle", "outer", "media", "adventitia")
     assert curves["Fibre angle"] == [f"fibre angle {place}" for place in places]
     assert curves["Largest r/L"] == ["largest r/L media", "largest r/L adventitia", "largest r/L"]
-    for words in ("kappa media: 0.05; adventitia: 0.025", "media: isotropic, r0 = 1; adventitia: (0.5, 0.85, 0.165"):
+    for words in ("<th>Region media", "remodeling kappa 0.05", "<th>Region adventitia", "initial (0.5, 0.85, 0.165"):
         assert words in found.text
     assert Decoded.of(recorded("artery")).data["parts"]["angles"]["regions"] == []
 
@@ -121,8 +121,8 @@ def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
     """Where it is free of stress, the loaded body that was given, turnover and ramps; nothing that is not there."""
     text = html.unescape(Decoded.of(recorded("unloaded")).text)
     expected = [
-        "opening angle 60°", "so that under the loads it has the given radii 1, 1.3, length 2",
-        "time 40, deposition stretch 1.1, gain 1", "pressure 1.2, times 0 at t = 0, 1 at t = 24",
+        "opening angle 60", "so that under the loads it has the given radii 1, 1.3, length 2",
+        "time 40, deposition stretch 1.1, gain 1", "value 1.2, ramp ((0, 0), (24, 1))",
     ]  # fmt: skip
     assert not [words for words in expected if words not in text]
     text = Decoded.of(recorded("cube")).text
