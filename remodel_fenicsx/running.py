@@ -116,7 +116,7 @@ def run(
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
     with interrupts.StopRequest() as stop, ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
-            scene = body.enter_context(as_unloaded(scene, comm))
+            scene = body.enter_context(as_unloaded(scene, comm, quiet))
             simulation = body.enter_context(_built(_with_sums(scene, comm), comm))
             place = place or chosen_folder(None, scene.name, comm)
         with locked(place, comm, new=True):
@@ -370,7 +370,7 @@ def write_unloaded(scene: Scene, folder: Path) -> str:
     if folder.exists():
         raise TakenError(folder, "folder")
     with temporary_folder() as temporary:
-        found = unloaded(scene, MPI.COMM_SELF, temporary)
+        found = unloaded(scene, MPI.COMM_SELF, temporary, quiet=False)
         kept, files = with_files_kept(found)
         part = part_of(folder)
         shutil.rmtree(part, ignore_errors=True)  # of one that was killed

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, preset_scene
-from remodel_fenicsx.model.residual_stress import Layer, closing, cut
+from remodel_fenicsx.model.residual_stress import Layer, closing, cut, principal_stresses
 from tests.runs import made
 
 
@@ -40,6 +41,17 @@ def test_what_was_closed_opens_again(opening_angle: float) -> None:
     assert found.opening_angle == pytest.approx(opening_angle, abs=1e-6)
     assert found.radii == pytest.approx(tuple(sector), abs=1e-6)
     assert found.axial == pytest.approx(1 / closed.axial, abs=1e-8)
+
+
+@pytest.mark.parametrize("preset", ["kuhl-holzapfel-2007", "consistent"])
+def test_the_tangent_of_stresses_is_their_derivative(preset: str) -> None:
+    """By logarithms of the stretches, of points whose cells differ; with turnover as arrays over the points."""
+    tissue = replace(scene(preset).properties()[""].tissue, content=np.array([1.0, 1.5]), natural_length=np.array(1.1))
+    stretches, cells = np.array([[1.2, 0.9, 0.95], [1.0, 1.3, 0.8]]), np.array([[0.6, 0.5, 0.6], [0.3, 0.9, 0.2]])
+    _, tangents = principal_stresses(tissue, stretches, cells)
+    for axis, way in enumerate(1e-4 * np.eye(3)):
+        ahead, behind = (principal_stresses(tissue, stretches * np.exp(side * way), cells)[0] for side in (1, -1))
+        np.testing.assert_allclose(tangents[..., axis], (ahead - behind) / 2e-4, rtol=1e-4, atol=1e-4)
 
 
 def test_tensor_and_log_leave_the_angle_as_it_was() -> None:
