@@ -20,6 +20,7 @@ from remodel_fenicsx.evolution.stepper import Pause, Step, Watcher
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.fem.solver_methods import WORTH_RANKS
+from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.export import write_vtu
@@ -28,7 +29,6 @@ from remodel_fenicsx.results.recording import LOG, RecordingError, SCENE, scene_
 from remodel_fenicsx.results.run_folder import (
     LastStep,
     RunFolder,
-    agreed,
     check_before_resuming,
     chosen_folder,
     forget_steps,
@@ -45,7 +45,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
 from remodel_fenicsx.system.files import TakenError, part_of, read_regular, temporary_folder
-from remodel_fenicsx.system.guarded import LARGEST_FILE
+from remodel_fenicsx.system.children import LARGEST_FILE
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 from remodel_fenicsx.unloading import as_unloaded, unloaded
 
@@ -116,7 +116,7 @@ def run(
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
     with interrupts.StopRequest() as stop, ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
-            scene = body.enter_context(as_unloaded(scene, comm))
+            scene = body.enter_context(as_unloaded(scene, comm, quiet))
             simulation = body.enter_context(_built(_with_sums(scene, comm), comm))
             place = place or chosen_folder(None, scene.name, comm)
         with locked(place, comm, new=True):
@@ -370,7 +370,7 @@ def write_unloaded(scene: Scene, folder: Path) -> str:
     if folder.exists():
         raise TakenError(folder, "folder")
     with temporary_folder() as temporary:
-        found = unloaded(scene, MPI.COMM_SELF, temporary)
+        found = unloaded(scene, MPI.COMM_SELF, temporary, quiet=False)
         kept, files = with_files_kept(found)
         part = part_of(folder)
         shutil.rmtree(part, ignore_errors=True)  # of one that was killed

@@ -24,7 +24,7 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.results.columns import Observer
-from remodel_fenicsx.results.run_folder import agreed
+from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
 from remodel_fenicsx.schema.settings import Cells, Properties, missing_for_steps_of_cells

@@ -27,20 +27,20 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, factorised, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
 from remodel_fenicsx.results.fields import NodalGather, dof_of_node
-from remodel_fenicsx.results.run_folder import agreed
+from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import mandel_vector
 from remodel_fenicsx.system.files import temporary_folder
-from remodel_fenicsx.system.terminal import unsaid
+from remodel_fenicsx.system.terminal import Line, unsaid
 
 log = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def as_unloaded(scene: Scene, comm: MPI.Intracomm) -> Iterator[Scene]:
+def as_unloaded(scene: Scene, comm: MPI.Intracomm, quiet: bool = True) -> Iterator[Scene]:
     """The scene itself, or that of its unloaded body, whose mesh is there as long as this context. Collective."""
     if not scene.geometry.is_loaded:
         yield scene
@@ -48,10 +48,12 @@ def as_unloaded(scene: Scene, comm: MPI.Intracomm) -> Iterator[Scene]:
     for line in scene.turned_away() if comm.rank == 0 else ():
         log.warning("%s", line)
     with temporary_folder() as folder:
-        yield unloaded(scene, comm, comm.bcast(folder))
+        yield unloaded(scene, comm, comm.bcast(folder), quiet)
 
 
-def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | None = None) -> Scene:
+def unloaded(
+    scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | None = None, quiet: bool = True
+) -> Scene:
     """The scene of the body that the loads, at the end of their ramps, bring to the geometry of this one. Collective.
 
     Parameters
@@ -62,6 +64,8 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
         MPI communicator.
     folder
         Where the mesh of an own body is written, on rank 0.
+    quiet
+        No progress on the terminal.
 
     Returns
     -------
@@ -89,11 +93,12 @@ def unloaded(scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | 
     """
     if not scene.geometry.is_loaded:
         return scene
-    if isinstance(scene.geometry, RoundWall):
-        return unloaded_tube(scene, comm)
-    if folder is None:
-        raise SceneError("geometry.is = 'loaded': a folder is needed for the unloaded mesh")
-    return unloaded_mesh(scene, comm, folder)
+    with Line(f"{scene.name}, unloaded body", silent=quiet or comm.rank != 0) as line:
+        if isinstance(scene.geometry, RoundWall):
+            return unloaded_tube(scene, comm, line.show)
+        if folder is None:
+            raise SceneError("geometry.is = 'loaded': a folder is needed for the unloaded mesh")
+        return unloaded_mesh(scene, comm, folder, line.show)
 
 
 # ---------------------------------------------------------------- no unloaded shape
@@ -133,14 +138,15 @@ def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
 
 # ---------------------------------------------------------------- the unloaded tube of a loaded one
 # Radii and length.
-#  They are found by runs of the scene's own kinematics, so that the run that follows comes to the given numbers: a
-# fixed point in the targets of inverse elastostatics of one radius (`model.closing`).
+#  They are found by runs of the scene's own kinematics, so that the run that follows comes to the given numbers:
+# by Broyden's method for their logarithms, from what inverse elastostatics of one radius says
+# (`model.residual_stress.closing`). There the loaded numbers change about as the unloaded ones do.
 
 Array = NDArray[np.float64]
+Said = Callable[[str], object]
 
 LOADED_AGAIN = 1e-9  # of the largest length: how far the loaded numbers may be from those of the scene
 MOST_LOADINGS = 30  # runs for one share of the loads
-REMEMBERED = 5  # differences of earlier runs from which the next is guessed (Anderson 1965)
 LOAD_STEPS = 10  # of a run to the end of the ramps
 # cells that stay; what says how to remodel goes with a law
 PASSIVE: dict[str, Any] = {
@@ -149,25 +155,39 @@ PASSIVE: dict[str, Any] = {
 }  # fmt: skip
 
 
-def unloaded_tube(scene: Scene, comm: MPI.Intracomm) -> Scene:
-    """By fixed-point iteration for the targets of inverse elastostatics, with Anderson's extrapolation."""
+def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
+    """By Broyden's method, from inverse elastostatics."""
     shape: Any = scene.geometry
     names = sorted((n for n in scene.regions if scene.regions[n].outer_radius), key=lambda n: _outer(scene, n))
     inside = [_outer(scene, name) for name in names if _outer(scene, name) < shape.outer_radius]
     given = np.array([shape.inner_radius, *inside, shape.outer_radius, shape.length])
-    runs = 0
+    runs, found = 0, given
 
-    def find(share: float, start: Array) -> Array:
-        nonlocal runs
-        found, number = _found(scene, comm, given, share, start)
-        runs += number
-        return found
+    def find(share: float, correction: Any) -> Any:
+        """How far logarithms are from what inverse elastostatics says, from how far they were; the numbers too."""
+        nonlocal runs, found
+        first: Any = np.log(_inverse(scene, given, share))
+        numbers, slope, words = first + correction, np.eye(len(given)), ""
+        step = before = np.zeros_like(numbers)
+        for _ in range(MOST_LOADINGS):
+            runs += 1
+            said(f"run {runs}, {100 * share:g} % of the loads{words}")
+            found = np.exp(numbers)
+            loaded = _loaded(scene, comm, found, share)
+            if np.abs(given - loaded).max() <= LOADED_AGAIN * given.max():
+                return numbers - first
+            error = np.log(given / loaded)
+            if step.any():  # Broyden's good update of the inverse derivative
+                change = slope @ (before - error)
+                slope = slope + np.outer(step - change, step @ slope) / (step @ change)
+            step, before = slope @ error, error
+            numbers, words = numbers + step, f"; the one before was off by {np.abs(error).max():.1e}"
+        raise ArithmeticError(f"off by {np.abs(error).max():.2g} after {MOST_LOADINGS} runs")
 
-    found = in_shares(find, given)
-    geometry = _with_numbers(scene, found)
+    in_shares(find, np.zeros(len(given)))
     unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
     log.info("unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
-    return geometry
+    return _with_numbers(scene, found)
 
 
 def _outer(scene: Scene, name: str) -> float:
@@ -175,44 +195,15 @@ def _outer(scene: Scene, name: str) -> float:
     return float(outer)
 
 
-def _found(scene: Scene, comm: MPI.Intracomm, given: Array, share: float, start: Array) -> tuple[Array, int]:
-    """Radii and length that a share of the loads brings to the given ones, and how many runs that took."""
-    target, targets, errors = given.copy(), [], []
-    length = start[-1]
-    for number in range(1, MOST_LOADINGS + 1):
-        numbers = _inverse(scene, target, share, given[-1] / length)
-        found = _loaded(scene, comm, numbers, share)
-        length = numbers[-1] * given[-1] / found[-1]
-        error = given - found
-        if np.abs(error).max() <= LOADED_AGAIN * given.max():
-            return numbers, number
-        targets.append(target)
-        errors.append(error)
-        target = _extrapolated(targets[-REMEMBERED:], errors[-REMEMBERED:])
-    raise ArithmeticError(f"off by {np.abs(error).max():.2g} after {MOST_LOADINGS} runs")
-
-
-def _extrapolated(targets: list[Array], errors: list[Array]) -> Array:
-    """Where the error, were it linear in the target, would be least; then on by what is left of it."""
-    target, error = targets[-1], errors[-1]
-    if len(targets) == 1:
-        return target + error
-    steps = np.stack([target - earlier for earlier in targets[:-1]], axis=1)
-    changes = np.stack([error - earlier for earlier in errors[:-1]], axis=1)
-    weights = np.linalg.lstsq(changes, error, rcond=1e-10)[0]
-    found: Array = target + error - (steps + changes) @ weights
-    return found
-
-
-def _inverse(scene: Scene, target: Array, share: float, axial: float) -> Array:
+def _inverse(scene: Scene, given: Array, share: float) -> Array:
     """Unloaded radii and length of a tube with these loaded ones, whose mesh is free of stress; on one radius."""
-    loaded = _with_numbers(scene, target)
     tissues = {name: properties.tissue for name, properties in scene.properties().items()}
-    layers = loaded.geometry.layers_of_tissue(Natural(), loaded.regions, tissues)
-    pressure = scene.loads["pressure"] if "pressure" in scene.loads else None
-    value = 0.0 if pressure is None else pressure.value * pressure.factor(scene.end_of_ramps) * share
-    radii = closing(layers, 0.0, Loads(value, None, axial)).natural_radius(target[:-1])
-    return np.append(radii, target[-1] / axial)
+    layers = scene.geometry.layers_of_tissue(Natural(), scene.regions, tissues)
+    end = scene.end_of_ramps
+    loads = {name: load.value * load.factor(end) * share for name, load in scene.loads.items()}
+    axial = 1.0 + loads.get("elongation", 0.0)
+    radii = closing(layers, 0.0, Loads(loads.get("pressure", 0.0), None, axial)).natural_radius(given[:-1])
+    return np.append(radii, given[-1] / axial)
 
 
 def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
@@ -227,13 +218,14 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
     for name, load in scene.loads.items():
         changes |= {f"loads.{name}.value": load.value * load.factor(end) * share}
         changes |= {f"loads.{name}.ramp": [[0.0, 0.0], [end, 1.0]]}
-    simulation = Simulation(_with_numbers(scene, numbers).with_values(changes), comm)
-    try:
+    with (
+        unsaid(),
+        contextlib.closing(Simulation(_with_numbers(scene, numbers).with_values(changes), comm)) as simulation,
+    ):
+        simulation.watchers = [simulation.observer]
         row = [step.row for step in simulation.steps()][-1]
         domain = simulation.domain
         places, moves = domain.gather_nodes(domain.mesh.geometry.x), NodalGather(domain, simulation.state)()
-    finally:
-        simulation.close()
     radii = None
     if places is not None and moves is not None:
         before, after = (np.hypot(x[:, 0], x[:, 1]) for x in (places, places + moves))
@@ -267,7 +259,7 @@ MOST_MOVES = 20  # Newton iterations for one share of the loads
 LEAST_STEP = 1 / 64  # of a Newton step that keeps elements whole and chains shorter than their contour length
 
 
-def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
+def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -> Scene:
     """The scene of the unloaded body, whose mesh is written into the folder. Collective."""
     shape: Any = scene.geometry
     file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
@@ -287,9 +279,10 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
 
     def find(share: float, start: Array) -> Array:
         nonlocal iterations
-        places, step, length = start, np.zeros_like(start), 1.0
+        places, step, length, words = start, np.zeros_like(start), 1.0, ""
         for _ in range(MOST_MOVES):
             iterations += 1
+            said(f"Newton iteration {iterations}, {100 * share:g} % of the loads{words}")
             write(places)
             with unsaid(), contextlib.closing(Simulation(scene.with_values(changes), comm)) as simulation:
                 found = _newton_step(simulation, given, share)
@@ -300,6 +293,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path) -> Scene:
                 places = places - length * step
                 continue
             size, length = float(np.abs(found).max()), 1.0
+            words = f"; nodes have moved by {size:.1e}"
             while not comm.bcast(file is None or _is_whole(replace(file, points=places + length * found))):
                 length /= 2
                 if length < LEAST_STEP:

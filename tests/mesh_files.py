@@ -29,6 +29,7 @@ def write_tube(
     counts: tuple[int, int, int] = COUNTS,
     length: float = LENGTH,
     moved: Callable[[Any], Any] | None = None,
+    every: bool = False,
 ) -> Path:
     """A tube about z as a file with named faces, perhaps turned and shifted, or its places (n, 3) moved at will."""
     around, through, along = counts
@@ -47,6 +48,7 @@ def write_tube(
                 gmsh.model.mesh.setNode(tag, place, [])
         gmsh.option.setNumber("Mesh.MshFileVersion", version)
         gmsh.option.setNumber("Mesh.Binary", 0)
+        gmsh.option.setNumber("Mesh.SaveAll", int(every))
         gmsh.write(str(path))
     return path
 

@@ -16,41 +16,32 @@ from benchmarks.fuzzing.relations import Other
 from benchmarks.fuzzing.scenes import Values, cost, made
 from benchmarks.stability_map.cases import Case, Finding, Run
 from benchmarks.stability_map.judging import BAD_INPUT, NO_END, SOLVE_FAILED, Verdict, judged
-from benchmarks.stability_map.running import (
-    Record,
-    Runner,
-    file_of,
-    judges,
-    measure,
-    parser_of,
-    read_records,
-    source_of,
-)
+from benchmarks.stability_map import running
 
 
 def main(description: str | None, arguments: list[str] | None = None) -> int:
     """Run what is missing, print what has come of it; 1 if a scene is wrong."""
-    parser = parser_of(description, 15, "fuzz")
+    parser = running.parser_of(description, 15, "fuzz")
     parser.add_argument("--seed", type=int, default=1, metavar="FIRST", help="the first seed (1)")
     parser.add_argument("--count", type=int, default=300, metavar="N", help="how many seeds (300)")
     parser.add_argument("--only", type=int, metavar="SEED", help="this one, with its scene, whatever is there of it")
     options = parser.parse_args(arguments)
     if options.only is not None:
         return _one(options.only, options.limit)
-    by, seeds = judges("fuzzing", "stability_map")[:10], range(options.seed, options.seed + options.count)
-    source = f"{source_of()} by {by}"
-    file = file_of(options, source)
-    there = {} if options.again else {r["seed"]: r for r in read_records(file) if r["source"] == source}
+    by, seeds = running.judges("fuzzing", "stability_map")[:10], range(options.seed, options.seed + options.count)
+    source = f"{running.source_of()} by {by}"
+    file = running.file_of(options, source)
+    there = {} if options.again else {r["seed"]: r for r in running.read_records(file) if r["source"] == source}
     done = {seed: there[seed] for seed in seeds if seed in there}
     # the cheap ones first: what is stopped has seen as many as it could
     missing = sorted((seed for seed in seeds if seed not in done), key=lambda seed: cost(made(seed)[0]))
     print(f"{source}: {len(seeds)} scenes, {len(missing)} to run; {file}", file=sys.stderr)
-    done |= measure({seed: partial(evaluated, seed, source=source) for seed in missing}, said, source, options)
+    done |= running.measure({seed: partial(evaluated, seed, source=source) for seed in missing}, said, source, options)
     print(summary([done[seed] for seed in seeds if seed in done]))
     return int(any(record["outcome"] == "wrong" for record in done.values()))
 
 
-def evaluated(seed: int, runner: Runner, source: str = "") -> Record:
+def evaluated(seed: int, runner: running.Runner, source: str = "") -> running.Record:
     """The scene of a seed, run twice and judged."""
     scene, counts = made(seed)
     other = relations.chosen(scene, Random(seed))
@@ -90,7 +81,7 @@ def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
     return judged(Case("fuzz", "", scene, lambda case, run: worst, ""), run)
 
 
-def said(record: Record) -> str:
+def said(record: running.Record) -> str:
     """A line on a seed."""
     alarm = " (false alarm)" if record["false_alarm"] else ""
     return (
@@ -98,7 +89,7 @@ def said(record: Record) -> str:
     )
 
 
-def summary(records: list[Record]) -> str:
+def summary(records: list[running.Record]) -> str:
     """How many ended how, and those that are not right."""
     counts = Counter(record["outcome"] for record in records)
     lines = [said(record) for record in records if record["outcome"] in ("wrong", "unchecked")]
@@ -118,7 +109,7 @@ def _one(seed: int, limit: float) -> int:
         for key, value in values.items() if scene.get(table, {}).get(key) != value
     }  # fmt: skip
     print("\n".join(f"#     {key} = {value}" for key, value in changed.items()))
-    runner = Runner(limit)
+    runner = running.Runner(limit)
     try:
         record = evaluated(seed, runner)
     finally:

@@ -10,21 +10,12 @@ from pathlib import Path
 
 from benchmarks.stability_map import report
 from benchmarks.stability_map.cases import FAMILIES, Case, all_cases
-from benchmarks.stability_map.running import (
-    Record,
-    digest,
-    evaluated,
-    file_of,
-    measure,
-    parser_of,
-    read_records,
-    source_of,
-)
+from benchmarks.stability_map import running
 
 
 def main(description: str | None, arguments: list[str] | None = None) -> int:
     """Run what is missing, print the table; 1 if a case is wrong."""
-    parser = parser_of(description, 120, "stability")
+    parser = running.parser_of(description, 120, "stability")
     parser.add_argument("--family", action="append", default=[], metavar="NAME", help="only cases of this family")
     parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="only cases whose key contains it")
     parser.add_argument("--reduced", action="store_true", help="only the cases of the test")
@@ -33,21 +24,21 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser.add_argument("--report", action="store_true", help="write docs/stability.md and its picture, run nothing")
     options = parser.parse_args(arguments)
     if options.report:
-        return report.write(options.results, all_cases(), source_of())
+        return report.write(options.results, all_cases(), running.source_of())
     cases = chosen(options, parser)
     if options.list:
         print("\n".join(f"{case.key}\n    {case.command}" for case in cases.values()))
         return 0
-    source = source_of()
-    file = file_of(options, source)
+    source = running.source_of()
+    file = running.file_of(options, source)
     done = {} if options.again else measured(file, source, cases, options.limit)
     if options.judge:
-        known = {record["key"] for record in read_records(file) if record["source"] == source}
+        known = {record["key"] for record in running.read_records(file) if record["source"] == source}
         cases = {key: case for key, case in cases.items() if key in known}
     missing = spread([key for key in cases if key not in done], cases)
     print(f"{source}: {len(cases)} cases, {len(missing)} to run with {options.jobs} processes; {file}", file=sys.stderr)
-    jobs = {key: partial(evaluated, cases[key], source=source) for key in missing}
-    done |= measure(jobs, said, source, options)
+    jobs = {key: partial(running.evaluated, cases[key], source=source) for key in missing}
+    done |= running.measure(jobs, said, source, options)
     records = [done[key] for key in cases if key in done]
     print(report.table(records))
     for record in records:
@@ -56,7 +47,7 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     return int(any(record["outcome"] == "wrong" for record in records))
 
 
-def said(record: Record) -> str:
+def said(record: running.Record) -> str:
     """A line on a case."""
     return f"{record['outcome']:9} {record['total']:6.1f} s  {record['key']}"
 
@@ -75,12 +66,12 @@ def chosen(options: argparse.Namespace, parser: argparse.ArgumentParser) -> dict
     return cases
 
 
-def measured(file: Path, source: str, cases: dict[str, Case], limit: float = 0.0) -> dict[str, Record]:
+def measured(file: Path, source: str, cases: dict[str, Case], limit: float = 0.0) -> dict[str, running.Record]:
     """What has been measured of these cases with this package, by key; the last one of each."""
     found = {}
-    for record in read_records(file):
+    for record in running.read_records(file):
         case = cases.get(record["key"])
-        if case is not None and record["source"] == source and record["digest"] == digest(case):
+        if case is not None and record["source"] == source and record["digest"] == running.digest(case):
             found[record["key"]] = record
     # what had no end may have one within more time
     return {key: record for key, record in found.items() if record.get("no_end_within", limit) >= limit}

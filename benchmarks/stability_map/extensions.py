@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -45,25 +44,6 @@ class Block(Cube):
         return replace(domain, shape=self.shape)
 
 
-class Value:
-    """Stands for a Constant where a load is a field: what `Loading.set` sets goes to a function."""
-
-    def __init__(self, loading: Any, name: str, take: Callable[[float], None]):
-        self._value, self._take = 0.0, take
-        loading.magnitude(name)
-        loading._magnitudes[name] = [(self, 1.0)]
-
-    @property
-    def value(self) -> float:
-        """As it was set."""
-        return self._value
-
-    @value.setter
-    def value(self, value: float) -> None:
-        self._value = value
-        self._take(value)
-
-
 def prescribed(loading: Any, face: str | None = None, component: int | None = None) -> Any:
     """A function whose values all or one component of a face, or of the whole boundary, take."""
     tags = loading.domain.facet_tags
@@ -93,7 +73,7 @@ def entry_of_gradient(i: int, j: int) -> LoadKind:
             gradient[i, j] = value
             values.interpolate(lambda x: gradient @ x)
 
-        Value(loading, name, take)
+        loading.follow(name, take)
 
     return LoadKind(add, f"H_{'xyz'[i]}{'xyz'[j]} of the boundary")
 
@@ -120,7 +100,7 @@ def turn_top(shape: Any, loading: Any, name: str) -> None:
         along.interpolate(lambda x: c * x[0] - s * x[1])
         across.interpolate(lambda x: s * x[0] + c * x[1])
 
-    Value(loading, name, take)
+    loading.follow(name, take)
 
 
 class Twisted(Tendon):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Iterable, Sized
 from pathlib import Path
@@ -49,6 +50,11 @@ def table() -> str:
         f"| imported by `Simulation` | {tens(imported)} | {lines(imported):,} |\n"
         f"| whose functions the fourth step calls | {tens(called & set(all_files))} | |"
     )
+
+
+def made_alone() -> str:
+    """The table, by a process that has imported nothing yet."""
+    return subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=True).stdout
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from docs.making.pages import EDGES, FIGURES, Columns, drawn, markdown, rows_and_last, simulated
+from docs.making.pages import EDGES, FIGURES, Columns, by_layer, drawn, rows_and_last, simulated
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
@@ -161,11 +161,9 @@ def page_values(folder: Path) -> dict[str, str]:
 
 def layer_table(layers: Columns) -> str:
     """Angles of Figs. 8, 10 and 11, layer by layer."""
-    cases = {"σ": "10_4.8", "S": "pk2", "b": "finger"}
-    short = {"paper": "the paper's", "once": "κ", "twice": "2κ"}
-    head = ["layer", *(f"{symbol}, {short[variant]}" for symbol in cases for variant in VARIANTS)]
-    columns = [layers[f"{case}_{variant}"] for case in cases.values() for variant in VARIANTS]
-    return markdown(head, [[str(k + 1), *(f"{angles[k]:.1f}" for angles in columns)] for k in range(8)])
+    cases, short = {"σ": "10_4.8", "S": "pk2", "b": "finger"}, {"paper": "the paper's", "once": "κ", "twice": "2κ"}
+    of_all = [(symbol, case, variant) for symbol, case in cases.items() for variant in short]
+    return by_layer([(f"{symbol}, {short[variant]}", layers[f"{case}_{variant}"]) for symbol, case, variant in of_all])
 
 
 def make(keep: bool) -> None:

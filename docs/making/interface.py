@@ -9,6 +9,8 @@ import argparse
 import dataclasses
 import inspect
 import re
+import subprocess
+import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from types import ModuleType
@@ -18,7 +20,7 @@ from mpi4py import MPI
 
 import remodel_fenicsx
 from remodel_fenicsx import Scene, cli, extend, parts
-from docs.making.pages import markdown
+from docs.making.pages import DOCS, markdown
 from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, WithRegions, columns_of
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.schema.tables import Table, description, sections
@@ -52,6 +54,12 @@ def page() -> str:
     text += f"\n## Keys of a scene\n\n{_wrapped(_keys())}\n\n## Columns of a history\n\n{_wrapped(_columns())}\n"
     text += f"\n## Commands\n\n```text\n{_wrapped(_commands(cli.parser()), '    ')}\n```\n\n## Exit codes\n\n"
     return text + "\n".join(f"- {code}: {meaning}" for code, meaning in cli.EXIT_CODES.items()) + "\n"
+
+
+def schema() -> str:
+    """docs/scene.schema.json, as the command prints it."""
+    command = [sys.executable, "-m", "remodel_fenicsx.cli", "schema"]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=DOCS.parent).stdout
 
 
 def _wrapped(lines: Iterable[str], indent: str = "  ") -> str:

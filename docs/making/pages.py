@@ -35,6 +35,13 @@ def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join([first, "|" + " --- |" * (first.count("|") - 1), *([found] if found else [])])
 
 
+def by_layer(columns: Sequence[tuple[str, Sequence[Any]]]) -> str:
+    """A table with a row for each layer of elements, of columns with their heads: degrees, or what is text already."""
+    heads, values = zip(*columns, strict=True)
+    rows = ([one if isinstance(one, str) else f"{one:.1f}" for one in row] for row in zip(*values, strict=True))
+    return markdown(["layer", *heads], [[str(number), *row] for number, row in enumerate(rows, 1)])
+
+
 def between_marks(text: str, name: str, made: str) -> str:
     """A page with another text between the two comments of this name."""
     start, end = f"<!-- {name}: ./with-fenicsx docs/make ", f"\n<!-- end of {name} -->"

@@ -1,12 +1,10 @@
 """What docs/verification.md shows beside the figures: comparisons with the radial reference, invariance.
 
-Each study is a table, NAME.csv. They take minutes; a table may be used again where versions and the files below stay.
+Each study is a table, NAME.csv. They take minutes.
 """
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
 import multiprocessing
 import os
 import sys
@@ -18,27 +16,15 @@ from typing import Any
 import numpy as np
 
 from demos.figures import scenes
-from docs.making.pages import DOCS, by_column, simulated
-from remodel_fenicsx import __version__
+from docs.making.pages import by_column, simulated
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.spectral import positive_direction
 from remodel_fenicsx.results.columns import Measurement
-from remodel_fenicsx.studies.page import Page, read_notes, read_table
+from remodel_fenicsx.studies.page import Page
 from remodel_fenicsx.system.children import cores
 
 Row = dict[str, Any]
-LIBRARIES = ("fenics-dolfinx", "fenics-ufl", "fenics-ffcx", "petsc4py", "gmsh", "numpy")
-USED_BY_STUDIES = (
-    "demos/figures.py",
-    "docs/making/studies.py",
-    "tests/radial_comparison.py",
-    "tests/reference/radial.py",
-    "tests/model/test_invariance.py",
-    "tests/parts.py",
-)
-
-
 # ---------------------------------------------------------------- against the radial reference
 
 
@@ -179,9 +165,9 @@ def called(job: Job) -> list[Row]:
 
 
 def study(folder: Path, keep: bool) -> list[str]:
-    """Write the tables, or with `keep` only those not there or no longer valid; returns the names of all."""
-    key, tables = f"key {_key()}", jobs()
-    wanted = {name: of for name, of in tables.items() if not (keep and _is_valid(folder / f"{name}.csv", key))}
+    """Write the tables, or with `keep` only those that are not there; returns the names of all."""
+    tables = jobs()
+    wanted = {name: of for name, of in tables.items() if not (keep and (folder / f"{name}.csv").is_file())}
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes below, one for each core
     pool = ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn"))
     try:
@@ -189,20 +175,7 @@ def study(folder: Path, keep: bool) -> list[str]:
         for name, futures in pending.items():
             print(f"verification: {name}", file=sys.stderr, flush=True)
             rows = [row for future in futures for row in future.result()]
-            Page(folder, name).save_table(by_column(rows), ["docs/making/studies.py", key])
+            Page(folder, name).save_table(by_column(rows), ["docs/making/studies.py"])
     finally:
         pool.shutdown(cancel_futures=True)  # after a failure the rest is not waited for
     return list(tables)
-
-
-def _key() -> str:
-    """Hash of what the tables depend on."""
-    digest = hashlib.sha256(str([importlib.metadata.version(name) for name in LIBRARIES]).encode())
-    digest.update(__version__.encode())
-    for name in USED_BY_STUDIES:
-        digest.update((DOCS.parent / name).read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def _is_valid(path: Path, key: str) -> bool:
-    return path.is_file() and key in read_notes(path.parent, path.stem).get(path.name, ()) and len(read_table(path)) > 0

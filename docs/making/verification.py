@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from demos import figures
 from docs.making.consistent import page_values
-from docs.making.pages import DOCS, EDGES, FIGURES, Columns, drawn, markdown, rows_of
+from docs.making.pages import DOCS, EDGES, FIGURES, Columns, by_layer, drawn, markdown, rows_of
 from docs.making.studies import study
 from remodel_fenicsx.studies.page import COLOURS, Page, read_notes, read_table
 from remodel_fenicsx.system.children import cores
@@ -260,24 +260,21 @@ def _energy(folder: Path) -> dict[str, str]:
 def layer_table(folder: Path) -> str:
     """Runs against the reference, layer by layer."""
     runs, reference = layer_angles(folder), read_table(folder / "radial-reference.csv")
-    head, columns = ["layer", "R"], []
+    columns: list[tuple[str, Any]] = [("R", [f"{radius:g}" for radius in reference["radius"]])]
     for name, label in zip(REFERENCE, ("σ, eq. (11)", "S, eq. (11)", "b, eq. (11)", "σ, eq. (10)"), strict=True):
-        head += [label, "reference"]
-        columns += [runs[name], reference[name]]
-    return markdown(head, [
-        [str(k + 1), f"{reference['radius'][k]:g}", *(f"{column[k]:.1f}" for column in columns)] for k in range(8)
-    ])  # fmt: skip
+        columns += [(label, runs[name]), ("reference", reference[name])]
+    return by_layer(columns)
 
 
 def case_table(folder: Path) -> str:
     """Fig. 9, layer by layer, against the reference."""
     table, reference = read_table(folder / "fig9.csv"), read_table(folder / "radial-reference.csv")
-    header, columns = ["layer"], []
+    columns: list[tuple[str, Any]] = []
     for stretch, pressure in CASES:
         chosen = np.isclose(table["stretch"], stretch / 100) & np.isclose(table["pressure"], pressure)
-        header += [f"{stretch:g} %, p = {pressure:g}", "reference"]
-        columns += [table["fibre_angle"][chosen], reference[f"case_{stretch:g}_{pressure:g}"]]
-    return markdown(header, [[str(k + 1), *(f"{column[k]:.1f}" for column in columns)] for k in range(8)])
+        exact = reference[f"case_{stretch:g}_{pressure:g}"]
+        columns += [(f"{stretch:g} %, p = {pressure:g}", table["fibre_angle"][chosen]), ("reference", exact)]
+    return by_layer(columns)
 
 
 def error_table(folder: Path, name: str, label: str, what: Callable[[dict[str, Any]], str]) -> str:

@@ -13,7 +13,6 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-import basix
 import dolfinx.fem
 import dolfinx.la
 import numpy as np
@@ -22,7 +21,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.domain import Domain, cells_of, corners_of
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import SolveStopped, of_all_ranks, over_ranks, solve_positive
 from remodel_fenicsx.fem.compat import geometry_dofmap
@@ -147,28 +146,15 @@ def facets_of(domain: Domain, names: Sequence[str]) -> Facets:
     return found.astype(np.int32)
 
 
-def cells_of(mesh: Any, facets: Facets) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The element behind each facet of the boundary, and the facet's number in it."""
-    topology = mesh.topology
-    for pair in ((2, 3), (3, 2), (2, 0)):
-        topology.create_connectivity(*pair)
-    to_cells, to_facets = topology.connectivity(2, 3), topology.connectivity(3, 2)
-    cells = np.array([to_cells.links(facet)[0] for facet in facets], dtype=np.int64)
-    local = [np.flatnonzero(to_facets.links(cell) == facet)[0] for cell, facet in zip(cells, facets, strict=True)]
-    return cells, np.array(local, dtype=np.int64)
-
-
 def outward_areas(mesh: Any, facets: Facets) -> Array:
     """Area times outward normal of the facets between their corners, (n, 3); zero for those that another rank owns."""
-    cells, local = cells_of(mesh, facets)
-    corners_of = np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[2])
-    nodes = geometry_dofmap(mesh)[cells]
-    corners = mesh.geometry.x[np.take_along_axis(nodes, corners_of[local], axis=1)]
+    cells, _ = cells_of(mesh, facets)
+    corners = mesh.geometry.x[corners_of(mesh, facets)]
     if corners.shape[1] == 3:
         vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     else:  # the diagonals of a quadrilateral, in dolfinx's order of its corners
         vectors = np.cross(corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]) / 2
-    middles = mesh.geometry.x[nodes].mean(axis=1)
+    middles = mesh.geometry.x[geometry_dofmap(mesh)[cells]].mean(axis=1)
     outwards = np.sign(np.sum(vectors * (corners.mean(axis=1) - middles), axis=1))
     owned = facets < mesh.topology.index_map(2).size_local
     return vectors * (outwards * owned)[:, None]
@@ -268,18 +254,7 @@ def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:
 
 def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None:
     """Give points without axes those of the nearest one that has some. Collective."""
-    comm, wanted = quadrature.mesh.comm, quadrature.coordinates[~known]
-    asked = of_all_ranks(comm, wanted)
     good = quadrature.owned(known)
-    places, candidates = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
-    answers = []
-    for part in asked:
-        if len(candidates):
-            distance, index = spatial.cKDTree(places).query(part)
-            answers.append((distance, candidates[index]))
-        else:
-            answers.append((np.full(len(part), np.inf), np.zeros((len(part), 3, 3))))
-    mine = [answers] if comm.size == 1 else comm.alltoall([[answer] for answer in answers])
-    distances = np.stack([answer[0][0] for answer in mine])
-    choices = np.stack([answer[0][1] for answer in mine])
-    axes[~known] = choices[distances.argmin(axis=0), np.arange(len(wanted))]
+    own = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
+    places, candidates = map(np.concatenate, zip(*of_all_ranks(quadrature.mesh.comm, own), strict=True))
+    axes[~known] = candidates[spatial.cKDTree(places).query(quadrature.coordinates[~known])[1]]

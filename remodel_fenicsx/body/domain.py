@@ -7,7 +7,8 @@ it, are structured meshes without Gmsh.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -85,12 +86,10 @@ class Domain:
     node_number: npt.NDArray[np.int64] = field(init=False)
     number_of_elements: int = field(init=False)
     number_of_nodes: int = field(init=False)
-    _orders: dict[str, _Order] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         topology, geometry = self.mesh.topology, self.mesh.geometry
         settle = object.__setattr__  # the dataclass is frozen: these follow from the mesh
-        settle(self, "_orders", {})
         settle(self, "element_number", np.asarray(topology.original_cell_index, dtype=np.int64))
         settle(self, "node_number", np.asarray(geometry.input_global_indices, dtype=np.int64))
         settle(self, "number_of_elements", int(topology.index_map(topology.dim).size_global))
@@ -129,7 +128,7 @@ class Domain:
         """
         topology = self.mesh.topology
         owned = topology.index_map(topology.dim).size_local
-        return self._gather(np.asarray(values), "elements", self.element_number[:owned])
+        return self._gather(np.asarray(values), self.element_number[:owned])
 
     def scatter_elements(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
         """Give every rank the rows of its elements, ghosts included: the way back of `gather_elements`. Collective.
@@ -167,7 +166,7 @@ class Domain:
             If there are fewer rows than owned nodes.
         """
         owned = self.mesh.geometry.index_map().size_local
-        return self._gather(np.asarray(values), "nodes", self.node_number[:owned])
+        return self._gather(np.asarray(values), self.node_number[:owned])
 
     def gather_mesh(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]] | tuple[None, None]:
         """The whole mesh on rank 0, in input order, the same for every number of ranks. Collective.
@@ -182,44 +181,17 @@ class Domain:
         elements = self.gather_elements(self.node_number[compat.geometry_dofmap(self.mesh)])
         return (None, None) if points is None or elements is None else (points, elements)
 
-    def _gather(self, values: npt.NDArray[Any], kind: str, number: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
-        """Rows as buffers, without pickle; their numbers are sent once only."""
-        short = over_ranks(self.comm, len(values) < len(number), MPI.LOR)
-        if short:
+    def _gather(self, values: npt.NDArray[Any], number: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
+        if over_ranks(self.comm, len(values) < len(number), MPI.LOR):
             raise ValueError(f"{len(values)} rows for {len(number)} owned entities on rank {self.comm.rank}")
-        if kind not in self._orders:
-            self._orders[kind] = _Order.gathered(self.comm, number)
-        order, rows = self._orders[kind], np.ascontiguousarray(values[: len(number)])
-        if self.comm.size == 1:
-            whole = np.empty_like(rows)
-            whole[order.numbers] = rows
-            return whole
-        row_bytes = rows.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
-        row = MPI.BYTE.Create_contiguous(row_bytes).Commit()  # counts of bytes would overflow
-        by_rank = np.empty((sum(order.counts), *rows.shape[1:]), rows.dtype)
-        self.comm.Gatherv([rows, len(rows), row], [by_rank, order.counts, row] if self.comm.rank == 0 else None, root=0)
-        row.Free()
-        if self.comm.rank != 0:
+        own = number, values[: len(number)]
+        parts = [own] if self.comm.size == 1 else self.comm.gather(own, root=0)
+        if parts is None:
             return None
-        whole = np.empty_like(by_rank)
-        whole[order.numbers] = by_rank
+        whole = np.empty((sum(len(one) for one, _ in parts), *values.shape[1:]), values.dtype)
+        for numbers, rows in parts:
+            whole[numbers] = rows
         return whole
-
-
-@dataclass(frozen=True)
-class _Order:
-    """On rank 0: the numbers of what all ranks own, rank after rank, and how many each has; elsewhere nothing."""
-
-    numbers: npt.NDArray[np.int64]
-    counts: list[int]
-
-    @classmethod
-    def gathered(cls, comm: MPI.Intracomm, number: npt.NDArray[np.int64]) -> _Order:
-        counts = comm.gather(len(number)) or []
-        numbers = np.empty(sum(counts), dtype=np.int64)
-        target = [numbers, counts, MPI.INT64_T] if comm.rank == 0 else None
-        comm.Gatherv([np.ascontiguousarray(number), len(number), MPI.INT64_T], target)
-        return cls(numbers, counts)
 
 
 class SymbolicMesh(ufl.Mesh):
@@ -244,28 +216,24 @@ def build_domain(
     comm = comm or MPI.COMM_WORLD
     # with several threads Scotch parts the same mesh differently from run to run
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
-    if comm.rank != 0:
-        verdict, groups = comm.bcast(None, root=0)
-        if verdict:
-            raise GeometryError(verdict)
-        return _domain_from_gmsh(None, comm, groups, shape, dimensions)
-    # the verdict goes out exactly once, whether Gmsh is missing, fails or is interrupted: nobody waits for ever
-    told = False
-    try:
-        with gmsh_model(shape) as gmsh:
-            draw()
-            groups = named_groups()
-            told = True
-            comm.bcast(("", groups), root=0)
-            return _domain_from_gmsh(gmsh.model, comm, groups, shape, dimensions)
-    except BaseException as error:
-        if told:
-            raise
-        verdict = f"Gmsh could not mesh the {shape}: {str(error) or type(error).__name__}"
-        comm.bcast((verdict, None), root=0)
-        if not isinstance(error, Exception):  # Ctrl-C on rank 0 stays what it is there
-            raise
-        raise GeometryError(verdict) from error
+    with ExitStack() as stack:
+        model: Any = None
+        groups: NamedGroups | None = None
+        failure: BaseException | None = None
+        if comm.rank == 0:
+            try:
+                model = stack.enter_context(gmsh_model(shape)).model
+                draw()
+                groups = named_groups()
+            except BaseException as error:  # whatever it is, nobody waits for ever
+                failure = error
+        verdict = failure and f"Gmsh could not mesh the {shape}: {str(failure) or type(failure).__name__}"
+        verdict, groups = comm.bcast((verdict, groups), root=0)
+        if failure is not None and not isinstance(failure, Exception):  # Ctrl-C on rank 0 stays what it is there
+            raise failure
+        if groups is None:
+            raise GeometryError(verdict) from failure
+        return _domain_from_gmsh(model, comm, groups, shape, dimensions)
 
 
 def _domain_from_gmsh(
@@ -319,90 +287,58 @@ def share_mesh(
 
 def _tags_of_facets(mesh: Any, corners: npt.NDArray[np.int64], values: npt.NDArray[np.int64]) -> Any:
     """Tags of the facets of the boundary with these corners, as rank 0 numbered them, each row ascending."""
-    topology, geometry = mesh.topology, mesh.geometry
-    dimension = topology.dim
-    topology.create_connectivity(dimension - 1, dimension)
-    topology.create_connectivity(dimension, dimension - 1)
-    facets = dolfinx.mesh.exterior_facet_indices(topology)
-    to_cells = topology.connectivity(dimension - 1, dimension)
-    to_facets = topology.connectivity(dimension, dimension - 1)
-    cells = to_cells.array[to_cells.offsets[facets]]
-    of_cell = to_facets.array.reshape(-1, len(to_facets.links(0)) if len(cells) else 1)
-    local = np.argmax(of_cell[cells] == facets[:, None], axis=1) if len(cells) else cells
-    corners_of = np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[dimension - 1])
-    nodes = np.take_along_axis(compat.geometry_dofmap(mesh)[cells], corners_of[local], axis=1)
+    dimension = mesh.topology.dim - 1
+    mesh.topology.create_connectivity(dimension, dimension + 1)
+    facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology)).astype(np.int32)
     listed: Any = corners.tolist()
     wanted = dict(zip(map(tuple, listed), values.astype(int), strict=True))
-    own = np.sort(np.asarray(geometry.input_global_indices, dtype=np.int64)[nodes], axis=1)
-    rows: Any = own.tolist()
+    nodes = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[corners_of(mesh, facets)]
+    rows: Any = np.sort(nodes, axis=1).tolist()
     found = np.array([wanted.get(tuple(row), 0) for row in rows], dtype=np.int32)
-    order = np.argsort(facets)
-    order = order[found[order] > 0]
-    return dolfinx.mesh.meshtags(mesh, dimension - 1, facets[order].astype(np.int32), found[order])
+    return dolfinx.mesh.meshtags(mesh, dimension, facets[found > 0], found[found > 0])
+
+
+def cells_of(mesh: Any, facets: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The element behind each facet of the boundary, and the facet's number in it."""
+    topology, dimension = mesh.topology, mesh.topology.dim
+    for pair in ((dimension - 1, dimension), (dimension, dimension - 1), (dimension - 1, 0)):
+        topology.create_connectivity(*pair)
+    to_cells, to_facets = topology.connectivity(dimension - 1, dimension), topology.connectivity(
+        dimension, dimension - 1
+    )
+    cells = to_cells.array[to_cells.offsets[facets]].astype(np.int64)
+    of_cells = to_facets.array.reshape(-1, len(_corners_of_facets(mesh)))
+    return cells, np.argmax(of_cells[cells] == facets[:, None], axis=1)
+
+
+def corners_of(mesh: Any, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+    """Local nodes at the corners of facets of the boundary, in dolfinx's order, (facets, corners of one)."""
+    cells, local = cells_of(mesh, facets)
+    return np.take_along_axis(compat.geometry_dofmap(mesh)[cells], _corners_of_facets(mesh)[local], axis=1)
+
+
+def _corners_of_facets(mesh: Any) -> npt.NDArray[np.int64]:
+    """Of an element, (facets, corners of one)."""
+    return np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[mesh.topology.dim - 1])
 
 
 # ---------------------------------------------------------------- structured, without Gmsh
 
-
-def interval_domain(
-    start: tuple[float, float, float],
-    end: tuple[float, float, float],
-    shares: Array,
-    degree: int,
-    faces: Mapping[str, Marker],
-    shape: str,
-    dimensions: dict[str, float],
-    comm: MPI.Intracomm | None = None,
-) -> Domain:
-    """Elements on a straight line. Collective."""
-    points = (1.0 - shares[:, None]) * np.array(start) + shares[:, None] * np.array(end)
-    elements = (len(shares) - 1) // degree
-    return _domain_from_lattice("interval", degree, points, _lines(elements, degree), faces, shape, dimensions, comm)
-
-
-def half_plane_domain(
-    radii: Array,
-    length: float,
-    layers: int,
-    degree: int,
-    faces: Mapping[str, Marker],
-    shape: str,
-    dimensions: dict[str, float],
-    comm: MPI.Intracomm | None = None,
-) -> Domain:
-    """Quadrilaterals on a rectangle of the half-plane y = 0, x > 0. Collective."""
-    across, along = len(radii), degree * layers + 1
-    z = np.linspace(0.0, length, along)
-    points = np.stack([np.tile(radii, along), np.zeros(across * along), np.repeat(z, across)], axis=1)
-    elements = (across - 1) // degree, layers
-    first, second = (_lines(number, degree, in_order=True) for number in elements)
-    # dolfinx's order on a quadrilateral of any degree: corners, then edges and inside, from the two lines
-    nodes = second[:, None, :, None] * across + first[None, :, None, :]
-    quadrilaterals = nodes.reshape(elements[0] * elements[1], -1)[:, _QUADRILATERAL[degree]]
-    return _domain_from_lattice("quadrilateral", degree, points, quadrilaterals, faces, shape, dimensions, comm)
-
-
-# places (second line, first line) of a quadrilateral's nodes in the order of basix; a line's own order is ascending
+# places (second direction, first one) of a quadrilateral's nodes in the order of basix: corners, edges, inside
 _QUADRILATERAL = {1: [0, 1, 2, 3], 2: [0, 2, 6, 8, 1, 3, 5, 7, 4]}
 
 
-def _lines(elements: int, degree: int, in_order: bool = False) -> npt.NDArray[np.int64]:
-    """Nodes of each element of a line, ends first unless they are wanted in order; (elements, degree + 1)."""
-    nodes = degree * np.arange(elements)[:, None] + np.arange(degree + 1)
-    return nodes if in_order else nodes[:, [0, degree, *range(1, degree)]]
-
-
-def _domain_from_lattice(
-    kind: str,
-    degree: int,
-    points: Array,
-    elements: npt.NDArray[np.int64],
-    faces: Mapping[str, Marker],
-    shape: str,
-    dimensions: dict[str, float],
-    comm: MPI.Intracomm | None,
-) -> Domain:
+def lattice_domain(
+    points: Array, counts: Sequence[int], degree: int, faces: Mapping[str, Marker], shape: str,
+    dimensions: dict[str, float], comm: MPI.Intracomm | None = None,
+) -> Domain:  # fmt: skip
+    """So many lines, or quadrilaterals along two directions, between nodes in rows of the first one. Collective."""
     comm = comm or MPI.COMM_WORLD
+    first, *second = (degree * np.arange(count)[:, None] + np.arange(degree + 1) for count in counts)
+    kind, elements = "interval", first[:, [0, degree, *range(1, degree)]]
+    if second:
+        nodes = second[0][:, None, :, None] * (degree * counts[0] + 1) + first[None, :, None, :]
+        kind, elements = "quadrilateral", nodes.reshape(counts[0] * counts[1], -1)[:, _QUADRILATERAL[degree]]
     here = slice(None) if comm.rank == 0 else slice(0)
     geometry = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
     mesh: Any = dolfinx.mesh.create_mesh(comm, cells=elements[here], x=points[here], e=geometry)

@@ -16,7 +16,7 @@ from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
 from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
 from remodel_fenicsx.system.files import read_regular
-from remodel_fenicsx.system.guarded import LARGEST_FILE, UnreadableFile
+from remodel_fenicsx.system.children import LARGEST_FILE, UnreadableFile
 
 Array = NDArray[np.float64]
 

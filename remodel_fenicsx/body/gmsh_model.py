@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -138,9 +139,10 @@ def line(start: Point, stop: Point, elements: int = 1) -> list[int]:
     return curves
 
 
-def polygon(corners: Sequence[Point]) -> list[int]:
-    """Closed chain of straight curves of one element each; curve i starts at corner i."""
-    return [line(start, stop)[0] for start, stop in zip(corners, [*corners[1:], corners[0]], strict=True)]
+def polygon(corners: Sequence[Point], is_closed: bool = True) -> list[int]:
+    """Chain of straight curves of one element each; curve i starts at corner i."""
+    chain = [*corners, corners[0]] if is_closed else corners
+    return [line(start, stop)[0] for start, stop in itertools.pairwise(chain)]
 
 
 def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], element: str) -> int:
@@ -159,18 +161,14 @@ def reverse(curves: Sequence[int]) -> list[int]:
 
 
 def ring(
-    inner: Sequence[Point],
-    outer: Sequence[Point],
-    inner_lines: Sequence[int],
-    outer_lines: Sequence[int],
-    spokes: Sequence[Sequence[int]],
-    element: str,
-) -> list[int]:
-    """Blocks between two closed polygons, from each of the spokes to the next."""
-    number, found = len(inner), []
-    part = number // len(spokes)
-    for i, k in enumerate(range(0, number, part)):
-        m, next_spoke = (k + part) % number, spokes[(i + 1) % len(spokes)]
+    inner: Sequence[Point], outer: Sequence[Point], inner_lines: Sequence[int], outer_lines: Sequence[int],
+    spokes: Sequence[Sequence[int]], element: str,
+) -> list[int]:  # fmt: skip
+    """Blocks between two polygons, closed ones or not, from each of the spokes to the next."""
+    blocks = len(spokes) - (len(inner) - len(inner_lines))
+    part, found = len(inner_lines) // blocks, []
+    for i in range(blocks):
+        k, m, next_spoke = i * part, (i + 1) * part % len(inner), spokes[(i + 1) % len(spokes)]
         edges = [spokes[i], outer_lines[k : k + part], reverse(next_spoke), reverse(inner_lines[k : k + part])]
         found.append(block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
     return found

@@ -27,7 +27,6 @@ from remodel_fenicsx.body.mesh_faces import (
     through_the_wall,
 )
 from remodel_fenicsx.body.mesh_file import (
-    BY_NUMBER,
     ENDINGS,
     TAGS,
     Block,
@@ -52,7 +51,6 @@ log = logging.getLogger(__name__)
 
 HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that leave a face no motion along its normal
 ROLES = ("inner", "outer", "inlet", "outlet")
-MESH_ENDINGS = (".msh", *ENDINGS)
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 Names = tuple[str | int, ...]
 _ENTRY: JsonDict = {"type": ["string", "integer"]}
@@ -76,12 +74,12 @@ def _faces(value: Any) -> Any:
 
 
 def _is_mesh(value: Any) -> TypeGuard[str]:
-    return isinstance(value, str) and "\x00" not in value and Path(value).suffix.lower() in MESH_ENDINGS
+    return isinstance(value, str) and "\x00" not in value and Path(value).suffix.lower() in ENDINGS
 
 
 def _file(value: Any) -> Any:
     if not _is_mesh(value):
-        raise fault(f"must be the path of a mesh ({', '.join(MESH_ENDINGS)}), relative to the scene's folder")
+        raise fault(f"must be the path of a mesh ({', '.join(ENDINGS)}), relative to the scene's folder")
     return value
 
 
@@ -413,7 +411,11 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
 
 # ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh
-GMSH_TYPES = {("tetrahedron", 1): (4, 2), ("hexahedron", 1): (5, 3)}  # of elements and facets
+# Gmsh's number of elements and facets of degree 1; meshio's names of those of degree 1 and 2
+SPLIT: dict[str, dict[int, tuple[Any, ...]]] = {
+    "tetrahedron": {3: (4, "tetra", "tetra10"), 2: (2, "triangle", "triangle6")},
+    "hexahedron": {3: (5, "hexahedron", "hexahedron27"), 2: (3, "quad", "quad9")},
+}
 
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
@@ -422,31 +424,31 @@ def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
         return file
     if file.degree != 1:
         raise MeshFileError(f"has elements of degree {file.degree}: they are taken as they are")
-    solid, flat = GMSH_TYPES[file.kind, 1]
     with gmsh_model("file") as gmsh:
-        numbers = {3: distinct(file.cell_groups), 2: distinct(file.facet_groups)}
-        entities = {d: {n: gmsh.model.addDiscreteEntity(d) for n in found} for d, found in numbers.items()}
+        mesh, parts = gmsh.model.mesh, {3: (file.cells, file.cell_groups), 2: (file.facets, file.facet_groups)}
+        entities = {
+            d: {n: gmsh.model.addDiscreteEntity(d) for n in distinct(groups)} for d, (_, groups) in parts.items()
+        }
         first = next(iter(entities[3].values()))
-        gmsh.model.mesh.addNodes(3, first, np.arange(1, len(file.points) + 1), file.points.reshape(-1))
-        parts = {3: (solid, file.cells, file.cell_groups), 2: (flat, file.facets, file.facet_groups)}
-        for dimension, (kind, rows, groups) in parts.items():
+        mesh.addNodes(3, first, np.arange(1, len(file.points) + 1), file.points.reshape(-1))
+        for dimension, (rows, groups) in parts.items():
             for number, entity in entities[dimension].items():
-                gmsh.model.mesh.addElementsByType(entity, kind, [], 1 + rows[groups == number].reshape(-1))
+                nodes = 1 + rows[groups == number].reshape(-1)
+                mesh.addElementsByType(entity, SPLIT[file.kind][dimension][0], [], nodes)
         for _ in range(refinement.bit_length() - 1):
-            gmsh.model.mesh.refine()
+            mesh.refine()
         if degree == 2:
             before = gmsh.option.getNumber("Mesh.SecondOrderLinear")
             gmsh.option.setNumber("Mesh.SecondOrderLinear", 1)
-            gmsh.model.mesh.setOrder(2)
+            mesh.setOrder(2)
             gmsh.option.setNumber("Mesh.SecondOrderLinear", before)
-        tags, places, _ = gmsh.model.mesh.getNodes()
+        tags, places, _ = mesh.getNodes()
+        order = np.argsort(tags)
         blocks = []
         for dimension, by_number in entities.items():
             for number, entity in by_number.items():
-                for kind, elements, nodes in zip(*gmsh.model.mesh.getElements(dimension, entity), strict=True):
-                    rows = np.asarray(nodes, dtype=np.int64).reshape(len(elements), -1)
-                    groups = np.full(len(elements), number, dtype=np.int64)
-                    blocks.append(Block(BY_NUMBER[int(kind)], np.asarray(elements), groups, rows))
-    order = np.argsort(tags)
+                for elements, nodes in zip(*mesh.getElements(dimension, entity)[1:], strict=True):
+                    rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(elements), -1)
+                    blocks.append(Block(SPLIT[file.kind][dimension][degree], np.full(len(elements), number), rows))
     points = np.asarray(places, dtype=np.float64).reshape(-1, 3)[order]
-    return assembled(np.asarray(tags, dtype=np.int64)[order], points, blocks, file.names, file.data)
+    return assembled(points, blocks, file.names, file.data)

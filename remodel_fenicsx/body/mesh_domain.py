@@ -12,21 +12,21 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.axes import cells_of, facets_of
-from remodel_fenicsx.body.domain import Domain, MeshArrays, share_mesh
+from remodel_fenicsx.body.axes import facets_of
+from remodel_fenicsx.body.domain import Domain, MeshArrays, cells_of, share_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, VOLUMES
+from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import over_ranks, solve_positive
+from remodel_fenicsx.fem.assembly import agreed, over_ranks, solve_positive
 from remodel_fenicsx.fem.kinematics import lagrange
-from remodel_fenicsx.schema.tables import SceneError
 
 
 # ---------------------------------------------------------------- a mesh as the text of a Gmsh file, format 2.2
 # What `mesh_file` reads.
 
-TYPE_OF = {kind: number for number, kind in VOLUMES.items()}
-FACET_OF = {3: 2, 4: 3}  # corners -> Gmsh's number of the type; facets are written by their corners
+# Gmsh's numbers of the types of elements and of facets, which are written by their corners
+TYPE_OF = {("tetrahedron", 1): 4, ("hexahedron", 1): 5, ("tetrahedron", 2): 11, ("hexahedron", 2): 12}
+FACET_OF = {3: 2, 4: 3}
 
 
 def gmsh_text(file: MeshFile) -> str:
@@ -107,18 +107,7 @@ class MeshDomain(Domain):
 
 def shared(read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm) -> MeshDomain:
     """What rank 0 reads, on all ranks. Collective."""
-    verdict, found = "", None
-    if comm.rank == 0:
-        try:
-            found = read()
-        except SceneError as error:
-            verdict = str(error)
-        except BaseException:
-            comm.bcast("rank 0 could not read the mesh")
-            raise
-    verdict = comm.bcast(verdict)
-    if verdict:
-        raise SceneError(verdict)
+    found = agreed(comm, lambda: read() if comm.rank == 0 else None)
     arrays = None if found is None else _arrays(*found)
     extent = comm.bcast(arrays and float(np.ptp(arrays.points, axis=0).max()))
     domain = share_mesh(arrays, "mesh", {"extent": extent}, comm)

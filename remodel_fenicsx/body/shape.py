@@ -929,14 +929,14 @@ def homogeneous_bar(
     """The reduction "point" of a body between two faces across z, the same strain everywhere."""
 
     def build(scene: Any, comm: Any = None) -> Domain:
-        from remodel_fenicsx.body.domain import interval_domain
+        from remodel_fenicsx.body.domain import lattice_domain
 
         shape, length = scene.geometry, scene.geometry.axial_length
         faces = {bottom: lambda x: np.isclose(x[2], 0.0), top: lambda x: np.isclose(x[2], length)}
-        ends = (length, 0.0, 0.0), (length, 0.0, length)
         degree: int = scene.mesh.degree
-        shares = np.linspace(0.0, 1.0, degree + 1, dtype=np.float64)
-        return interval_domain(*ends, shares, degree, faces, shape.name, dimensions(shape), comm)
+        share = np.linspace(0.0, 1.0, degree + 1)[:, None]
+        points = (1.0 - share) * np.array([length, 0.0, 0.0]) + share * np.array([length, 0.0, length])
+        return lattice_domain(points, [1], degree, faces, shape.name, dimensions(shape), comm)
 
     rules = (same_cells, symmetric_law, homogeneous, known_loads("point"))
     return Reduction(build, lambda scene: 1, rules, unturned, lambda shape, points, corners: whole(shape))

@@ -6,6 +6,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -66,38 +67,37 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 
 def build_ray(scene: Any, comm: Any = None) -> Domain:
     """The wall on the x axis, as many elements as the body has through it."""
-    from remodel_fenicsx.body.domain import interval_domain
-
-    shape, faces = scene.geometry, _faces(scene.geometry, "inner", "outer")
-    ends = (shape.inner_radius, 0.0, 0.0), (shape.outer_radius, 0.0, 0.0)
-    wall, degree = _wall(shape, _counts(scene.mesh)[1], scene.regions), scene.mesh.degree
-    return wall.marked(interval_domain(*ends, wall.shares(degree), degree, faces, shape.name, _dimensions(shape), comm))
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:2], ("inner", "outer"))
 
 
 def build_half_plane(scene: Any, comm: Any = None) -> Domain:
     """The wall in the half-plane y = 0, x > 0, with the body's elements through the wall and along."""
-    from remodel_fenicsx.body.domain import half_plane_domain
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:], ("bottom", "top", "inner", "outer"))
 
-    shape, faces = scene.geometry, _faces(scene.geometry, "bottom", "top", "inner", "outer")
-    _, through, along = _counts(scene.mesh)
-    wall, degree = _wall(shape, through, scene.regions), scene.mesh.degree
-    return wall.marked(
-        half_plane_domain(wall.nodes(degree), shape.length, along, degree, faces, shape.name, _dimensions(shape), comm)
-    )
+
+def _in_half_plane(scene: Any, comm: Any, counts: tuple[int, ...], names: tuple[str, ...]) -> Domain:
+    from remodel_fenicsx.body.domain import lattice_domain
+
+    shape, degree = scene.geometry, scene.mesh.degree
+    wall = _wall(shape, counts[0], scene.regions)
+    along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [np.zeros(1)]
+    z, radii = np.meshgrid(*along, wall.nodes(degree), indexing="ij")
+    points = np.stack([radii.ravel(), np.zeros(radii.size), z.ravel()], axis=1)
+    places = {
+        "bottom": lambda x: np.isclose(x[2], 0.0, atol=1e-9 * shape.length),
+        "top": lambda x: np.isclose(x[2], shape.length),
+        "inner": lambda x: np.isclose(x[0], shape.inner_radius),
+        "outer": lambda x: np.isclose(x[0], shape.outer_radius),
+    }
+    faces = {name: places[name] for name in names}
+    return wall.marked(lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm))
 
 
 def build_quarter(scene: Any, comm: Any = None) -> Domain:
     """The body's elements with x > 0 and y > 0; one layer along z where all sections are alike."""
-    from remodel_fenicsx.body.domain import build_domain
-
-    shape, mesh = scene.geometry, scene.mesh
-    around, through, _ = _counts(mesh)
-    wall = _wall(shape, through, scene.regions)
-
-    def draw() -> None:
-        draw_quarter(wall, shape.length, (around, layers(scene)), mesh.element, mesh.degree)
-
-    return wall.marked(build_domain(draw, shape.name, _dimensions(shape), comm))
+    mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
+    counts = around, through, layers(scene)
+    return whole_tube(scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1)
 
 
 def layers(scene: Any) -> int:
@@ -106,39 +106,11 @@ def layers(scene: Any) -> int:
     return 1 if alike else PAPER[2] * scene.mesh.refinement
 
 
-def draw_quarter(wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int) -> None:
-    """Draw and mesh a quarter in the current Gmsh model; elements of the whole tube around, and along."""
-    number, along = counts
-    quarter = number // 4
-    faces = wall.radii[0], wall.radii[-1]
-    inner, outer = (model.points(model.circle(radius, number)[: quarter + 1]) for radius in faces)
-    inner_line, outer_line = (
-        [curve for pair in zip(arc[:-1], arc[1:], strict=True) for curve in model.line(*pair)] for arc in (inner, outer)
-    )
-    first, last = (_spoke(wall, number, k, inner[k], outer[k]) for k in (0, quarter))
-    edges = [first, outer_line, model.reverse(last), model.reverse(inner_line)]
-    section = model.block(edges, [inner[0], outer[0], outer[quarter], inner[quarter]], element)
-    sides = {"inner": inner_line, "outer": outer_line, "plane_y": first, "plane_x": last}
-    model.extrude([section], length, along, element, sides)
-    model.raise_degree(degree, np.ones_like)
-
-
 def _spoke(wall: Wall, number: int, corner: int, start: model.Point, stop: model.Point) -> list[int]:
     """Chain of curves through the wall between the corners of the same number on its two faces."""
     inside = [model.points(model.circle(radius, number)[[corner]])[0] for radius in wall.radii[1:-1]]
     pairs = itertools.pairwise([start, *inside, stop])
     return [curve for pair, count in zip(pairs, wall.counts, strict=True) for curve in model.line(*pair, count)]
-
-
-def _faces(shape: Any, *names: str) -> dict[str, Any]:
-    """Where the faces of a tube are in a half-plane."""
-    places = {
-        "bottom": lambda x: np.isclose(x[2], 0.0, atol=1e-9 * shape.length),
-        "top": lambda x: np.isclose(x[2], shape.length),
-        "inner": lambda x: np.isclose(x[0], shape.inner_radius),
-        "outer": lambda x: np.isclose(x[0], shape.outer_radius),
-    }
-    return {name: places[name] for name in names}
 
 
 def _counts(mesh: Mesh) -> tuple[int, int, int]:
@@ -253,12 +225,9 @@ def _elongation(m: Any) -> float:
     return float(m.step.loads.get("elongation", 0.0)) if strain is None else float(strain(m.state.unknown))
 
 
-def _axial_force(m: Any) -> float:
-    return float(m.end_force("inner").of_the_wall(m.state.loading.values.get("pressure", 0.0)))
-
-
-def _reduced_axial_force(m: Any) -> float:
-    return float(m.end_force("inner").reduced(m.state.loading.values.get("pressure", 0.0)))
+def _of_the_end(name: str, m: Any) -> float:
+    """`of_the_wall` or `reduced` of an `EndForce`."""
+    return float(getattr(m.end_force("inner"), name)(m.state.loading.values.get("pressure", 0.0)))
 
 
 def _opening_angle(m: Any) -> float:
@@ -337,7 +306,7 @@ class Tube(RoundWall):
             FORCE,
             reductions=("radial", "axisymmetric", "sector"),
             frees_length=True,
-            value=_axial_force,
+            value=partial(_of_the_end, "of_the_wall"),
             area=lambda shape: shape.section_area,
         ),
     }
@@ -355,7 +324,7 @@ class Tube(RoundWall):
             "reduced_axial_force",
             "force",
             "what a testing machine measures: `axial_force` less the pressure on the lumen at that end, p pi r_i^2",
-            _reduced_axial_force,
+            partial(_of_the_end, "reduced"),
         ),
         Column(
             "opening_angle",
@@ -507,13 +476,9 @@ class Tube(RoundWall):
 
 
 def whole_tube(
-    shape: Tube,
-    counts: tuple[int, int, int],
-    element: str,
-    degree: int,
-    comm: MPI.Intracomm | None = None,
-    regions: Mapping[str, Region] | None = None,
-) -> Domain:
+    shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None,
+    regions: Mapping[str, Region] | None = None, quarters: int = 4,
+) -> Domain:  # fmt: skip
     """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective."""
     # The nodes lie exactly on the radii, equally spaced through each layer; some are on the positive and negative x and
     # y axes. Elements of degree 1 have plane faces: their inner and outer faces are regular prisms inside the
@@ -524,19 +489,21 @@ def whole_tube(
     wall = _wall(shape, through, regions or {})
 
     def draw() -> None:
-        draw_tube(wall, shape.length, (around, along), element, degree)
+        draw_tube(wall, shape.length, (around, along), element, degree, quarters)
 
     return wall.marked(build_domain(draw, shape.name, _dimensions(shape), comm))
 
 
-def draw_tube(wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int) -> None:
-    """Draw and mesh the tube in the current Gmsh model: four quarters, swept along z; elements around and along."""
+def draw_tube(wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int, quarters: int = 4) -> None:
+    """Draw and mesh quarters of the tube in the current Gmsh model, swept along z; elements around all and along."""
     number, along = counts
-    quarter = number // 4
-    inner, outer = (model.points(model.circle(radius, number)) for radius in (wall.radii[0], wall.radii[-1]))
-    inner_lines, outer_lines = model.polygon(inner), model.polygon(outer)
-    corners = range(0, number, quarter)
-    spokes = [_spoke(wall, number, k, inner[k], outer[k]) for k in corners]
+    quarter, is_whole = number // 4, quarters == 4
+    nodes = quarters * quarter + (not is_whole)
+    inner, outer = (model.points(model.circle(radius, number)[:nodes]) for radius in (wall.radii[0], wall.radii[-1]))
+    inner_lines, outer_lines = (model.polygon(nodes, is_whole) for nodes in (inner, outer))
+    spokes = [_spoke(wall, number, k, inner[k], outer[k]) for k in range(0, nodes, quarter)]
     section = model.ring(inner, outer, inner_lines, outer_lines, spokes, element)
-    model.extrude(section, length, along, element, {"inner": inner_lines, "outer": outer_lines})
+    sides = {"inner": inner_lines, "outer": outer_lines}
+    sides |= {} if is_whole else {"plane_y": spokes[0], "plane_x": spokes[-1]}
+    model.extrude(section, length, along, element, sides)
     model.raise_degree(degree, np.ones_like)

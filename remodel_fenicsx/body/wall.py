@@ -50,12 +50,6 @@ class Wall(NamedTuple):
         """Radii of the nodes of elements of this degree, equally spaced within a layer."""
         return lattice(self.radii, self.counts, degree)
 
-    def shares(self, degree: int) -> Array:
-        """The same as shares of the way through the wall, from 0 to 1."""
-        inner, outer = self.radii[0], self.radii[-1]
-        inside = [(radius - inner) / (outer - inner) for radius in self.radii[1:-1]]
-        return lattice([0.0, *inside, 1.0], self.counts, degree)
-
     def marked(self, domain: Domain) -> Domain:
         """The domain with its layers as regions: an element is where the middle of its radii is."""
         from remodel_fenicsx.fem import compat
@@ -175,7 +169,8 @@ def _angle_at(face: str) -> AngleOf:
     """Mean angle over the elements that have a facet on a face."""
 
     def elements(m: Any) -> NDArray[np.bool_]:
-        from remodel_fenicsx.body.axes import cells_of, facets_of
+        from remodel_fenicsx.body.axes import facets_of
+        from remodel_fenicsx.body.domain import cells_of
 
         found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
         found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from numbers import Real
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import dolfinx.fem
 import dolfinx.fem.petsc
@@ -96,6 +96,19 @@ def over_ranks(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
 def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:
     """The values of all ranks, on all ranks. Collective."""
     return [value] if comm.size == 1 else comm.allgather(value)
+
+
+def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
+    """What `make` makes on every rank; what one of them refuses with a ValueError is refused on all. Collective."""
+    made = refusal = None
+    try:
+        made = make()
+    except ValueError as error:
+        refusal = error
+    refusal = next(filter(None, comm.allgather(refusal)), None)
+    if refusal is not None:
+        raise refusal
+    return cast(T, made)
 
 
 # ---------------------------------------------------------------- parameters of kernels

@@ -56,8 +56,8 @@ class TensorKernels:
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
         """`energy.log_sum`."""
-        result = np.empty(len(F))
-        self.call("log_sum", len(F), F, whole_structure_tensor(cells), result)
+        result = np.empty(F.shape[:-2])
+        self.call("log_sum", result.size, F, whole_structure_tensor(cells), result)
         return result
 
     def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,16 +38,16 @@ class Panels:
         self._weights: Array = areas @ self._coefficients
 
     def derivative(self, values: Array) -> Array:
-        """By the radius, of values (panels, points)."""
+        """By the radius, of values (..., panels, points)."""
         return values @ self._slope.T / self._half
 
-    def integral(self, values: Array) -> float:
-        """Over all panels."""
-        return float(np.sum(values * self._weights * self._half))
+    def integral(self, values: Array) -> Array:
+        """Over all panels, of values (..., panels, points)."""
+        return np.asarray(np.sum(values * self._weights * self._half, axis=(-2, -1)))
 
     def jumps(self, values: Array) -> Array:
-        """From one panel to the next, (panels - 1,)."""
-        return values[1:, 0] - values[:-1, -1]
+        """From one panel to the next, (..., panels - 1)."""
+        return values[..., 1:, 0] - values[..., :-1, -1]
 
     def of(self, radius: Array) -> NDArray[np.intp]:
         """Number of the panel of each radius (...,); what is outside belongs to the nearest."""
@@ -82,10 +81,8 @@ MOST_POLYNOMIALS = 8  # of one layer
 LARGEST_TURN = 0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too; half of it
 ITERATIONS = 30
 CLOSED = 1e-9  # of the residual over lambda + 2 mu; the differences of the energy are good to about 1e-11
-# of a value, for the tangent: rho(R) has slopes of some 1000 times it near the faces, and bending of a thin wall is so
-# soft that with 1e-6 the error of the tangent is a tenth of it: 30 iterations in place of 20
-VALUE_DIFFERENCE = 1e-7
-STRETCH_DIFFERENCE = 1e-3  # of a stretch in the five-point rule: its error is of fourth order
+STRETCH_DIFFERENCE = 1e-3  # of a logarithm in the five-point rules: their error is of fourth order
+COMPLEX_STEP = 1e-30
 UNSTRETCHED = (1.0, 1.0, 1.0)
 
 
@@ -112,7 +109,7 @@ class Closing(NamedTuple):
     panels: Panels
     radius: Array
     circumferential: float
-    axial: float
+    axial: Any
 
     def natural_radius(self, radius: Array) -> Array:
         """R at r, both (...,)."""
@@ -132,7 +129,7 @@ class Closing(NamedTuple):
     def _joined(self, radius: Array, natural: Array, slope: Array) -> Array:
         """G without the prestretch."""
         hoop = self.circumferential * radius / natural
-        return np.stack([hoop, np.full_like(radius, self.axial), 1.0 / slope], axis=-1)
+        return np.stack(np.broadcast_arrays(hoop, self.axial, 1.0 / slope), axis=-1)
 
 
 def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads()) -> Closing:
@@ -166,74 +163,100 @@ def _halves(layer: Layer) -> list[Layer]:
 
 
 def _balanced(near: Closing, loads: Loads) -> Closing:
-    """The equilibrium that is near."""
-    stiffness = max(layer.tissue.lame_lambda + 2 * layer.tissue.lame_mu for layer in near.layers)
-    scale: Array = np.append(np.full(near.radius.size, near.panels.edges[-1]), 1.0)
-    residual = partial(_residual, near.layers, near.panels, near.circumferential, loads)
-    values = solved(residual, np.append(near.radius, near.axial), scale, stiffness)
-    return near._replace(radius=values[:-1].reshape(near.radius.shape), axial=float(values[-1]))
+    """The equilibrium that is near: forces on both faces, and along."""
+    panels, tissues = near.panels, [layer.tissue for layer in near.layers]
+    stiffness, edges = _stiffness(tissues), panels.edges
+
+    def stretches(values: Array) -> Array:
+        radius = values[..., :-1].reshape(*values.shape[:-1], *near.radius.shape)
+        return near._replace(radius=radius, axial=values[..., -1:, None]).at_panels()
+
+    def residual(values: Array, stresses: Array) -> Array:
+        through = _through(panels, values[..., :-1], stresses, panels.places, loads.pressure / stiffness)
+        force = 2 * np.pi * panels.integral(stresses[..., 1] * panels.places)
+        if loads.force is None:
+            along = values[..., -1] - loads.axial
+        else:
+            along = (force - loads.force / stiffness) / (np.pi * (edges[-1] ** 2 - edges[0] ** 2))
+        return np.concatenate([through, along[..., None]], axis=-1)
+
+    found = solved(tissues, [None] * len(tissues), stretches, residual, np.append(near.radius, near.axial))
+    return near._replace(radius=found[:-1].reshape(near.radius.shape), axial=float(found[-1]))
 
 
-def solved(function: Callable[[Array], Array], values: Array, scale: Array, stiffness: float) -> Array:
-    """Newton with differences, halved where a step leaves what has an energy."""
+def _stiffness(tissues: Sequence[Tissue]) -> float:
+    return max(tissue.lame_lambda + 2 * tissue.lame_mu for tissue in tissues)
 
-    def residual(trial: Array) -> Array:
-        with np.errstate(all="ignore"):
-            return np.asarray(function(trial) / stiffness, dtype=np.float64)
 
-    present = residual(values)
+def _through(
+    panels: Panels, unknown: Array, stresses: Array, place: Array, pressure: float = 0.0, slope: Array | float = 1.0
+) -> Array:
+    """Radial balance in the layers, radial stress on both faces, and what goes from one layer to the next."""
+    hoop, _, radial = np.moveaxis(stresses, -1, 0)
+    balance = panels.derivative(radial) + (radial - hoop) * slope / place
+    inside = balance[..., 1:-1] * (panels.edges[-1] - panels.edges[0]) / 2
+    faces = np.stack([radial[..., 0, 0] + pressure, radial[..., -1, -1]], axis=-1)
+    between = panels.jumps(unknown.reshape(radial.shape)) / panels.edges[0]
+    return np.concatenate([inside.reshape(*inside.shape[:-2], -1), faces, panels.jumps(radial), between], axis=-1)
+
+
+@np.errstate(all="ignore")
+def solved(
+    tissues: Sequence[Tissue],
+    dimensions: Sequence[Array | None],
+    stretches: Callable[[Array], Array],
+    residual: Callable[[Array, Array], Array],
+    values: Array,
+) -> Array:
+    """Newton, halved where a step leaves what has an energy: values (n,) whose residual is zero."""
+    # `stretches` (..., panels, points, 3) and `residual` (..., n) are of values (..., n), and of stresses over the
+    # largest stiffness, real or complex
+    stiffness = _stiffness(tissues)
+
+    def state(trial: Array) -> tuple[Array, Array, Array, Array]:
+        of = stretches(trial)
+        found = [principal_stresses(*layer) for layer in zip(tissues, [*of], dimensions, strict=True)]
+        stresses, tangents = (np.stack(parts) / stiffness for parts in zip(*found, strict=True))
+        return of, stresses, tangents, residual(trial, stresses)
+
+    of, stresses, tangents, present = state(values)
     for _ in range(ITERATIONS):
-        if np.abs(present).max() < CLOSED:
-            return values
-        changes = VALUE_DIFFERENCE * np.diag(scale)
-        columns = [(residual(values + d) - residual(values - d)) / (2 * VALUE_DIFFERENCE) for d in changes]
+        # a stress depends on its own point's stretches alone; all else is closed formulas: exact by a complex step
+        moved = values + 1j * COMPLEX_STEP * np.eye(len(values))
+        strains = np.log(stretches(moved) / of)
+        columns = residual(moved, stresses + (tangents @ strains[..., None])[..., 0]).imag / COMPLEX_STEP
         if not np.isfinite(columns).all() or not np.isfinite(present).all():
             break
-        step: Array = scale * np.linalg.solve(np.transpose(columns), present)
-        shares = (0.5**power for power in range(12))
-        for share in shares:
-            trial = residual(values - share * step)
+        step = np.linalg.solve(columns.T, present)
+        if np.abs(present).max() < CLOSED:
+            return values - step  # bending is soft: what is left of the balance may be a millionth of the angle
+        for share in (0.5**power for power in range(12)):
+            of, stresses, tangents, trial = state(values - share * step)
             if np.isfinite(trial).all() and np.linalg.norm(trial) < np.linalg.norm(present) * 10:
                 break
         values, present = values - share * step, trial
     raise ArithmeticError(f"no equilibrium of ring and sector; out of balance by {np.abs(present).max():.2g}")
 
 
-def _residual(layers: tuple[Layer, ...], panels: Panels, k: float, loads: Loads, values: Array) -> Array:
-    """Radial balance in the layers, what goes from one to the next, radial stress on both faces, axial force."""
-    ring, radius = panels.places, values[:-1].reshape(panels.places.shape)
-    stretches = Closing(layers, panels, radius, k, float(values[-1])).at_panels()
-    stresses = [principal_stresses(layer.tissue, stretches[n]) for n, layer in enumerate(layers)]
-    hoop, axial, radial = np.moveaxis(np.array(stresses), -1, 0)
-    balance = (panels.derivative(radial) + (radial - hoop) / ring)[:, 1:-1] * (panels.edges[-1] - panels.edges[0]) / 2
-    faces = [radial[0, 0] + loads.pressure, radial[-1, -1]]
-    moduli = np.array([layer.tissue.lame_lambda + 2 * layer.tissue.lame_mu for layer in layers])
-    between = panels.jumps(radius) / ring[0, 0] * moduli.max()
-    edges = panels.edges
-    area = np.pi * (edges[-1] ** 2 - edges[0] ** 2)
-    if loads.force is None:
-        along = (float(values[-1]) - loads.axial) * moduli.max()
-    else:
-        along = (2 * np.pi * panels.integral(axial * ring) - loads.force) / area
-    return np.concatenate([balance.ravel(), faces, panels.jumps(radial), between, [along]])
-
-
-def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> Array:
-    """Principal Cauchy stresses (..., 3) along stretches (..., 3), which are the axes of the cells."""
-    shape = stretches.shape[:-1]
-    length = np.full((*shape, 3), tissue.end_to_end_length / np.sqrt(3.0)) if dimensions is None else dimensions
-    cell = UnitCell(length, np.broadcast_to(np.eye(3), (*shape, 3, 3)))
-
-    def energy(index: int, change: float) -> Array:
-        moved = stretches.copy()
-        moved[..., index] *= np.exp(change)
-        return np.asarray(tissue.strain_energy(moved[..., None] * np.eye(3), [cell]))
-
-    h = STRETCH_DIFFERENCE
-    slopes = [
-        (8 * (energy(i, h) - energy(i, -h)) - (energy(i, 2 * h) - energy(i, -2 * h))) / (12 * h) for i in range(3)
-    ]
-    return np.stack(slopes, axis=-1) / np.prod(stretches, axis=-1)[..., None]
+def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> tuple[Array, Array]:
+    """Principal Cauchy stresses (..., 3) along stretches (..., 3), axes of the cells, and d sigma_i/d ln lambda_j."""
+    h, one = STRETCH_DIFFERENCE, np.eye(3)
+    pairs = one[[0, 0, 1]] + one[[1, 2, 2]]
+    ways = np.concatenate([np.zeros((1, 3)), one, -one, 2 * one, -2 * one, pairs, -pairs])
+    moved = stretches * np.exp(h * ways.reshape(-1, *(1,) * (stretches.ndim - 1), 3))
+    length = tissue.end_to_end_length / np.sqrt(3.0) if dimensions is None else dimensions
+    cell = UnitCell(np.broadcast_to(length, moved.shape), np.broadcast_to(one, (*moved.shape, 3)))
+    still, *changed = np.asarray(tissue.strain_energy(moved[..., None] * one, [cell]))
+    ahead, behind, two_ahead, two_behind, both, neither = np.reshape(changed, (6, 3, *still.shape))
+    volume, sums = np.prod(stretches, axis=-1), ahead + behind
+    stresses = np.moveaxis(8 * (ahead - behind) - (two_ahead - two_behind), 0, -1) / (12 * h) / volume[..., None]
+    mixed = (both + neither - sums[[0, 0, 1]] - sums[[1, 2, 2]] + 2 * still) / (2 * h**2)
+    tangents = np.empty((*stretches.shape, 3))
+    tangents[..., range(3), range(3)] = np.moveaxis(16 * sums - two_ahead - two_behind - 30 * still, 0, -1) / (
+        12 * h**2
+    )
+    tangents[..., [0, 0, 1], [1, 2, 2]] = tangents[..., [1, 2, 2], [0, 0, 1]] = np.moveaxis(mixed, 0, -1)
+    return stresses, tangents / volume[..., None, None] - stresses[..., None]
 
 
 # ---------------------------------------------------------------- what a tube without loads does when it is cut
@@ -253,17 +276,8 @@ class Cut(NamedTuple):
     axial: float
 
 
-class _Wall(NamedTuple):
-    """What is known of the ring: its layers' tissues, points, and G and l_I there, (panels, points, 3)."""
-
-    tissues: tuple[Tissue, ...]
-    panels: Panels
-    natural: Array
-    dimensions: Array
-
-
 def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_dimensions: Array) -> Cut:
-    """Cut an unloaded tube."""
+    """Cut an unloaded tube: squared dimensions of its cells, and what turnover changes, at radii."""
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], CUT_DEGREE)
     squared = np.empty((*panels.places.shape, squared_dimensions.shape[1]))
     panel = panels.of(radius)
@@ -272,7 +286,7 @@ def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_
         rows = radius[here], squared_dimensions[here]
         squared[number] = np.stack([np.interp(at, rows[0], column) for column in rows[1].T], axis=-1)
     squared, turned = squared[..., :3], np.moveaxis(squared[..., 3:], -1, 0)
-    natural, start = np.ones_like(squared), (panels.places.copy(), 1.0, 1.0)
+    natural, start = np.ones_like(squared), (panels.places, 1.0, 1.0)
     if closed is not None:
         fine = closed._replace(layers=tuple(layers), panels=panels, radius=closed.natural_radius(panels.places))
         natural = fine.at_panels()
@@ -281,28 +295,25 @@ def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_
     for number, layer in enumerate(layers):
         changes: dict[str, Any] = dict(zip(TURNED_OVER, turned[:, number], strict=False))  # none without turnover
         tissues.append(replace(layer.tissue, **changes))
-    wall = _Wall(tuple(tissues), panels, natural, np.sqrt(np.maximum(squared, 0.0)))
-    values: Array = np.concatenate([start[0].ravel(), start[1:]])
-    scale: Array = np.concatenate([np.full(panels.places.size, panels.edges[-1]), [1.0, 1.0]])
-    stiffness = max(tissue.lame_lambda + 2 * tissue.lame_mu for tissue in tissues)
-    found = solved(partial(_residual_of_a_cut, wall, stiffness), values, scale, stiffness)
+
+    def opened(values: Array) -> tuple[Array, Array]:
+        rho = values[..., :-2].reshape(*values.shape[:-1], *panels.places.shape)
+        return rho, panels.derivative(rho)
+
+    def stretches(values: Array) -> Array:
+        (rho, slope), axial, k = opened(values), values[..., -2:-1, None], values[..., -1:, None]
+        return np.stack(np.broadcast_arrays(k * rho / panels.places, axial, slope), axis=-1) * natural
+
+    def residual(values: Array, stresses: Array) -> Array:  # and axial force and bending moment, as stresses
+        rho, slope = opened(values)
+        through = _through(panels, values[..., :-2], stresses, rho, slope=slope)
+        area = (panels.edges[-1] - panels.edges[0]) / 2 * (rho[..., 0, 0] + rho[..., -1, -1])
+        means = [panels.integral(stresses[..., n] * rho * slope) / area for n in (1, 0)]
+        return np.concatenate([through, np.stack(means, axis=-1)], axis=-1)
+
+    dimensions = [*np.sqrt(np.maximum(squared, 0.0))]
+    found = solved(tissues, dimensions, stretches, residual, np.append(start[0], start[1:]))
     return Cut(360.0 * (1.0 - float(found[-1])), (float(found[0]), float(found[-3])), float(found[-2]))
-
-
-def _residual_of_a_cut(wall: _Wall, stiffness: float, values: Array) -> Array:
-    """Radial balance in the layers, what goes on between them, both faces, axial force and bending moment: stresses."""
-    panels, axial, k = wall.panels, values[-2], values[-1]
-    ring, half = panels.places, (panels.edges[-1] - panels.edges[0]) / 2
-    rho = values[:-2].reshape(ring.shape)
-    slope = panels.derivative(rho)
-    stretches = np.stack([k * rho / ring, np.full_like(rho, axial), slope], axis=-1) * wall.natural
-    stresses = [principal_stresses(t, stretches[n], wall.dimensions[n]) for n, t in enumerate(wall.tissues)]
-    hoop, along, radial = np.moveaxis(np.array(stresses), -1, 0)
-    balance = (panels.derivative(radial) + (radial - hoop) * slope / rho)[:, 1:-1] * half
-    between = panels.jumps(rho) / ring[0, 0] * stiffness
-    means = [panels.integral(density * rho * slope) / half / (rho[0, 0] + rho[-1, -1]) for density in (along, hoop)]
-    faces = [radial[0, 0], radial[-1, -1]]
-    return np.concatenate([balance.ravel(), faces, panels.jumps(radial), between, means])
 
 
 def means_through(radius: Array, values: Array, weights: Array, number: int) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import os
 import shutil
 import subprocess
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,7 @@ def draw_animation(
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
         raise FigureError(f"--frames {frames}: allowed is a whole number from {FEWEST_FRAMES} to {MOST_FRAMES}", 2)
     ending = path.suffix.lower() if path else ".gif"
-    encode = _encoder(ending)
+    _check_encoder(ending)
     sight = Sight(RecordedRun(folder), viewing or Viewing())
     if len(sight.recording.times) < FEWEST_FRAMES:
         raise FigureError(f"{sight.recording.path}: fields of one time alone are recorded, so nothing moves", 2)
@@ -77,7 +77,7 @@ def draw_animation(
     images = render(grids, view)
     with matplotlib.rc_context(STYLE):
         drawn = _drawn(Leaf(sight, times[:1], images[:1], view, FRAME_DOTS, has_clock=True), times, images)
-    return _write(path, sight, [times[0], times[-1]], ending, encode(drawn, _about(sight, "animate")))
+    return _write(path, sight, [times[0], times[-1]], ending, _encoded(drawn, _about(sight, "animate"), ending))
 
 
 def _drawn(sheet: Leaf, times: Sequence[float], images: Sequence[Pixels]) -> list[Image.Image]:
@@ -211,42 +211,27 @@ def _round_length(most: float) -> float:
 
 
 # ---------------------------------------------------------------- kinds of animations
-Encoder = Callable[[list[Image.Image], About], bytes]
-
-
-def _encoder(ending: str) -> Encoder:
-    """The one for a kind of file."""
+def _check_encoder(ending: str) -> None:
+    """Before anything is drawn."""
     if ending == ".mp4" and shutil.which("ffmpeg") is None:
         raise FigureError("mp4 needs ffmpeg, which is not there; .webp needs nothing", 5)
     if ending == ".webp" and not features.check("webp"):
         raise FigureError("webp needs a Pillow that writes it; .gif needs nothing", 5)
-    return {".gif": _gif, ".webp": _webp, ".mp4": _mp4}[ending]
 
 
-def _durations(frames: list[Image.Image]) -> list[int]:
-    return [FRAME_TIME] * (len(frames) - 1) + [LAST_TIME]
-
-
-def _gif(frames: list[Image.Image], about: About) -> bytes:
-    """The colours of the scale are kept as they are."""
-    palette = Palette(_side_by_side([frames[0], frames[len(frames) // 2], frames[-1]]), scale_colours())
-    first, *others = [palette(frame) for frame in frames]
-    comment = f"{about.comment}; {about.made_by}".encode()
-    return _saved(first, others, "GIF", duration=_durations(frames), comment=comment)
-
-
-def _side_by_side(frames: Sequence[Image.Image]) -> Image.Image:
-    return Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames], axis=1))
-
-
-def _webp(frames: list[Image.Image], about: About) -> bytes:
-    first, *others = frames
-    return _saved(first, others, "WEBP", duration=_durations(frames), quality=90, method=4)
-
-
-def _saved(first: Image.Image, others: list[Image.Image], kind: str, **how: Any) -> bytes:
-    file = io.BytesIO()
-    first.save(file, kind, save_all=True, append_images=others, loop=0, **how)
+def _encoded(frames: list[Image.Image], about: About, ending: str) -> bytes:
+    """As a file; a GIF keeps the colours of the scale as they are."""
+    if ending == ".mp4":
+        return _mp4(frames, about)
+    how: dict[str, Any] = {"quality": 90, "method": 4}
+    if ending == ".gif":
+        some = np.concatenate([np.asarray(frames[k]) for k in (0, len(frames) // 2, -1)], axis=1)
+        palette = Palette(Image.fromarray(some), scale_colours())
+        frames = [palette(frame) for frame in frames]
+        how = {"comment": f"{about.comment}; {about.made_by}".encode()}
+    file, durations = io.BytesIO(), [FRAME_TIME] * (len(frames) - 1) + [LAST_TIME]
+    kept: dict[str, Any] = {"save_all": True, "append_images": frames[1:], "loop": 0, "duration": durations}
+    frames[0].save(file, ending[1:], **kept, **how)
     return file.getvalue()
 
 

@@ -9,8 +9,9 @@ import math
 import os
 import re
 import shlex
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from itertools import chain, takewhile
@@ -18,12 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.shape import Column, columns_of_region
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.report.card import Array, Card, ShownBody, folded, packed, section, table
+from remodel_fenicsx.model.axes import moved_axes
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -38,16 +40,213 @@ from remodel_fenicsx.results.recording import (
     unit_of,
     with_unit,
     words,
-    writer,
 )
-from remodel_fenicsx.results.status import FAILED, STOPPED, how_it_ended, log_entries
-from remodel_fenicsx.results.whole_body import WholeBody, has_a_body
-from remodel_fenicsx.scene.scene import Scene
-from remodel_fenicsx.schema.settings import Load, Properties
+from remodel_fenicsx.results.status import log_entries, state_of
+from remodel_fenicsx.results.whole_body import (
+    AXIS_FIELDS,
+    DIRECTION_FIELDS,
+    TENSOR_FIELDS,
+    WholeBody,
+    has_a_body,
+)
 from remodel_fenicsx.schema.tables import Table
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.files import read_regular, typed, write_new, write_whole
 from remodel_fenicsx.system.terminal import duration
+
+
+Places = NDArray[np.float64]
+
+
+# ---------------------------------------------------------------- arrays as text of a page
+# One block, deflated, in base64; and how numbers become few bytes.
+
+ANGLE_STEPS = 252  # of a byte for 0 to 90 degrees: 14 for each of the 18 colours, so that all agree about these
+NO_ANGLE = 255
+
+
+def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]:
+    """The block, and what tells the page where each array is in it."""
+    parts, table, start = [], {}, 0
+    for name, array in arrays.items():
+        values = np.ascontiguousarray(array.values)
+        stored = values
+        if array.differences and len(values) > 1:
+            stored = values.copy()
+            stored[1:] -= values[:-1]  # modulo the range of the type
+        data = stored.astype(values.dtype.newbyteorder("<")).tobytes()
+        start += -start % 4  # typed arrays begin at multiples of their size
+        parts.append((start, data))
+        table[name] = {
+            "type": values.dtype.name, "shape": list(values.shape), "start": start, "differences": array.differences
+        }  # fmt: skip
+        start += len(data)
+    block = bytearray(start)
+    for place, data in parts:
+        block[place : place + len(data)] = data
+    deflate = zlib.compressobj(
+        3, zlib.DEFLATED, 31
+    )  # 31: with the head of gzip; 6 is 5 % smaller and takes as long again
+    return base64.b64encode(deflate.compress(bytes(block)) + deflate.flush()).decode("ascii"), table
+
+
+def of_angles(degrees: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Angles from 0 to 90 degrees in `ANGLE_STEPS` levels; `NO_ANGLE` where there is none."""
+    steps = np.clip(np.floor(degrees * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1)
+    return np.where(np.isnan(degrees), NO_ANGLE, steps).astype(np.uint8)
+
+
+def of_places(places: NDArray[np.float32]) -> tuple[NDArray[np.uint16], list[float], float]:
+    """Coordinates (..., 3) as steps from the least of each, with these three and the length of a step."""
+    flat = places.reshape(-1, 3)
+    least = flat.min(axis=0)
+    step = float((flat.max(axis=0) - least).max() / 65535) or 1.0
+    return np.rint((places - least) / step).astype(np.uint16), [float(value) for value in least], step
+
+
+def of_vectors(vectors: NDArray[np.float32]) -> tuple[NDArray[np.int8], float]:
+    """Components as 127ths of the largest, and the length of a step."""
+    step = float(np.abs(vectors).max()) / 127 or 1.0
+    return np.rint(vectors / step).astype(np.int8), step
+
+
+# ---------------------------------------------------------------- a part of the page, and its HTML
+# All text of others goes through `escape`.
+
+
+@dataclass(frozen=True)
+class Array:
+    """Numbers that the page unpacks into a typed array."""
+
+    values: NDArray[Any]
+    differences: bool = False
+
+
+@dataclass(frozen=True)
+class Card:
+    """A part of the page."""
+
+    name: str
+    html: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+
+def section(title: str, content: str, width: str = "half", note: str = "") -> str:
+    """A card with a heading; `content` is HTML, the others text. Widths: whole, wide, narrow, half, third."""
+    more = f' <span class="note">{escape(note)}</span>' if note else ""
+    heading = f"<h2>{escape(title)}{more}</h2>" if title else ""
+    return f'<section class="card {width}">{heading}{content}</section>'
+
+
+def folded(title: str, content: str) -> str:
+    """The same, closed until somebody opens it."""
+    return f'<details class="card half"><summary>{escape(title)}</summary>{content}</details>'
+
+
+def table(rows: Iterable[tuple[str, str]]) -> str:
+    """Names and values."""
+    cells = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
+    return f"<table>{cells}</table>"
+
+
+# ---------------------------------------------------------------- the body at the times that a page keeps
+
+CELL = ("cell_dimensions", *AXIS_FIELDS)
+NAMES = ("displacement", "fibre_angle_deformed", "chain_extension", *CELL, *TENSOR_FIELDS, *DIRECTION_FIELDS)
+
+
+@dataclass(frozen=True)
+class ShownBody:
+    """A body over time."""
+
+    whole: WholeBody
+    times: Places
+    volume: Places
+    position: NDArray[np.float32]
+    angle: NDArray[np.float32] | None
+    extension: NDArray[np.float32] | None
+    edges: NDArray[np.float32] | None
+    wall_stress: Places | None
+    is_deformed: bool
+
+    @classmethod
+    def of(cls, whole: WholeBody, times: Places) -> ShownBody:
+        """What a run has recorded at these times."""
+        names = ("position", "angle", "extension", "edges", "wall_stress")
+        rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in names}
+        volume, is_deformed = _volumes(whole.points[whole.elements]), True
+        with whole.recording.kept_open():
+            for time in times:
+                displacement, found = whole.fields(float(time), NAMES)
+                is_deformed = displacement is not None
+                moved = 0.0 if displacement is None else displacement
+                rows["position"].append((whole.points + moved).astype(np.float32))
+                for name, values in (_of_elements(found) | _of_layers(whole, volume, found)).items():
+                    rows[name].append(values.astype(np.float32))
+        series: Any = {name: np.stack(values) if values else None for name, values in rows.items()}
+        return cls(whole, times, volume, **series, is_deformed=is_deformed)
+
+    def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
+        """The same in few bytes, and the numbers that lead back."""
+        position, origin, step = of_places(self.position)
+        size = np.uint16 if len(self.whole.points) <= 65536 else np.uint32
+        arrays = {
+            "elements": Array(self.whole.elements.astype(size)),
+            "layer": Array(self.whole.layer.astype(np.uint8)),
+            "volume": Array(self.volume.astype(np.float32)),
+            "reference": Array(self.whole.points.astype(np.float32)),
+            "position": Array(position, differences=True),
+        }
+        scales: dict[str, Any] = {"origin": origin, "position_step": step}
+        if self.angle is not None:
+            arrays["angle"] = Array(of_angles(self.angle), differences=True)
+        if self.extension is not None:
+            arrays["extension"] = Array(np.rint(255 * self.extension).astype(np.uint8), differences=True)
+        if self.edges is not None:
+            edges, scales["edge_step"] = of_vectors(self.edges)
+            arrays["edges"] = Array(edges.reshape(*edges.shape[:2], 9), differences=True)
+        return arrays, scales
+
+
+def _of_elements(fields: dict[str, Places]) -> dict[str, Places]:
+    """What is shown of the elements, by the names of `ShownBody`, as far as it was recorded."""
+    names = {"angle": "fibre_angle_deformed", "extension": "chain_extension"}
+    found = {name: fields[field] for name, field in names.items() if field in fields}
+    if set(CELL) <= set(fields):
+        axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
+        if "deformation_gradient" in fields:
+            axes = axes @ np.swapaxes(fields["deformation_gradient"].reshape(-1, 3, 3), 1, 2)
+        found["edges"] = fields["cell_dimensions"][:, :, None] * axes
+    return found
+
+
+def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> dict[str, Places]:
+    """Mean stress around, along and across the wall in each layer, (layers, 3); nothing without a wall or fields."""
+    shape = whole.recording.scene.geometry
+    recorded = DIRECTION_FIELDS if shape.constant_fields else ()  # where axes are no function of the place
+    if not shape.is_a("Walled") or not set(fields) >= {*TENSOR_FIELDS, *recorded}:
+        return {}
+    found = np.stack([fields[name] for name in recorded], axis=1) if recorded else None
+    axes = shape.axes_at(whole.points[whole.elements].mean(axis=1)) if found is None else found
+    F, stress = (fields[name].reshape(-1, 3, 3) for name in TENSOR_FIELDS)
+    moved = moved_axes(axes, F)
+    components = volume[:, None] * np.einsum("nki,nij,nkj->nk", moved, stress, moved)
+    sums = [np.bincount(whole.layer, weights=part) for part in (*components.T, volume)]
+    return {"wall_stress": np.stack(sums[:3], axis=1) / sums[3][:, None]}
+
+
+def _volumes(corners: Places) -> Places:
+    """Of hexahedra (m, 8, 3), in six tetrahedra about a diagonal, or of tetrahedra (m, 4, 3): shares of their sum."""
+    if corners.shape[1] == 8:
+        ring = (1, 2, 3, 7, 4, 5, 1)
+        parts = [(0, 6, ring[k], ring[k + 1]) for k in range(6)]
+    else:
+        parts = [(0, 1, 2, 3)]
+    total = np.zeros(len(corners))
+    for a, b, c, d in parts:
+        first, second, third = (corners[:, k] - corners[:, a] for k in (b, c, d))
+        total += np.abs(np.einsum("mi,mi->m", np.cross(first, second), third))
+    return total / total.sum()
 
 
 # ---------------------------------------------------------------- how a run went, from its folder
@@ -83,13 +282,12 @@ class Story:
     @classmethod
     def of(cls, recording: RecordedRun) -> Story:
         """The story of a run's folder."""
-        lives = writer(recording.path)[1]
         history = recording.history
         lines = log_entries(recording.path)
         stamps = [stamp for stamp, _, _ in lines] or [""]
         ranks = [found[1] for _, _, text in lines if (found := _RANKS.match(text))] or [""]
         unloaded = [text for _, _, text in lines if text.startswith(SAID_UNLOADED)] or [""]
-        state, words = _state(recording, history, lives)
+        state, words = _story(recording, history)
         return cls(state, words, history, stamps[0], stamps[-1], ranks[-1], _warnings(lines), unloaded[-1])
 
 
@@ -107,21 +305,17 @@ def _warnings(lines: list[tuple[str, str, str]]) -> list[Warned]:
     return list(found.values())
 
 
-def _state(recording: RecordedRun, history: HistoryColumns, lives: bool) -> tuple[str, str]:
+def _story(recording: RecordedRun, history: HistoryColumns) -> tuple[str, str]:
     """A word, and why or where."""
     scene, times = recording.scene, history["time"]
-    if len(times) and same_time(float(times[-1]), scene.last_time):
-        return "finished", ""
-    words = how_it_ended(recording.path)
-    if words.startswith(FAILED):
-        return "failed", words.removeprefix(FAILED)
+    state, reason = state_of(recording)
+    if state in ("finished", "failed"):
+        return state, reason
     at = f"at t = {float(times[-1]) if len(times) else 0.0:g} of {scene.last_time:g}"
-    if words.startswith(STOPPED):
-        return "stopped", f"{at}: {words.removeprefix(STOPPED)}"
-    if lives:
+    if state == "running":
         of = f" of {scene.time.number_of_steps}" if scene.time.tolerance is None else ""
-        return "running", f"step {max(0, len(times) - 1)}{of}, {at}"
-    return "stopped", f"{at}, without a word: it was killed"
+        return state, f"step {max(0, len(times) - 1)}{of}, {at}"
+    return state, f"{at}: {reason}" if reason else f"{at}, without a word: it was killed"
 
 
 ASSETS = Path(__file__).with_name("assets")
@@ -330,77 +524,42 @@ def _finite(value: float) -> float | None:
 def facts(run: ReportedRun) -> Card:
     """What was run."""
     scene, story = run.recording.scene, run.story
-    shape, mesh, remodeling = scene.geometry, scene.mesh, scene.remodeling
-    sizes = ", ".join(
-        f"{words(name)} {value:g}" for name, value in shape.model_dump().items() if isinstance(value, (int, float))
-    )
-    given = f"; {story.unloaded}" if story.unloaded else ""
-    count = f", {len(run.recording.elements):,} in number" if run.body else ""
-    name = KINEMATICS[scene.model.kinematics].element(mesh.element)
-    seed = f", seed {scene.cells.seed}" if scene.has_random_cells else ""
-    cells, kappa = _by_region(scene, _cells), _by_region(scene, lambda properties: f"{properties.kappa:g}")
-    loads = "; ".join(f"{words(name)} {load.value:g}{_ramp(load)}" for name, load in scene.loads.items())
+    kinematics = KINEMATICS[scene.model.kinematics]
+    count = f"{len(run.recording.elements):,} " if run.body else ""
     seconds = story.history.get("seconds", np.zeros(0))
     solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
     steps = f"{max(0, len(story.history['time']) - 1)}{'' if scene.time.chooses else ' of'}"
     ranks = f", {story.ranks} ranks" if story.ranks not in ("", "1") else ""
     rows = [
-        ("Body", f"{shape.name}: {sizes}{f' in {shape.length_unit}' if shape.length_unit else ''}{given}"),
-        *([] if scene.natural.is_of_the_mesh else [("Free of stress", _natural(scene))]),
-        ("Mesh", f"{name} elements{count}, degree {mesh.degree}, refinement {mesh.refinement}, {mesh.formulation}"),
-        ("Kinematics", f"{scene.model.kinematics}: {KINEMATICS[scene.model.kinematics].meaning}"),
-        ("Supports", f"ends {scene.supports.ends}"),
-        ("Cells", f"{cells}{seed}, axes {scene.cells.axes}"),
-        ("Loads", loads or "none"),
-        *([("Load cases", _load_cases(scene))] if scene.cases else []),
+        ("Body", "; ".join(filter(None, (_keys(scene.geometry, "file", "sha256"), story.unloaded)))),
+        ("Free of stress", "" if scene.natural.is_of_the_mesh else _keys(scene.natural)),
+        ("Mesh", f"{count}{kinematics.element(scene.mesh.element)}: {_keys(scene.mesh)}"),
+        ("Kinematics", f"{scene.model.kinematics}: {kinematics.meaning}"),
+        ("Supports", _keys(scene.supports)),
+        ("Cells", _keys(scene.cells)),
+        *((f"Region {words(name)}", _keys(region)) for name, region in scene.regions.items()),
+        *((words(name).capitalize(), _keys(load)) for name, load in scene.loads.items()),
+        *((f"Load case {number}", _keys(case)) for number, case in enumerate(scene.cases, start=1)),
         ("Material", scene.summary()),
-        ("Remodeling", f"law {remodeling.law}, driver {remodeling.driver}, frame {remodeling.frame}, "
-                       f"coupling {remodeling.coupling}, kappa {kappa}"),
-        *([("Turnover", _keys(remodeling.turnover))] if remodeling.turnover.is_on else []),
+        ("Remodeling", _keys(scene.remodeling, "turnover")),
+        ("Turnover", _keys(scene.remodeling.turnover) if scene.remodeling.turnover.is_on else ""),
         ("Time", f"{steps} {scene.time.in_words()}{solving}{ranks}"),
-    ]  # fmt: skip
-    return Card("facts", section("What was run", table(rows)))
+    ]
+    return Card("facts", section("What was run", table(row for row in rows if row[1])))
 
 
-def _ramp(load: Load) -> str:
-    """By what it is multiplied over time."""
-    return f", times {', '.join(f'{factor:g} at t = {time:g}' for time, factor in load.ramp)}"
-
-
-def _natural(scene: Scene) -> str:
-    """In which pieces the tissue is, and how they were stretched."""
-    layers = [_keys(layer) for layer in scene.natural.layers]
-    return "; ".join([f"opening angle {scene.natural.opening_angle:g}°", *(f"layer {layer}" for layer in layers)])
-
-
-def _keys(table: Table) -> str:
+def _keys(keys: Table, *but: str) -> str:
     """All keys of a table that have a value."""
-    found = table.model_dump(exclude_none=True).items()
-    return ", ".join(
-        f"{words(name)} {value:g}" if isinstance(value, float) else f"{words(name)} {value}" for name, value in found
-    )
+    return _as_text(keys.model_dump(exclude_none=True, exclude=set(but)))
 
 
-def _by_region(scene: Scene, in_words: Callable[[Properties], str]) -> str:
-    """What holds in the body, or in each region by its name where they differ."""
-    found = {name: in_words(properties) for name, properties in scene.properties().items()}
-    if len(set(found.values())) == 1:
-        return next(iter(found.values()))
-    return "; ".join(f"{name or 'elsewhere'}: {text}" for name, text in found.items())
-
-
-def _load_cases(scene: Any) -> str:
-    """Weight and factors of each."""
-    factors = (
-        ", ".join(f"{words(name)} times {factor:g}" for name, factor in case.loads.items()) for case in scene.cases
-    )
-    return "; ".join(
-        f"{case.weight:.3g} of the time{': ' if f else ''}{f}" for case, f in zip(scene.cases, factors, strict=True)
-    )
-
-
-def _cells(properties: Properties) -> str:
-    return f"{properties.cells.initial}, r0 = {properties.cells.end_to_end_length:g}"
+def _as_text(value: Any) -> str:
+    """A value of a scene."""
+    if isinstance(value, dict):
+        return ", ".join(f"{words(str(name))} {_as_text(one)}" for name, one in value.items() if one not in ({}, ()))
+    if isinstance(value, (list, tuple)):
+        return f"({', '.join(map(_as_text, value))})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def warnings(run: ReportedRun) -> Card:

@@ -13,7 +13,7 @@ import numpy as np
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.checkpoint_file import Array, Checkpoint, CheckpointError, write_checkpoint
-from remodel_fenicsx.results.run_folder import agreed
+from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.state import State
 from remodel_fenicsx.system.environment import versions
 

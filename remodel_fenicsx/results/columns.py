@@ -264,12 +264,8 @@ class Measurement:
 
     def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
         """Mask of the local elements with a reference point at this distance from the z axis, (elements,)."""
-        return self.tool(("elements at", radius), lambda: self._touching(radius))
-
-    def _touching(self, radius: float) -> NDArray[np.bool_]:
         nodes = self.domain.mesh.geometry.x[compat.geometry_dofmap(self.domain.mesh)]
-        radii = np.linalg.norm(nodes[..., :2], axis=-1)
-        tolerance = 1e-6 * self.domain.size
+        radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size
         return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
 
     def of_case(self, number: int) -> Measurement:

@@ -9,15 +9,16 @@ import itertools
 import math
 import os
 import time as clock
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, cast
 
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.results.recording import (
     CHAIN_LINES,
     FIELDS,
@@ -35,22 +36,6 @@ from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.files import ClosedAtEnd, open_own, read_regular, write_whole
 
 DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
-
-
-T = TypeVar("T")
-
-
-def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
-    """What `make` makes on every rank; what one of them refuses with a ValueError is refused on all. Collective."""
-    made = refusal = None
-    try:
-        made = make()
-    except ValueError as error:
-        refusal = error
-    refusal = next(filter(None, comm.allgather(refusal)), None)
-    if refusal is not None:
-        raise refusal
-    return cast(T, made)
 
 
 def choose_folder(requested: Path | None, name: str) -> Path:

@@ -7,7 +7,6 @@ import os
 import re
 import time as clock
 from collections import Counter
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -42,7 +41,7 @@ def status(folder: Path) -> list[str]:
     number = max(0, len(times) - 1)
     steps, behind = scene.time.number_of_steps, scene.time.progress(number, time)
     of = f" of {steps}" if scene.time.tolerance is None else ""
-    done = same_time(time, end)
+    state, reason = state_of(recording)
     lines = [f"{folder}: {scene.name}, step {number}{of}, time {time:g} of {end:g}"]
     seconds = history.get("seconds", np.zeros(0))[1:][-RECENT:]
     rate = float(np.mean(seconds)) if len(seconds) else 0.0
@@ -51,23 +50,20 @@ def status(folder: Path) -> list[str]:
         per_step = number / behind if behind else 1.0  # those of a tolerance are longer or shorter than the first
         left = f", {duration(rate * per_step * (steps - behind))} left" if rate else ""
         lines.append(f"running: {holder or 'a process'}{left}; the last step was done {duration(max(0.0, age))} ago")
-    elif done:
-        lines.append("finished")
+    elif state == "finished":
+        lines.append(state)
     else:
+        if state == "failed":
+            lines.append(f"{FAILED}{reason}")
         when = f"{datetime.fromtimestamp(os.stat(folder / HISTORY).st_mtime):%Y-%m-%d %H:%M:%S}"
-        killed = f"; {holder} was killed" if holder else ""
-        words = how_it_ended(folder)
-        if words.startswith(FAILED):
-            lines.append(words)
-        lines.append(f"not running, the last step was done at {when}{killed}")
-        if words.startswith(STOPPED):
-            reason = words.removeprefix(STOPPED)  # a signal, or the whole sentence of a stop on purpose
+        lines.append(f"not running, the last step was done at {when}{f'; {holder} was killed' if holder else ''}")
+        if state == "stopped" and reason:  # a signal, or the whole sentence of a stop on purpose
             lines[-1] += f"; {reason if reason.startswith('stopped') else f'stopped by {reason}'}"
     if rate:
         lines.append(f"{rate:.3g} s a step (mean of the last {len(seconds)})")
     time_kept = time_of_checkpoint(folder)
     kept = "no checkpoint yet" if time_kept is None else f"checkpoint at time {time_kept:g}"
-    lines.append(kept if lives or done else f"{kept}; it goes on with: {typed()} run --resume {folder}")
+    lines.append(kept if lives or state == "finished" else f"{kept}; it goes on with: {typed()} run --resume {folder}")
     return lines
 
 
@@ -84,11 +80,22 @@ def log_entries(folder: Path) -> list[tuple[str, str, str]]:
     return entries
 
 
-def how_it_ended(folder: Path) -> str:
-    """What run.log says of a run's end since it last began, beginning with `FAILED` or `STOPPED`; or nothing."""
+def state_of(recording: RecordedRun) -> tuple[str, str]:
+    """Whether a run has "finished", "failed", "stopped" or is "running", and what run.log says of why."""
+    times = recording.history["time"]
+    if len(times) and same_time(float(times[-1]), recording.scene.last_time):
+        return "finished", ""
+    state, reason = _said_of_its_end(recording.path)
+    return ("running" if not reason and writer(recording.path)[1] else state), reason
+
+
+def _said_of_its_end(folder: Path) -> tuple[str, str]:
+    """What run.log says since the run last began: "failed" or "stopped", and why; no reason where it was killed."""
     said = [text.partition("\n")[0] for _, _, text in log_entries(folder)]
     last = next((text for text in reversed(said) if text.startswith((BEGUN, FAILED, STOPPED))), BEGUN)
-    return "" if last.startswith(BEGUN) else last
+    if last.startswith(FAILED):
+        return "failed", last.removeprefix(FAILED)
+    return "stopped", last.removeprefix(STOPPED) if last.startswith(STOPPED) else ""
 
 
 def _of_study(folder: Path) -> list[str]:
@@ -107,7 +114,7 @@ def _of_study(folder: Path) -> list[str]:
     lines = [
         f"{folder}: {name} of {scene}, {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"
     ]
-    failed = [f"{run} has {words}" for run, (state, words) in states.items() if state == "failed"]
+    failed = [f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"]
     lines += failed[:SHOWN] + ([f"and {len(failed) - SHOWN} more"] if len(failed) > SHOWN else [])
     answer = folder / f"{name}.csv"
     lines.append(f"its answer: {answer}" if answer.exists() else "no answer yet")
@@ -123,13 +130,10 @@ def _state(folder: Path) -> tuple[str, str]:
         data = read_regular(messages, LARGEST_HISTORY) if messages.is_file() else b""
         said = data.decode(errors="replace").split("\n")
         last = next((line for line in reversed(said) if line), "")
-        return ("failed", f"{FAILED}{last.removeprefix('remodel-fenicsx: ')}") if last else ("not begun", "")
+        return ("failed", last.removeprefix("remodel-fenicsx: ")) if last else ("not begun", "")
     if writer(folder)[1]:
         return "running", ""
-    with suppress(RecordingError):
-        recording = RecordedRun(folder)
-        times = recording.history["time"]
-        if len(times) and same_time(float(times[-1]), recording.scene.last_time):
-            return "finished", ""
-    words = how_it_ended(folder)
-    return ("failed", words) if words.startswith(FAILED) else ("stopped", "")
+    try:
+        return state_of(RecordedRun(folder))
+    except RecordingError:
+        return _said_of_its_end(folder)

@@ -226,7 +226,6 @@ class TransientGrid(ClosedAtEnd):
         import h5py
 
         self.path, self.number_of_steps, self.last_time = path, 0, -np.inf
-        self._datasets: dict[str, h5py.Dataset] = {}
         with signals_held_back():
             self._staged = StagedFile(path, existing=mode == "r+")
             # a file that is no HDF5 stays open where this fails: h5py still flushes it when it lets go of it
@@ -251,41 +250,31 @@ class TransientGrid(ClosedAtEnd):
         constant: Fields | None = None,
     ) -> None:
         """Add one step and bring it to the disk; points are given at every step or at none."""
-        step = self.number_of_steps
-        blocks = {f"PointData/{name}": np.asarray(values) for name, values in (point_data or {}).items()}
-        blocks |= {f"CellData/{name}": np.asarray(values) for name, values in (cell_data or {}).items()}
-        once = {f"CellData/{name}": np.asarray(values) for name, values in (constant or {}).items()}
+        step, root = self.number_of_steps, self._root
+        kinds = (("PointData", point_data, step), ("CellData", cell_data, step), ("CellData", constant, 0))
         with signals_held_back():
-            for name, block in (blocks | once).items():
-                if (
-                    name not in self._datasets and name not in self._root
-                ):  # a chunk is a step, which readers take as a whole
-                    _create(self._root, name, np.float32, block.shape, fletcher32=True)
-                    _create(self._root, _offsets(name), np.int64, (_STEPS_PER_CHUNK,))
-            for name, block in blocks.items():
-                _write(self._dataset(name), step, block)
-            for name, block in once.items():
-                _write(self._dataset(name), 0, block)
-            if points is not None:  # block 0 is the reference configuration
-                _write(self._dataset("Points"), step + 1, points)
+            for kind, fields, place in kinds:
+                for name, block in ((f"{kind}/{name}", np.asarray(values)) for name, values in (fields or {}).items()):
+                    if name not in root:  # a chunk is a step, which readers take as a whole
+                        _create(root, name, np.float32, block.shape, fletcher32=True)
+                        _create(root, _offsets(name), np.int64, (_STEPS_PER_CHUNK,))
+                    _write(root[name], place, block)
+                    _write(root[_offsets(name)], step, [place * len(block)])
             # offsets that stay 0 say that the mesh is the one of the first step
-            numbers: dict[str, float] = {_offsets(name): step * len(block) for name, block in blocks.items()}
-            numbers |= dict.fromkeys([*map(_offsets, once), *_ALWAYS_0], 0)
-            moved = 0 if points is None else (step + 1) * len(np.asarray(points))
-            numbers |= {"Steps/NumberOfParts": 1, "Steps/PointOffsets": moved, "Steps/Values": time}
+            numbers: dict[str, float] = dict.fromkeys(_ALWAYS_0, 0)
+            numbers |= {"Steps/NumberOfParts": 1, "Steps/PointOffsets": 0, "Steps/Values": time}
+            if points is not None:  # block 0 is the reference configuration
+                _write(root["Points"], step + 1, points)
+                numbers["Steps/PointOffsets"] = (step + 1) * len(np.asarray(points))
             for name, number in numbers.items():
                 columns = (1,) if name in _OF_TOPOLOGY else ()  # one for each kind of topology
-                _write(self._dataset(name), step, np.full((1, *columns), number))
+                _write(root[name], step, np.full((1, *columns), number))
             self._file.flush()
             # the number of steps comes last: until then a reader sees the series without this step
             self.number_of_steps, self.last_time = step + 1, time
-            self._root["Steps"].attrs.modify("NSteps", np.int64(step + 1))
+            root["Steps"].attrs.modify("NSteps", np.int64(step + 1))
             self._file.flush()
             self._staged.commit()
-
-    def _dataset(self, name: str) -> h5py.Dataset:
-        """Found once: looking for it costs as much as writing a few numbers."""
-        return self._datasets.get(name) or self._datasets.setdefault(name, self._root[name])
 
     def drop_last(self) -> None:
         """Take the last step back; the next `append`, or `close`, brings that to the disk."""
@@ -345,15 +334,9 @@ def _create(group: h5py.Group, name: str, dtype: DTypeLike, chunk: tuple[int, ..
 
 def _write(dataset: h5py.Dataset, number: int, block: ArrayLike) -> None:
     """Write a block of rows, the last one of a dataset whose blocks have this one's length."""
-    import h5py
-
-    # by HDF5's own calls: h5py's are twice as slow, with thirty numbers and blocks at each step
-    rows = np.ascontiguousarray(block, dataset.dtype)
-    start, others = number * len(rows), rows.shape[1:]
-    dataset.id.set_extent((start + len(rows), *others))
-    place = dataset.id.get_space()
-    place.select_hyperslab((start, *(0 for _ in others)), rows.shape)
-    dataset.id.write(h5py.h5s.create_simple(rows.shape), place, rows)
+    start, rows = number * len(np.asarray(block)), len(np.asarray(block))
+    dataset.resize(start + rows, axis=0)
+    dataset[start:] = block
 
 
 def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.body.shape import Shape
@@ -30,7 +31,6 @@ FEW_LAYERS = 8
 
 DIRECTION_FIELDS = ("axis_c", "axis_a", "axis_r")
 TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
-AT_ONCE = 1_000_000  # distances that are compared at a time
 
 
 class TurnedFields:
@@ -41,7 +41,7 @@ class TurnedFields:
     ):
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
-        self.nodes = nearest(back, own_points)
+        self.nodes = cKDTree(own_points).query(back)[1]
         self.offsets = back - own_points[self.nodes]
         owner = np.zeros(len(own_points), dtype=np.int64)
         owner[own_elements.reshape(-1)] = np.repeat(np.arange(len(own_elements)), own_elements.shape[1])
@@ -49,7 +49,7 @@ class TurnedFields:
         self.centres = points[elements].mean(axis=1)
         self.element_turns = turn(self.centres)
         # the mean of nodes that were turned back each by itself: chords of a coarse mesh lie inside of their circles
-        self.sources = nearest(back[elements].mean(axis=1), own_points[own_elements].mean(axis=1))
+        self.sources = cKDTree(own_points[own_elements].mean(axis=1)).query(back[elements].mean(axis=1))[1]
 
     def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
         """Displacement of the body's nodes, where it was recorded, and fields of its elements."""
@@ -65,16 +65,6 @@ class TurnedFields:
         gradient = fields["deformation_gradient"].reshape(-1, 3, 3)[self.owners] - np.eye(3)
         moved = fields["displacement"][self.nodes] + np.einsum("nij,nj->ni", gradient, self.offsets)
         return np.einsum("nij,nj->ni", self.turns, moved), found
-
-
-def nearest(places: Array, candidates: Array) -> NDArray[np.int64]:
-    """Number of the candidate (m, 3) that is nearest to each place (n, 3)."""
-    found = np.empty(len(places), dtype=np.int64)
-    rows = max(1, AT_ONCE // len(candidates))
-    for start in range(0, len(places), rows):
-        distances = np.linalg.norm(places[start : start + rows, None] - candidates, axis=-1)
-        found[start : start + rows] = distances.argmin(axis=1)
-    return found
 
 
 # ---------------------------------------------------------------- chains of unit cells as lines, and a file of them

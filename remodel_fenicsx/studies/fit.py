@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError
-from remodel_fenicsx.report.card import Card, folded, section, table as card_table
+from remodel_fenicsx.report.page import Card, folded, section, table as card_table
 from remodel_fenicsx.report.page import page_with
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
@@ -550,12 +550,6 @@ def fit(
     """Fit numbers of a scene to measurements."""
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
-    line = Line(f"{scene.name} fit")
-
-    def show(text: str) -> None:
-        if not quiet:
-            line.show(text)
-
     with hold_log(quiet=quiet) as held:
         unknowns, tables = read_measurements(Path(data), scene)
         mark = fingerprint(scene, unknowns, tables)
@@ -573,18 +567,18 @@ def fit(
         stack.enter_context(RunLock(place))
         journal.begin(mark)
         stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
-        stack.callback(line.end)
+        line = stack.enter_context(Line(f"{scene.name} fit", quiet))
         for number in range(1, starts + 1):
             start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number > 1 else 0.0)
 
             def said(misfit: float, words: str = f"start {number} of {starts}, misfit") -> None:
-                show(f"{words} {misfit:.4g}")
+                line.show(f"{words} {misfit:.4g}")
 
             found.append(minimised(problem, start, said))
             log.info("start %d: sum of squares %.6g, %d evaluations", number, 2 * found[-1].cost, found[-1].nfev)
         result = result_of(problem, found)
         if profiles:
-            result = with_profiles(problem, result, lambda key: show(f"profile of {key}"))
+            result = with_profiles(problem, result, lambda key: line.show(f"profile of {key}"))
         log.info("%s", result.verdict())
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
         result.write(place)

@@ -177,8 +177,8 @@ class Study:
         text = {"study": self.name, "scene": self.scene.name, "runs": [run.name for run in self.runs]}
         write_whole(self.folder / STUDY, (json.dumps(text, indent=1) + "\n").encode())  # for `status`
         self.learn()
-        line, pausing = Line(f"{self.scene.name} {self.name}"), False
-        with StopRequest() as stop:
+        pausing = False
+        with StopRequest() as stop, Line(f"{self.scene.name} {self.name}", self.quiet) as line:
             try:
                 while (self._waiting or self._running) and clock.monotonic() < self.deadline:
                     if stop.number:
@@ -193,7 +193,6 @@ class Study:
             finally:
                 for worker in [*self._running, *self._idle]:
                     worker.stop()
-                line.end()
         if pausing:
             raise Interrupted(PAUSE)
 

@@ -14,7 +14,7 @@ from io import TextIOWrapper
 from logging.handlers import MemoryHandler
 from pathlib import Path
 from statistics import median_low
-from typing import Any, cast
+from typing import Any, Self, cast
 
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.system.files import open_own
@@ -38,7 +38,7 @@ class Progress:
         self._pending: str | None = None  # the newest line that was not printed
         self._bar: Any = None  # `bar.Bar`, on a terminal
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> Self:
         if not self._silent and _is_terminal():
             from remodel_fenicsx.system.bar import Bar  # late: most runs have no terminal
 
@@ -108,24 +108,19 @@ def _joined(*parts: str) -> str:
 class Line(Progress):
     """What several runs do, on stderr: one line that changes on a terminal, else a plain line now and then."""
 
-    def __init__(self, title: str) -> None:
-        super().__init__(0, title, interval=LINE_EVERY)
-        self._begun = False
+    def __init__(self, title: str, silent: bool) -> None:
+        super().__init__(0, title, -1 if silent else 0, interval=LINE_EVERY)
 
-    def show(self, text: str, at_once: bool = False) -> None:
-        """Show a line; where lines stay, only now and then unless it is wanted at once."""
-        if not self._begun:
-            self._begun = True
-            self.__enter__()
+    def __exit__(self, *error: object) -> None:
+        self._pending = None
+        super().__exit__(*error)
+
+    def show(self, text: str) -> None:
+        """Show a line; where lines stay, only now and then."""
         if self._bar is not None:
             self._bar.show(0, "", text, "")
-        else:
-            self._say(text, at_once)
-
-    def end(self) -> None:
-        """Leave the last line as it is."""
-        self._pending = None
-        self.__exit__()
+        elif not self._silent:
+            self._say(text, at_once=False)
 
 
 def _is_terminal() -> bool:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
-from remodel_fenicsx.model.residual_stress import Layer, closing, cut
+from remodel_fenicsx import Scene, preset_scene
+from remodel_fenicsx.model.residual_stress import Layer, closing, cut, principal_stresses
+from tests.runs import made
 
 
 def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any) -> Scene:
@@ -21,11 +23,8 @@ def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any
 
 
 def angles(of: Scene) -> list[float]:
-    simulation = Simulation(of)
-    try:
+    with made(of) as simulation:
         return [float(step.row["opening_angle"]) for step in simulation.steps()]
-    finally:
-        simulation.close()
 
 
 @pytest.mark.parametrize("opening_angle", [60.0, 160.0])
@@ -42,6 +41,17 @@ def test_what_was_closed_opens_again(opening_angle: float) -> None:
     assert found.opening_angle == pytest.approx(opening_angle, abs=1e-6)
     assert found.radii == pytest.approx(tuple(sector), abs=1e-6)
     assert found.axial == pytest.approx(1 / closed.axial, abs=1e-8)
+
+
+@pytest.mark.parametrize("preset", ["kuhl-holzapfel-2007", "consistent"])
+def test_the_tangent_of_stresses_is_their_derivative(preset: str) -> None:
+    """By logarithms of the stretches, of points whose cells differ; with turnover as arrays over the points."""
+    tissue = replace(scene(preset).properties()[""].tissue, content=np.array([1.0, 1.5]), natural_length=np.array(1.1))
+    stretches, cells = np.array([[1.2, 0.9, 0.95], [1.0, 1.3, 0.8]]), np.array([[0.6, 0.5, 0.6], [0.3, 0.9, 0.2]])
+    _, tangents = principal_stresses(tissue, stretches, cells)
+    for axis, way in enumerate(1e-4 * np.eye(3)):
+        ahead, behind = (principal_stresses(tissue, stretches * np.exp(side * way), cells)[0] for side in (1, -1))
+        np.testing.assert_allclose(tangents[..., axis], (ahead - behind) / 2e-4, rtol=1e-4, atol=1e-4)
 
 
 def test_tensor_and_log_leave_the_angle_as_it_was() -> None:
@@ -87,8 +97,3 @@ def test_no_equilibrium_of_the_cut_is_said(monkeypatch: pytest.MonkeyPatch, capl
     with caplog.at_level(logging.WARNING):
         assert np.isnan(angles(scene(**{"time.end": 5.0})))[0]
     assert "no opening_angle: out of balance by 0.1" in caplog.text
-
-
-def test_layers_have_no_cut() -> None:
-    with pytest.raises(SceneError, match="'opening_angle' is for bodies of one tissue; the scene has regions"):
-        scene(**{"regions": {"inside": {"outer_radius": 2.0}, "outside": {}}})

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError, Simulation, read_scene
+from remodel_fenicsx import Scene, SceneError, read_scene
 from remodel_fenicsx.extend import SHAPES
 from remodel_fenicsx.parts import Tube
 from tests.command.test_run import run
+from tests.runs import rows_of, simulated
 
 FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
 ELASTIC = {"remodeling.law": "none", "remodeling.coupling": "staggered", "material.chain_density": 0.0, "time.end": 4.0}
@@ -36,12 +36,6 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Scene]]:
     SHAPES.update(shapes)
 
 
-def simulated(scene: Scene) -> tuple[Simulation, list[dict[str, float]]]:
-    """At its end, and its rows."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    return simulation, [step.row for step in simulation.steps()]
-
-
 def test_each_is_short() -> None:
     scripts = sorted(FOLDER.glob("*.py"))
     assert scripts and all(len(script.read_text().splitlines()) < 60 for script in scripts)
@@ -51,23 +45,23 @@ def test_a_turned_tube_has_the_shear_of_torsion(scene: Any) -> None:
     """sigma_ca = mu r theta / length, of an elastic tube that is turned by one degree; its end turns as a whole."""
     changes = {**ELASTIC, "loads.torsion.value": 1.0, "loads.pressure.value": 0.0, "loads.elongation.value": 0.0}
     turned = scene("torsion").with_values(changes)
-    simulation, rows = simulated(turned)
+    with simulated(turned) as (simulation, rows):
+        moved = simulation.unknown.x.array.reshape(-1, 3)
+        nodes = simulation.unknown.function_space.tabulate_dof_coordinates()
+        assert len(simulation.domain.mesh.geometry.x) == len(nodes)
     radius = 2 / 3 * (2.0**3 - 1.0**3) / (2.0**2 - 1.0**2)  # the mean over the wall
     assert rows[-1]["shear_stress"] == pytest.approx(turned.material.lame_mu * radius * np.radians(1.0) / 3.0, rel=0.02)
-    places, moved = simulation.domain.mesh.geometry.x, simulation.unknown.x.array.reshape(-1, 3)
-    nodes = simulation.unknown.function_space.tabulate_dof_coordinates()
-    assert len(places) == len(nodes)
     top = nodes[:, 2] > 3.0 - 1e-9
     angle = np.angle((nodes + moved)[top] @ [1, 1j, 0]) - np.angle(nodes[top] @ [1, 1j, 0])
     np.testing.assert_allclose(np.degrees((angle + np.pi) % (2 * np.pi) - np.pi), 1.0, atol=1e-9)
-    other = simulated(turned.with_values({"loads.torsion.value": -1.0}))[1]
+    other = rows_of(turned.with_values({"loads.torsion.value": -1.0}))
     assert other[-1]["shear_stress"] == pytest.approx(-rows[-1]["shear_stress"], rel=1e-6)
 
 
 def test_torsion_stands_beside_elongation_and_turns_the_collagen(scene: Any) -> None:
     """One angle for both ends of a spiral: chains leave 45 degrees; one number cannot say it, so no reduction does."""
     turned = scene("torsion")
-    _, rows = simulated(turned)
+    rows = rows_of(turned)
     assert rows[-1]["axial_elongation"] == pytest.approx(0.05) and rows[-1]["torsion"] == 20.0
     assert rows[-1]["shear_stress"] > 0.5 and rows[-1]["fibre_angle_inner"] < 44.0
     with pytest.raises(SceneError, match="model.kinematics = 'radial': loads.torsion would have to be applied"):

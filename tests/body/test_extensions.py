@@ -6,8 +6,6 @@ may; `monkeypatch.setitem` stands for the script's own ``REGISTRY["mine"] = mine
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -18,60 +16,9 @@ import ufl
 from mpi4py import MPI
 from pydantic import Field
 
-from remodel_fenicsx import Recording, Scene, SceneError, Simulation, parts, run
-from remodel_fenicsx.extend import (
-    AXES,
-    CHAINS,
-    COLUMNS,
-    COUPLINGS,
-    DRIVERS,
-    FORCE,
-    FORMULATIONS,
-    FRAMES,
-    KINEMATICS,
-    LAWS,
-    LENGTH,
-    LENGTH_UNIT,
-    MATRICES,
-    PAIRINGS,
-    REPULSIONS,
-    SHAPES,
-    SOLVER_METHODS,
-    STRESS_UNIT,
-    Chain,
-    Column,
-    CouplingKind,
-    Dimension,
-    Drive,
-    Driver,
-    EveryTangent,
-    Frame,
-    FullKinematics,
-    Law,
-    LoadKind,
-    LocalAxes,
-    Measurement,
-    Repulsion,
-    Selective,
-    Shape,
-    SolverMethod,
-    Staggered,
-    WATCHERS,
-    UnitCell,
-    WarnsOnce,
-    WatcherKind,
-    angle_to_axis,
-    axes_sum,
-    box_domain,
-    form,
-    markdown_reference,
-    neo_hookean,
-    principal,
-    ranked,
-    squared_end_to_end_length,
-    uniaxial_columns,
-)
+from remodel_fenicsx import Recording, Scene, SceneError, Simulation, extend, parts, run
 from remodel_fenicsx.parts import Cube, Domain, Remodeling, Tube
+from tests.runs import rows_of, simulated
 
 KAPPA = 0.1
 SCENE: dict[str, Any] = {
@@ -99,22 +46,6 @@ def whole(**tables: dict[str, Any]) -> Scene:
     return scene(**{"model": {"kinematics": "full"}, **tables})
 
 
-@contextmanager
-def simulated(scene: Scene) -> Iterator[tuple[Simulation, list[dict[str, float]]]]:
-    """A simulation at its end, and its rows."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
-        yield simulation, [step.row for step in simulation.steps()]
-    finally:
-        simulation.close()
-
-
-def rows_of(scene: Scene) -> list[dict[str, float]]:
-    """All rows of a scene."""
-    with simulated(scene) as (_, rows):
-        return rows
-
-
 def column(rows: list[dict[str, float]], name: str) -> list[float]:
     """A column, without its start."""
     return [row[name] for row in rows]
@@ -124,7 +55,7 @@ def column(rows: list[dict[str, float]], name: str) -> list[float]:
 def test_a_chain_law(monkeypatch: pytest.MonkeyPatch) -> None:
     """A linear spring in three dimensions: with isotropic cells it is a matrix with mu + c g / 3, and never locks."""
     g = 0.7
-    monkeypatch.setitem(CHAINS, "spring", Chain(lambda r, L: g * r**2 / 2, lambda r, L: g, locks=False))
+    monkeypatch.setitem(extend.CHAINS, "spring", extend.Chain(lambda r, L: g * r**2 / 2, lambda r, L: g, locks=False))
     pulled = scene(loads={"force": {"value": 30.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}}).with_values(ELASTIC)
     springs = pulled.with_values({"material.chain": "spring"})
     with simulated(springs) as (simulation, found):
@@ -140,7 +71,7 @@ def test_a_chain_law(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_chain_that_does_not_lock_may_start_longer_than_its_contour_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(CHAINS, "spring", Chain(lambda r, L: r**2 / 2, lambda r, L: 1.0, locks=False))
+    monkeypatch.setitem(extend.CHAINS, "spring", extend.Chain(lambda r, L: r**2 / 2, lambda r, L: 1.0, locks=False))
     long = {"cells.end_to_end_length": 3.0, "material.contour_length": 2.0}
     assert scene().with_values({**long, "material.chain": "spring"}).cells.end_to_end_length == 3.0
     with pytest.raises(SceneError, match="must be smaller than material.contour_length = 2"):
@@ -154,8 +85,8 @@ def test_a_matrix_energy(monkeypatch: pytest.MonkeyPatch) -> None:
         log_jacobian = ufl.ln(ufl.det(F))
         return lame_lambda / 2 * log_jacobian**2 + lame_mu / 2 * (ufl.inner(F, F) - 3) - lame_mu * log_jacobian
 
-    monkeypatch.setitem(MATRICES, "again", again)
-    monkeypatch.setitem(MATRICES, "double", lambda F, *lame: 2 * neo_hookean(F, *lame))
+    monkeypatch.setitem(extend.MATRICES, "again", again)
+    monkeypatch.setitem(extend.MATRICES, "double", lambda F, *lame: 2 * extend.neo_hookean(F, *lame))
     matrix = scene().with_values(WITHOUT_CHAINS)
     expected = column(rows_of(matrix), "mean_stretch")
     assert column(rows_of(matrix.with_values({"material.matrix": "again"})), "mean_stretch") == expected
@@ -167,8 +98,10 @@ def test_a_matrix_energy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_repulsion(monkeypatch: pytest.MonkeyPatch) -> None:
     """M = r^2 cancels the chains' stress at F = I as the logarithms do; the network is then softer."""
-    monkeypatch.setitem(REPULSIONS, "again", Repulsion(axes_sum))
-    monkeypatch.setitem(REPULSIONS, "squared", Repulsion(lambda F, cells, r0: squared_end_to_end_length(F, cells)))
+    monkeypatch.setitem(extend.REPULSIONS, "again", extend.Repulsion(extend.axes_sum))
+    monkeypatch.setitem(
+        extend.REPULSIONS, "squared", extend.Repulsion(lambda F, cells, r0: extend.squared_end_to_end_length(F, cells))
+    )
     expected = column(rows_of(scene(**{"remodeling": {"law": "none"}})), "mean_stretch")
     found = {
         name: column(rows_of(scene(material={"repulsion": name}, remodeling={"law": "none"})), "mean_stretch")
@@ -183,8 +116,8 @@ def test_a_repulsion(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     """The Kirchhoff stress is J times Cauchy's: the same axes, the same ratios, the same cells."""
-    monkeypatch.setitem(DRIVERS, "kirchhoff", Driver(lambda F, s: ufl.det(F) * s.cauchy, False))
-    monkeypatch.setitem(DRIVERS, "pressed", Driver(lambda F, s: -s.cauchy, False))
+    monkeypatch.setitem(extend.DRIVERS, "kirchhoff", extend.Driver(lambda F, s: ufl.det(F) * s.cauchy, False))
+    monkeypatch.setitem(extend.DRIVERS, "pressed", extend.Driver(lambda F, s: -s.cauchy, False))
     final = {}
     for name in ("cauchy", "kirchhoff", "pressed"):
         with simulated(scene(remodeling={"driver": name})) as (simulation, _):
@@ -202,8 +135,8 @@ def rotated_back(F: np.ndarray, spatial_axes: np.ndarray) -> np.ndarray:
 
 def test_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing turns it is the printed frame; a rotation of the loaded body, which that one sees, it does not."""
-    monkeypatch.setitem(FRAMES, "rotated", Frame(rotated_back, carries_axes=False))
-    monkeypatch.setitem(FRAMES, "across", Frame(lambda F, m: np.roll(m, 1, axis=1), carries_axes=False))
+    monkeypatch.setitem(extend.FRAMES, "rotated", extend.Frame(rotated_back, carries_axes=False))
+    monkeypatch.setitem(extend.FRAMES, "across", extend.Frame(lambda F, m: np.roll(m, 1, axis=1), carries_axes=False))
     frames = ("spatial", "rotated", "across")
     expected, found, across = (rows_of(scene(remodeling={"frame": name}))[-1]["mean_fibre_angle"] for name in frames)
     assert found == pytest.approx(expected, abs=1e-12)
@@ -211,12 +144,21 @@ def test_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
 
     F, stress = np.diag([0.8, 1.1, 1.4])[None], np.diag([-1.0, 0.5, 2.0])[None]
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    cells = UnitCell(np.full((1, 3), 3**-0.5), np.eye(3)[None])
+    cells = extend.UnitCell(np.full((1, 3), 3**-0.5), np.eye(3)[None])
     axes = {}
     for frame in ("spatial", "rotated"):
         for Q in (np.eye(3), turn):
-            drive = Drive(Q @ F, Q @ stress @ Q.T, DRIVERS["cauchy"], FRAMES[frame], 0.0, cells.dimensions, 1.0, KAPPA)
-            axes.setdefault(frame, []).append(LAWS["explicit"].update(cells, drive, 0.0, 1.0).axes[0])
+            drive = extend.Drive(
+                Q @ F,
+                Q @ stress @ Q.T,
+                extend.DRIVERS["cauchy"],
+                extend.FRAMES[frame],
+                0.0,
+                cells.dimensions,
+                1.0,
+                KAPPA,
+            )
+            axes.setdefault(frame, []).append(extend.LAWS["explicit"].update(cells, drive, 0.0, 1.0).axes[0])
     still, turned = axes["rotated"]
     np.testing.assert_allclose(np.abs(still @ turned.T), np.eye(3), atol=1e-12)
     still, turned = axes["spatial"]
@@ -229,7 +171,7 @@ def test_a_ranked_law(monkeypatch: pytest.MonkeyPatch) -> None:
     def euler(l: Any, l0: Any, target: Any, kappa: float, time_old: float, time_new: float) -> Any:
         return l + kappa * (time_new - time_old) * (target - l)
 
-    monkeypatch.setitem(LAWS, "euler", ranked(euler, has_limit=True))
+    monkeypatch.setitem(extend.LAWS, "euler", extend.ranked(euler, has_limit=True))
     rows = rows_of(scene(remodeling={"law": "euler"}))
     for passes, row in enumerate(rows):
         left = (1 - KAPPA) ** passes
@@ -241,12 +183,12 @@ def test_a_ranked_law(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_law_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     """Collagen that is lost where it is pulled: no target, no ranks, the axes stay."""
 
-    def lost(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+    def lost(cells: extend.UnitCell, drive: extend.Drive, time_old: float, time_new: float) -> extend.UnitCell:
         pulled = np.linalg.eigvalsh(drive.tensor)[:, -1:] > drive.threshold
         share = np.where(pulled, np.exp(-drive.kappa * (time_new - time_old)), 1.0)
-        return UnitCell(share * cells.dimensions, cells.axes)
+        return extend.UnitCell(share * cells.dimensions, cells.axes)
 
-    monkeypatch.setitem(LAWS, "lost", Law(lost))
+    monkeypatch.setitem(extend.LAWS, "lost", extend.Law(lost))
     with simulated(whole(remodeling={"law": "lost"})) as (simulation, rows):
         left = np.exp(-KAPPA * 4.0) * simulation.cells.initial_dimensions
         np.testing.assert_allclose(simulation.cells.dimension_values, left, rtol=1e-13)
@@ -260,10 +202,10 @@ def test_a_pairing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The largest tension belongs to the last dimension: the start of a cell is another one, eq. (11) is the same."""
 
     def ascending(*tensors: Any, **limits: Any) -> Any:
-        values, axes = principal(*tensors, **limits)
+        values, axes = extend.principal(*tensors, **limits)
         return values[:, ::-1], axes[:, ::-1]
 
-    monkeypatch.setitem(PAIRINGS, "ascending", ascending)
+    monkeypatch.setitem(extend.PAIRINGS, "ascending", ascending)
     for pairing, along, across in (("sorted", 0.8, 0.6), ("ascending", 0.0, 1.0)):
         rows = rows_of(scene(cells={"initial": [0.8, 0.6, 0.0]}, remodeling={"pairing": pairing}))
         for passes, row in enumerate(rows[1:], start=1):
@@ -275,11 +217,11 @@ def test_a_pairing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells along an axis that leans by 30 degrees from the load."""
 
-    def leaning(points: LocalAxes) -> np.ndarray:
+    def leaning(points: extend.LocalAxes) -> np.ndarray:
         c, s = np.cos(np.pi / 6), 0.5
         return np.broadcast_to([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]], (*points.coordinates.shape[:-1], 3, 3))
 
-    monkeypatch.setitem(AXES, "leaning", leaning)
+    monkeypatch.setitem(extend.AXES, "leaning", leaning)
     with pytest.raises(SceneError, match="^cells.axes = 'leaning': allowed for shape 'cube' is 'global'$"):
         whole(cells={"axes": "leaning", "initial": "aligned"})
     monkeypatch.setattr(Cube, "axis_kinds", (*Cube.axis_kinds, "leaning"))
@@ -291,12 +233,14 @@ def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_load(monkeypatch: pytest.MonkeyPatch) -> None:
     """Weight along z: on one trilinear element the nodal forces are those of half of it, pulling at the top."""
 
-    def add_weight(shape: Shape, loading: Any, name: str) -> None:
+    def add_weight(shape: extend.Shape, loading: Any, name: str) -> None:
         weight = loading.magnitude(name)
         loading.add_term(lambda u, v: -weight * v[2] * loading.weight * ufl.dx)
 
-    density = Dimension("force per volume", "9.81 kN/m^3", ((STRESS_UNIT, 1), (LENGTH_UNIT, -1)))
-    monkeypatch.setitem(Cube.loads, "weight", LoadKind(add_weight, "weight along z per reference volume", density))
+    density = extend.Dimension("force per volume", "9.81 kN/m^3", ((extend.STRESS_UNIT, 1), (extend.LENGTH_UNIT, -1)))
+    monkeypatch.setitem(
+        Cube.loads, "weight", extend.LoadKind(add_weight, "weight along z per reference volume", density)
+    )
     ramp = [[0.0, 0.0], [2.0, 1.0]]
     heavy = whole(geometry={"length_unit": "m"}, loads={"force": {"value": 0.0, "ramp": ramp},
                                                         "weight": {"value": "0.02 kN/m^3", "ramp": ramp}})  # fmt: skip
@@ -310,7 +254,7 @@ def test_a_load(monkeypatch: pytest.MonkeyPatch) -> None:
         Scene(geometry={"shape": "tendon"}, loads={"weight": {"value": 1.0, "ramp": ramp}}, time={"end": 1.0})
 
 
-STRETCHED = LoadKind(
+STRETCHED = extend.LoadKind(
     lambda shape, loading, name: loading.add_prescribed_elongation(name, "z1", 2, shape.side),
     "strain of the height",
     reductions=("point",),
@@ -320,7 +264,7 @@ STRETCHED = LoadKind(
 class Held(Cube):
     """A cube that is stretched, between walls: x can not change."""
 
-    loads: ClassVar[dict[str, LoadKind]] = {"stretch": STRETCHED}
+    loads: ClassVar[dict[str, extend.LoadKind]] = {"stretch": STRETCHED}
 
     shape: Literal["held"] = Field(default="held", description="Which body it is.")
 
@@ -342,7 +286,7 @@ class Clamped(Held):
 def test_a_prescribed_displacement_of_a_body_as_a_point(monkeypatch: pytest.MonkeyPatch) -> None:
     """The rows are those of the whole cube; what the one strain cannot be is refused."""
     for shape in (Held, Clamped):
-        monkeypatch.setitem(SHAPES, shape.model_fields["shape"].default, shape)
+        monkeypatch.setitem(extend.SHAPES, shape.model_fields["shape"].default, shape)
     values = scene().model_dump(exclude={"geometry", "preset", "format", "model", "loads"}, exclude_none=True)
     values["loads"] = {"stretch": {"value": 0.3, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}
     held = Scene(**values, geometry={"shape": "held", "side": 2.0}, model={"kinematics": "full"})
@@ -366,7 +310,7 @@ class Cased(Tube):
 
 
 def test_a_radius_that_is_held_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(SHAPES, "cased", Cased)
+    monkeypatch.setitem(extend.SHAPES, "cased", Cased)
     values = scene().model_dump(exclude={"geometry", "preset", "format", "model", "loads"}, exclude_none=True)
     values["loads"] = {"pressure": {"value": 3.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}
     radii = {"inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0}
@@ -378,15 +322,17 @@ def test_a_radius_that_is_held_stays(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The body's volume, integrated on the mesh: the cube's lengths know it too."""
 
-    def volume(m: Measurement) -> float:
+    def volume(m: extend.Measurement) -> float:
         def compiled() -> Any:
             F = m.state.kinematics.deformation_gradient(m.state.unknown)
-            return form(ufl.det(F) * m.quadrature.dx)
+            return extend.form(ufl.det(F) * m.quadrature.dx)
 
         return float(dolfinx.fem.assemble_scalar(m.tool("volume", compiled)))
 
-    monkeypatch.setitem(COLUMNS, "volume", Column("volume", "length^3", "volume of the deformed body", volume))
-    section = Column(
+    monkeypatch.setitem(
+        extend.COLUMNS, "volume", extend.Column("volume", "length^3", "volume of the deformed body", volume)
+    )
+    section = extend.Column(
         "section", "length^2", "area across the load", lambda m: float(np.prod(m.position.max(axis=0)[:2]))
     )
     monkeypatch.setattr(Cube, "columns", (*Cube.columns, section))
@@ -396,34 +342,34 @@ def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert history["volume"][0] == pytest.approx(1.0) and history["volume"][-1] > 1.05
 
 
-class Bar(Shape):
+class Bar(extend.Shape):
     """A bar of rectangular cross-section along z."""
 
-    loads: ClassVar[dict[str, LoadKind]] = {
-        "force": LoadKind(
+    loads: ClassVar[dict[str, extend.LoadKind]] = {
+        "force": extend.LoadKind(
             lambda shape, loading, name: loading.add_dead_force(name, "z1", 2),
             "force on the top",
-            FORCE,
+            extend.FORCE,
             area=lambda shape: shape.width * shape.depth,
         )
     }
-    columns: ClassVar[tuple[Column, ...]] = (
-        *uniaxial_columns("z1", "length"),
-        Column("width", "length", "mean of the deformed side", lambda m: m.face_mean("x1", m.position[:, 0])),
+    columns: ClassVar[tuple[extend.Column, ...]] = (
+        *extend.uniaxial_columns("z1", "length"),
+        extend.Column("width", "length", "mean of the deformed side", lambda m: m.face_mean("x1", m.position[:, 0])),
     )
     number_of_elements: ClassVar[int] = 4
     face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
 
     shape: Literal["bar"] = Field(default="bar", description="Which body it is.")
-    width: Annotated[float, LENGTH] = Field(default=1.0, gt=0, description="Length along x.")
-    depth: Annotated[float, LENGTH] = Field(default=2.0, gt=0, description="Length along y.")
-    length: Annotated[float, LENGTH] = Field(default=4.0, gt=0, description="Length along z.")
+    width: Annotated[float, extend.LENGTH] = Field(default=1.0, gt=0, description="Length along x.")
+    depth: Annotated[float, extend.LENGTH] = Field(default=2.0, gt=0, description="Length along y.")
+    length: Annotated[float, extend.LENGTH] = Field(default=4.0, gt=0, description="Length along z.")
 
     def build(self, mesh: Any, comm: Any = None) -> Domain:
         """Of plane faces, whatever degree the scene asks for."""
         sides = {"width": self.width, "depth": self.depth, "length": self.length}
         flat = mesh.model_copy(update={"degree": 1})
-        return box_domain("bar", sides, [*sides.values()], (1, 2, 2), flat, comm)
+        return extend.box_domain("bar", sides, [*sides.values()], (1, 2, 2), flat, comm)
 
     def hold(self, loading: Any) -> None:
         """Three planes of symmetry."""
@@ -432,12 +378,12 @@ class Bar(Shape):
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
         """To x, across the load."""
-        return angle_to_axis(dimensions, axes, np.array([1.0, 0.0, 0.0]))
+        return extend.angle_to_axis(dimensions, axes, np.array([1.0, 0.0, 0.0]))
 
 
 def test_a_shape(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A bar of isotropic cells is as uniform as the cube: the same stretch under the same stress."""
-    monkeypatch.setitem(SHAPES, "bar", Bar)
+    monkeypatch.setitem(extend.SHAPES, "bar", Bar)
     cube = scene()
     values = cube.model_dump(exclude={"geometry", "preset", "format", "model"}, exclude_none=True)
     values["loads"]["force"]["value"] *= 1.5 * 2.0
@@ -458,7 +404,7 @@ def test_a_shape(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(SHAPES, "bar", Bar)
+    monkeypatch.setitem(extend.SHAPES, "bar", Bar)
     curved = Scene(geometry={"shape": "bar"}, mesh={"degree": 2}, time={"end": 1.0})
     with pytest.raises(SceneError, match="^mesh.degree = 2: the mesh has degree 1$"):
         Simulation(curved, MPI.COMM_SELF)
@@ -472,7 +418,7 @@ def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypat
 def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that lets the cells alone until t = 2."""
 
-    class Late(Staggered):
+    class Late(extend.Staggered):
         def remodel(self, time: float) -> float:
             return super().remodel(time) if time > 2.0 else 0.0
 
@@ -481,8 +427,8 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
         match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'$",
     ):
         scene(remodeling={"coupling": "late"})
-    late = CouplingKind("as staggered, but the cells stay as they are up to t = 2", Late)
-    monkeypatch.setitem(COUPLINGS, "late", late)
+    late = extend.CouplingKind("as staggered, but the cells stay as they are up to t = 2", Late)
+    monkeypatch.setitem(extend.COUPLINGS, "late", late)
     angles = column(rows_of(scene(remodeling={"coupling": "late"})), "mean_fibre_angle")
     isotropic = np.degrees(np.arccos(3**-0.5))
     np.testing.assert_allclose(angles[:3], isotropic, rtol=1e-12)
@@ -492,7 +438,7 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_watcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """One of every run, which warns once, and one of this run."""
 
-    class Long(WarnsOnce):
+    class Long(extend.WarnsOnce):
         name = "long"
 
         def look(self, step: Any) -> str:
@@ -505,7 +451,7 @@ def test_a_watcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         def committed(self, step: Any) -> None:
             self.seen.append(step.time)
 
-    monkeypatch.setitem(WATCHERS, "long", WatcherKind(Long.of))
+    monkeypatch.setitem(extend.WATCHERS, "long", extend.WatcherKind(Long.of))
     times = Times()
     folder = run(scene(), tmp_path / "run", MPI.COMM_SELF, watchers=[times])
     rows = Recording(folder).history
@@ -517,7 +463,7 @@ def test_a_watcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of the displacement as the unknown: nobody who asks the kinematics notices."""
 
-    class Halved(FullKinematics):
+    class Halved(extend.FullKinematics):
         def displacement(self, unknown: Any) -> Any:
             return 2 * unknown
 
@@ -527,7 +473,7 @@ def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
         def nodal_displacement(self, unknown: Any) -> Any:
             return 2 * super().nodal_displacement(unknown)
 
-    monkeypatch.setitem(KINEMATICS, "halved", Halved())
+    monkeypatch.setitem(extend.KINEMATICS, "halved", Halved())
     matrix = scene().with_values(WITHOUT_CHAINS)
     expected, found = rows_of(matrix), []
     with simulated(matrix.with_values({"model.kinematics": "halved"})) as (simulation, found):
@@ -539,7 +485,9 @@ def test_a_kinematics(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_formulation(monkeypatch: pytest.MonkeyPatch) -> None:
     """The two parts apart, but by the same rule: rows as with the whole energy."""
-    monkeypatch.setitem(FORMULATIONS, "apart", Selective("both parts at all points", {("hexahedron", 1): 2}))
+    monkeypatch.setitem(
+        extend.FORMULATIONS, "apart", extend.Selective("both parts at all points", {("hexahedron", 1): 2})
+    )
     with pytest.raises(
         SceneError, match="^mesh.formulation = 'apart': allowed for elements 'hexahedron' of degree 2 is"
     ):
@@ -557,14 +505,14 @@ def test_a_solver_method(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its options reach PETSc, and its class solves the systems."""
     made = []
 
-    class Watched(EveryTangent):
+    class Watched(extend.EveryTangent):
         def renew(self) -> None:
             super().renew()
             made.append(self)
 
     options = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "ksp_type": "gmres", "pc_type": "jacobi"}
-    method = SolverMethod({**options, "ksp_rtol": 1e-12}, "for this test", Watched)
-    monkeypatch.setitem(SOLVER_METHODS, "krylov", method)
+    method = extend.SolverMethod({**options, "ksp_rtol": 1e-12}, "for this test", Watched)
+    monkeypatch.setitem(extend.SOLVER_METHODS, "krylov", method)
     expected, found = (rows_of(whole().with_values({"solver.method": name})) for name in ("direct", "krylov"))
     np.testing.assert_allclose(column(found, "mean_stretch"), column(expected, "mean_stretch"), rtol=1e-9)
     assert column(expected, "linear_iterations") == column(expected, "newton_iterations")
@@ -596,4 +544,6 @@ def test_a_scene_key() -> None:
         HealingScene(**{**SCENE, "remodeling": {"rest": -1.0}})
     with pytest.raises(SceneError, match="^remodeling.rest = 2.5: unknown key"):
         Scene(**values)
-    assert "| `rest` | `0.0` | a finite number at least 0 | Time before the cells" in markdown_reference(HealingScene)
+    assert "| `rest` | `0.0` | a finite number at least 0 | Time before the cells" in extend.markdown_reference(
+        HealingScene
+    )

@@ -12,7 +12,6 @@ from typing import Any
 import meshio
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, run, running
 from remodel_fenicsx.body import tube
@@ -20,8 +19,9 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.axes import cells_of, structure_tensors
 from remodel_fenicsx.running import resume
 from tests.results.test_export import TUBE
+from tests.runs import SELF, made
+from tests.tables import rows, unescaped
 
-SELF = MPI.COMM_SELF
 R0 = 0.9
 
 
@@ -55,12 +55,11 @@ def scene(file: Path | str, **cells: Any) -> Scene:
 
 def tensors_of(one: Scene) -> np.ndarray:
     """A at the points of each element, by the number of the element."""
-    simulation = Simulation(one, SELF)
-    tensors = simulation.cells.structure_tensor()
-    found = np.empty_like(tensors)
-    found[simulation.domain.element_number] = tensors
-    simulation.close()
-    return found
+    with made(one) as simulation:
+        tensors = simulation.cells.structure_tensor()
+        found = np.empty_like(tensors)
+        found[simulation.domain.element_number] = tensors
+        return found
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -103,14 +102,14 @@ def test_what_is_exported_comes_back(kind: str, exported: Callable[[str], Path],
 
 def test_rows_belong_to_numbers_or_else_to_places(exported: Callable[[str], Path], tmp_path: Path) -> None:
     """Shuffled rows; six numbers in place of nine; places a little beside those of the elements."""
-    rows = rows_of(exported("csv"))
+    table_rows = rows_of(exported("csv"))
     wanted = tensors_of(scene(exported("csv")))
-    order = np.random.default_rng(2).permutation(len(rows))
+    order = np.random.default_rng(2).permutation(len(table_rows))
     np.testing.assert_allclose(
-        tensors_of(scene(table(tmp_path / "a.csv", [rows[i] for i in order]))), wanted, atol=1e-14
+        tensors_of(scene(table(tmp_path / "a.csv", [table_rows[i] for i in order]))), wanted, atol=1e-14
     )
     six = [{f"structure_tensor_{c}": row[f"structure_tensor_{c}"] for c in ("xx", "yy", "zz", "xy", "yz", "xz")}
-           | {c: float(row[c]) + 0.05 for c in "xyz"} for row in rows]  # fmt: skip
+           | {c: float(row[c]) + 0.05 for c in "xyz"} for row in table_rows]  # fmt: skip
     shuffled = [six[i] for i in order] + [six[0] | {"x": 100.0, "structure_tensor_xx": 50.0}]
     for number, found in enumerate((shuffled[:-1], shuffled)):  # as many as elements, and one more
         path = table(tmp_path / f"b{number}.csv", found)
@@ -279,65 +278,16 @@ def test_a_region_has_a_file_of_its_own(tmp_path: Path) -> None:
 
 # ---------------------------------------------------------------- what is refused
 
-HEAD = "element,fibre_x,fibre_y,fibre_z\n"
-BAD = {
-    "a.txt": ("", r"allowed are files .vtu, .xdmf, .csv"),
-    "nothing.csv": (None, r"cannot be read: No such file"),
-    "empty.csv": ("", r"is no table: needed are a row of names and rows of numbers"),
-    "words.csv": ("angle\nsteep\n", r"row 1, angle: 'steep' is no number"),
-    "short.csv": ("angle\n" + "1\n" * 31, r"has 31 rows without places \(x, y, z\), the mesh has 32 elements"),
-    "unknown.csv": ("x,y,z,direction\n0,0,0,1\n", r"the column 'direction' is not known; allowed are x, y, z, element"),
-    "weights.csv": ("angle,weights\n" + "1,0.5\n" * 32, r"the column 'weights' is not known; allowed are .*, weight, "),
-    "spread.csv": ("angle,kappa\n" + "1,0.1\n" * 32, r"the column 'kappa' is not known"),
-    "second.csv": (
-        "fibre_x,fibre_y,fibre_z,fibre2_x,fibre2_y,fibre2_z\n" + "1,0,0,0,1,0\n" * 32,
-        r"the column 'fibre2_x' is not known; allowed are .*, fibre_2_x, ",
-    ),
-    "twice.csv": ("angle,Angle\n" + "1,2\n" * 32, r"the column angle is there twice"),
-    "flat.csv": ("x,y,angle\n" + "1,2,3\n" * 32, r"has x, y without the other columns"),
-    "part.csv": ("angle,fibre_2_x\n" + "1,2\n" * 32, r"has fibre_2_x without the other columns"),
-    "places.csv": ("x,y,z\n" + "1,2,3\n" * 32, r"has columns x, y, z; needed is one of structure_tensor"),
-    "nameless.csv": ("1,2\n3,4\n", r"begins with a row of numbers; the first row must have the names of the columns"),
-    "mixed.csv": ("x;y;z;angle\n0,5;1.5;2;3\n", r"row 1, y: '1.5' is no number \(others have decimal commas\)"),
-    "latin.csv": (b"angle,\xb5\n1,2\n", r"is no text in UTF-8"),
-    "separator.csv": ("sep=ab\nangle\n1\n", r"cannot be read as a table: "),
-    "nan.csv": ("angle\n" + "1\n" * 4 + "nan\n" + "1\n" * 27, r"row 5, angle: 'nan' is no number"),
-    "zero.csv": (HEAD + "\n".join(f"{n},0,0,{n - 9}" for n in range(1, 33)), r"fibre of row 9 is the zero vector"),
-    "weight.csv": ("angle,weight\n" + "1,0.5\n" * 31 + "1,1.5\n", r"weight of row 32 is not from 0 to 1"),
-    "numbers.csv": ("element,angle\n" + "1,1\n" * 32, r"element must have the numbers 1 to 32, each once"),
-    "both.csv": ("angle,fibre_x,fibre_y,fibre_z\n" + "1,1,1,1\n" * 32, r"has fibre and angle of structure_tensor"),
-    "far.csv": ("x,y,z,angle\n0,0,9,1\n", r"nothing is measured within one element \([\d.]+\) of \("),
-    "damaged.vtu": ("<VTKFile", r"cannot be read: "),
-    "negative.csv": (
-        ",".join(f"structure_tensor_{c}" for c in ("xx", "yy", "zz", "xy", "yz", "xz")) + "\n" + "1,1,-1,0,0,0\n" * 32,
-        r"structure_tensor of row 1 has eigenvalues -1, 1, 1; none may be below 0",
-    ),
-    "outside.xdmf": ('<Xdmf><DataItem Format="HDF">/etc/x.h5:/a</DataItem></Xdmf>', r"numbers stand in another file"),
-    "entity.vtu": ('<!DOCTYPE a [<!ENTITY b "c">]><VTKFile/>', r"document type or entities"),
-}
 
-
-@pytest.mark.parametrize("name", BAD)
-def test_a_bad_file_is_said_in_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text, said = BAD[name]
-    if text is not None:
-        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+@pytest.mark.parametrize(("name", "text", "row", "often", "said"), rows(__file__, "bad_fibres.txt"))
+def test_a_bad_file_is_said_in_one_line(name: str, text: str, row: str, often: str, said: str, tmp_path: Path) -> None:
+    if text != "-":
+        (tmp_path / name).write_bytes(unescaped(text + int(often) * row).encode("latin-1"))
     with pytest.raises(SceneError, match=rf"^cells.fibres = '.*{name}': .*{said}") as error:
         Simulation(scene(tmp_path / name), SELF)
     assert "\n" not in str(error.value)
 
 
-def test_two_sources_and_reductions_are_refused() -> None:
-    with pytest.raises(SceneError, match="cells.fibres = 'a.csv': cells.initial = 'isotropic' is there too; one of"):
-        scene("a.csv", initial="isotropic")
-    with pytest.raises(SceneError, match="cells.initial = 'fibres': needs cells.fibres, the name of a file"):
-        Scene(**TUBE | {"cells": {"initial": "fibres"}})
-    with pytest.raises(SceneError, match="model.kinematics = 'radial': cells.fibres gives other cells to each element"):
-        Scene(**TUBE | {"cells": {"fibres": "a.csv"}, "model": {"kinematics": "radial"}})
-    regions = {"media": {"cells": {"fibres": "a.csv", "initial": "isotropic"}}}
-    with pytest.raises(SceneError, match="regions.media.cells.fibres = 'a.csv': regions.media.cells.initial = 'isotr"):
-        Scene(**TUBE | {"regions": regions})
+def test_the_presets_random_cells_lie_under_a_file() -> None:
     preset = Scene(preset="kuhl-holzapfel-2007", geometry={"shape": "tube"}, cells={"fibres": "a.csv"})
-    assert preset.cells.initial == "fibres", "the preset's random cells lie under it"
+    assert preset.cells.initial == "fibres"

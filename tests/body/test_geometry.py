@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import basix
 import dolfinx
@@ -20,7 +19,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body import Cube, Tendon, Tube
-from remodel_fenicsx.body.domain import interval_domain
+from remodel_fenicsx.body.domain import lattice_domain
 from remodel_fenicsx.body.mesh_file import read_mesh
 from tests import parallel_geometry
 from tests.parts import cube, tendon, tube
@@ -84,24 +83,6 @@ def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape,
     refined = {"cube": 27, "tendon": (81 + 4 * 32) * 21, "tube": 32 * 17 * 25}
     assert domain.number_of_nodes == (nodes if refinement == 1 else refined[shape])
     assert domain.mesh.topology.cell_name() == "hexahedron"
-
-
-@pytest.mark.parametrize("shape", BUILDERS)
-def test_each_hexahedron_makes_six_tetrahedra_on_the_same_nodes(shape):
-    hexahedra, tetrahedra = domain_of(shape), domain_of(shape, "tetrahedron")
-    assert tetrahedra.mesh.topology.cell_name() == "tetrahedron"
-    assert tetrahedra.number_of_elements == 6 * hexahedra.number_of_elements
-    distance, match = cKDTree(hexahedra.gather_mesh()[0]).query(tetrahedra.gather_mesh()[0])
-    assert distance.max() < 1e-13 and len(set(match)) == hexahedra.number_of_nodes
-
-
-@pytest.mark.parametrize("shape", BUILDERS)
-@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
-def test_degree_two_has_the_nodes_of_degree_one_between_new_ones(shape, element):
-    domain = domain_of(shape, element, 2)
-    assert domain.number_of_nodes == domain_of(shape, refinement=2).number_of_nodes
-    assert domain.mesh.ufl_domain().ufl_coordinate_element().basix_element.degree == 2
-    assert domain.gather_mesh()[1].shape[1] == {"hexahedron": 27, "tetrahedron": 10}[element]
 
 
 # ---------------------------------------------------------------- sizes
@@ -197,33 +178,6 @@ def on_faces(shape, domain):
         yield name, np.abs(where[name](mesh.geometry.x[np.unique(nodes)])).max()
 
 
-@pytest.mark.parametrize("shape", BUILDERS)
-@pytest.mark.parametrize("refinement", [1, 2])
-def test_each_named_face_lies_where_its_name_says(shape, refinement):
-    distances = dict(on_faces(shape, domain_of(shape, refinement=refinement)))
-    assert max(distances.values()) < 1e-14
-
-
-@pytest.mark.parametrize(
-    ("element", "degree", "refinement"),
-    [
-        *((element, degree, 1) for element, degree in KINDS),
-        ("hexahedron", 1, 2),
-        ("hexahedron", 1, 3),
-    ],
-)
-def test_nodes_for_the_supports(element, degree, refinement):
-    body = domain_of("tendon", element, degree, refinement)
-    assert all(has_node(body.gather_mesh()[0], (0, 0, 0), (body.dimensions["radius"], 0, 0)))
-    body = (
-        domain_of("tube", element, degree, refinement)
-        if refinement < 3
-        else tube(refinement=refinement, divisions=(16, 8, 1), comm=MPI.COMM_SELF)
-    )
-    assert all(has_node(body.gather_mesh()[0], (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
-    assert not any(has_node(body.gather_mesh()[0], (0, 0, 0), (1, 1e-3, 0)))
-
-
 @pytest.mark.parametrize(("element", "degree"), KINDS)
 def test_the_tube_is_equally_divided_through_the_wall_around_and_along(element, degree):
     points, _ = domain_of("tube", element, degree).gather_mesh()
@@ -242,33 +196,12 @@ def test_the_tube_is_equally_divided_through_the_wall_around_and_along(element, 
     assert np.abs(steps - np.round(steps)).max() < 1e-12
 
 
-@pytest.mark.parametrize(("element", "degree", "refinement"), [*((*kind, 1) for kind in KINDS), ("hexahedron", 1, 2)])
-def test_a_tube_with_divisions_of_its_own(element, degree, refinement):
-    body = tube(
-        1.0, 2.0, 0.25, element=element, degree=degree, refinement=refinement, divisions=(12, 3, 1), comm=MPI.COMM_SELF
-    )
-    around, through, along = 12 * refinement, 3 * refinement, refinement
-    assert body.number_of_elements == around * through * along * (6 if element == "tetrahedron" else 1)
-    points = body.gather_mesh()[0]
-    radii = np.hypot(points[:, 0], points[:, 1])
-    corners = np.isclose(radii * through, np.round(radii * through), rtol=0, atol=1e-12)
-    assert len(np.unique(np.round(radii[corners], 9))) == through + 1
-    assert all(has_node(points, (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
-    assert np.array_equal(np.unique(points[:, 2]), np.linspace(0.0, 0.25, along * degree + 1))
-    on_the_inner_circle = (np.abs(radii - 1.0) < 1e-12) & (points[:, 2] == 0.0)
-    assert np.count_nonzero(on_the_inner_circle) == around * degree
-    assert area(body, "inner") == pytest.approx(
-        0.25 * (2 * around * np.sin(np.pi / around) if degree == 1 else 2 * np.pi), rel=1e-3 if degree == 2 else 1e-12
-    )
-
-
 @pytest.mark.parametrize("kind", ["drawn", "points"])
 def test_ufls_side_of_a_mesh_is_ufls_own_but_for_the_number_of_its_cells(kind):
     """The same forms, so that kernels have the same names; one cell, however often it is asked for."""
-    line, faces = ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0), np.linspace(0.0, 1.0, 7), 2), {
-        "inner": lambda x: np.isclose(x[0], 1.0)
-    }
-    domain = domain_of("tube") if kind == "drawn" else interval_domain(*line, faces, "tube", {}, MPI.COMM_SELF)
+    points, faces = np.linspace([1.0, 0, 0], [2.0, 0, 0], 7), {"inner": lambda x: np.isclose(x[0], 1.0)}
+    line = points, [3], 2, faces, "tube", {}, MPI.COMM_SELF
+    domain = domain_of("tube") if kind == "drawn" else lattice_domain(*line)
     ours = domain.mesh.ufl_domain()
     theirs = ufl.Mesh(ours.ufl_coordinate_element())
     assert ours.ufl_cell() == theirs.ufl_cell() and ours.ufl_cell() is ours.ufl_cell()
@@ -277,32 +210,7 @@ def test_ufls_side_of_a_mesh_is_ufls_own_but_for_the_number_of_its_cells(kind):
     assert len(signatures) == 1
 
 
-def test_the_papers_divisions_are_the_default():
-    points, cells = tube(divisions=(16, 8, 12), comm=MPI.COMM_SELF).gather_mesh()
-    default_points, default_cells = domain_of("tube").gather_mesh()
-    assert np.array_equal(points, default_points) and np.array_equal(cells, default_cells)
-
-
 # ---------------------------------------------------------------- arguments
-def test_dimensions_and_the_scale_of_lengths():
-    assert tendon(length=2.0, area=50.0, comm=MPI.COMM_SELF).size == pytest.approx(4.04, abs=0.01)
-    body = tube(0.5, 0.75, 1.5, comm=MPI.COMM_SELF)
-    assert body.dimensions == {"inner_radius": 0.5, "outer_radius": 0.75, "length": 1.5} and body.size == 1.5
-    points, _ = cube(side=2.0, comm=MPI.COMM_SELF).gather_mesh()
-    assert points.min() == 0.0 and points.max() == 2.0
-
-
-@pytest.mark.parametrize(
-    "body", [Cube(side=2.0), Tendon(length=3.0, area=4.0), Tube(**TUBE)], ids=["cube", "tendon", "tube"]
-)
-def test_a_scenes_shape_builds_its_own_mesh(body):
-    mesh = SimpleNamespace(refinement=1, element="tetrahedron", degree=2)
-    domain = body.build(mesh, MPI.COMM_SELF)
-    assert domain.shape == body.name and domain.mesh.topology.cell_name() == "tetrahedron"
-    assert set(body.face_names) == set(domain.faces)
-    for name, value in domain.dimensions.items():
-        if name != "radius":
-            assert value == getattr(body, name)
 
 
 @pytest.mark.parametrize("unit", [1e-2, 1e2])
@@ -325,12 +233,6 @@ def test_bodies_of_extreme_proportions_are_meshed(shape, lengths, unit):
     domain, ordinary = BUILDERS[shape](*scaled, refinement=2, comm=MPI.COMM_SELF), domain_of(shape, refinement=2)
     assert domain.number_of_elements == ordinary.number_of_elements
     assert domain.number_of_nodes == ordinary.number_of_nodes
-
-
-def test_gathering_too_few_rows_is_refused():
-    domain = domain_of("tendon")
-    with pytest.raises(ValueError, match="479 rows for 480 owned entities on rank 0"):
-        domain.gather_elements(np.zeros(479))
 
 
 # ---------------------------------------------------------------- Gmsh's manners

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.body.mesh_file import MeshFileError, read_mesh
-from remodel_fenicsx.system import guarded
+from remodel_fenicsx.system import children as guarded
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
 TETRAHEDRON = "3\n0 0 0 1 0 0 0 1 0 0 0 1"

@@ -18,6 +18,7 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.reference.radial import RadialHistory, RadialMaterial, Tube, solve_radial
+from tests.runs import rows_of
 
 SELF = MPI.COMM_SELF
 INTERFACE, END = 1.5, 12.0
@@ -166,9 +167,7 @@ def test_a_comparison_can_fail() -> None:
 
 def rows(made: Scene) -> np.ndarray:
     """Columns of the whole body, but those of time and work."""
-    simulation = Simulation(made, SELF)
-    found = [step.row for step in simulation.steps()]
-    simulation.close()
+    found = rows_of(made)
     names = [name for name in found[0] if "seconds" not in name and "iterations" not in name and "media" not in name
              and "adventitia" not in name]  # fmt: skip
     return np.array([[row[name] for name in names] for row in found])

@@ -11,7 +11,6 @@ from typing import Any
 import meshio
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from remodel_fenicsx import SceneError
 from remodel_fenicsx.body import mesh_file
@@ -19,8 +18,8 @@ from remodel_fenicsx.body.mesh_faces import boundary_of, jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFileError, read_mesh
 from remodel_fenicsx.body.mesh_body import refined
 from remodel_fenicsx.scene import scene_from_dict
-from remodel_fenicsx.simulation import Simulation
 from tests.mesh_files import write_tube
+from tests.runs import last_row
 
 LOADS = {"pressure": {"value": 2.0, "ramp": [[0, 0], [2, 1]]}}
 
@@ -78,14 +77,6 @@ def scene_of(file: Path, **geometry: Any) -> Any:
             "solver": {"method": "direct"},
         }
     )
-
-
-def last_row(scene: Any) -> dict[str, float]:
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
-        return [dict(step.row) for step in simulation.steps()][-1]
-    finally:
-        simulation.close()
 
 
 def test_a_run_of_it_is_that_of_gmsh_s_file(tmp_path: Path) -> None:

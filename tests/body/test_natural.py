@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
+from remodel_fenicsx import Scene, Simulation, preset_scene
 from remodel_fenicsx.model.residual_stress import Closing, Layer, closing
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.studies.page import read_table
+from tests.runs import last_row, made, rows_of
 
 RADII = (1.0, 1.3)
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
@@ -94,8 +95,7 @@ def test_balance_and_driver_see_the_residual_stress(kinematics: str) -> None:
     """Without loads the ring keeps its radii and has no axial force; the driver has the stress of the closing."""
     unloaded = {"loads.pressure.value": 0.0, "loads.elongation.value": 0.0, "time.end": 1.0}
     unloaded |= {"output.columns": ["reduced_axial_force"]}  # without pressure the whole force
-    simulation = Simulation(scene(kinematics, **unloaded))
-    try:
+    with made(scene(kinematics, **unloaded)) as simulation:
         row = next(iter(simulation.steps())).row
         driver = simulation.stepper.remodeling.drive().tensor
         hoop = driver[:, 1, 1]
@@ -104,22 +104,6 @@ def test_balance_and_driver_see_the_residual_stress(kinematics: str) -> None:
         assert abs(row["reduced_axial_force"]) < 0.02
         assert hoop.min() == pytest.approx(-3.3, abs=0.4)
         assert hoop.max() == pytest.approx(2.0, abs=0.2)
-    finally:
-        simulation.close()
-
-
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"cells.initial": "random"}, "cells.initial"),
-        ({"mesh.formulation": "selective-integration"}, "mesh.formulation"),
-        ({"cells.axes": "global"}, "cells.axes"),
-    ],
-)
-def test_what_does_not_go_with_it_is_refused_by_name(change: dict[str, Any], key: str) -> None:
-    """One line with both keys."""
-    with pytest.raises(SceneError, match=f"natural.opening_angle.*{key}"):
-        scene("auto", **change)
 
 
 TABLE = {  # radii and mean angles of the outer eighth of the wall of an independent radial solver, t = 150
@@ -132,11 +116,7 @@ TABLE = {  # radii and mean angles of the outer eighth of the wall of an indepen
 @pytest.mark.parametrize("angle", sorted(TABLE))
 def test_the_paper_artery_with_residual_stress(angle: float) -> None:
     """Radii to 0.004, the angle outside to 1.5 degrees: the residual stress takes most of the paper's turn."""
-    simulation = Simulation(scene("radial", **{"natural.opening_angle": angle, "time.end": 150.0}))
-    try:
-        row = [step.row for step in simulation.steps()][-1]
-    finally:
-        simulation.close()
+    row = last_row(scene("radial", **{"natural.opening_angle": angle, "time.end": 150.0}))
     inner, outer, turned = TABLE[angle]
     assert row["inner_radius"] == pytest.approx(inner, abs=0.004)
     assert row["outer_radius"] == pytest.approx(outer, abs=0.004)
@@ -157,11 +137,7 @@ def test_reduced_kinematics_agree_with_residual_stress() -> None:
 def rows(**changes: Any) -> list[dict[str, float]]:
     """Of the radial tube of 120 degrees with the law `tensor`."""
     values = {"remodeling.law": "tensor", "material.repulsion": "log"}
-    simulation = Simulation(scene("radial", **(values | changes)))
-    try:
-        return [step.row for step in simulation.steps()]
-    finally:
-        simulation.close()
+    return rows_of(scene("radial", **(values | changes)))
 
 
 def test_couplings_see_the_residual_stress() -> None:
@@ -207,8 +183,7 @@ def test_a_rotation_of_the_natural_state_changes_nothing() -> None:
     With the repulsion `log`: that of the paper knows the cells' axes, however long they are.
     """
     changes = {"remodeling.law": "none", "time.end": 25.0, "material.repulsion": "log"}
-    simulation = Simulation(scene("radial", **changes))
-    try:
+    with made(scene("radial", **changes)) as simulation:
         list(simulation.steps())
         equilibrium, function = simulation.stepper.coupling.equilibrium, simulation.state.kinematics.gradient
         before = equilibrium.stored_energy()
@@ -218,8 +193,6 @@ def test_a_rotation_of_the_natural_state_changes_nothing() -> None:
         assert equilibrium.stored_energy() == pytest.approx(before, rel=1e-12)
         values[:] = values * np.array([1.1, 1.0, 1.0])
         assert equilibrium.stored_energy() != pytest.approx(before, rel=1e-3)
-    finally:
-        simulation.close()
 
 
 # ---------------------------------------------------------------- layers that were stretched before they were joined
@@ -238,8 +211,7 @@ def test_a_tube_of_stretched_layers_keeps_its_shape_without_loads() -> None:
     changes: dict[str, Any] = {"loads.pressure.value": 0.0, "loads.elongation.value": 0.0, "time.end": 1.0}
     changes |= {"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": ["reduced_axial_force"]}
     changes |= {"mesh.refinement": 2}
-    simulation = Simulation(scene("radial", **changes))
-    try:
+    with made(scene("radial", **changes)) as simulation:
         row = next(iter(simulation.steps())).row
         axial = simulation.stepper.remodeling.drive().tensor[:, 2, 2]
         radius = simulation.cells.local_axes.coordinates[..., 0].ravel()
@@ -247,8 +219,6 @@ def test_a_tube_of_stretched_layers_keeps_its_shape_without_loads() -> None:
         assert row["outer_radius"] == pytest.approx(3.0, abs=1e-6)
         assert abs(row["reduced_axial_force"]) < 1e-3
         assert axial[radius > 2].min() > 0.3 > -0.3 > axial[radius < 2].max()
-    finally:
-        simulation.close()
 
 
 def ends_of_layers(axial: float) -> tuple[float, float]:

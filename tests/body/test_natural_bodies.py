@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import SceneError, Simulation, cli
+from remodel_fenicsx import SceneError, Simulation
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.model.residual_stress import Layer, closing
 from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_layers import write_layers
 from tests.body.test_natural import layers, scene
+from tests.runs import goes_on, last_row
 
 SELF = MPI.COMM_SELF
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
@@ -63,13 +64,6 @@ def own_body(file: Path, elongation: float, **tables: Any) -> Any:
         "solver": {"method": "direct"},
     }
     return scene_from_dict(values | tables)
-
-
-def last_row(of: Any) -> dict[str, float]:
-    simulation = Simulation(of, SELF)
-    row = [dict(step.row) for step in simulation.steps()][-1]
-    simulation.close()
-    return row
 
 
 def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(tmp_path: Path) -> None:
@@ -128,21 +122,10 @@ def test_bad_layers_get_one_line(table: dict[str, Any], words: str, tmp_path: Pa
 
 
 def test_a_run_with_residual_stress_goes_on(tmp_path: Path) -> None:
-    """Two steps and two more are four, to the last digit; its scene as run has the layers, and all three angles."""
+    """Its scene as run has the layers, and it knows all three angles."""
     names = [f"fibre_angle_{of}outer" for of in ("", "unloaded_", "deformed_")]
-    text = scene(
-        "radial", **{"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": names}
-    ).to_toml()  # fmt: skip
-    (tmp_path / "scene.toml").write_text(text)
-    command = ["run", str(tmp_path / "scene.toml"), "-q", "--set", "output.fields=['fibre_angle_unloaded']"]
-    assert cli.main([*command, "-o", str(tmp_path / "all"), "--set", "time.end=4"]) == 0
-    assert cli.main([*command, "-o", str(tmp_path / "run"), "--set", "time.end=2"]) == 0
-    assert "[[natural.layers]]" in (tmp_path / "run" / "scene.toml").read_text()
-    assert cli.main(["run", "--resume", str(tmp_path / "run"), "--set", "time.end=4", "-q"]) == 0
-    tables = [(tmp_path / name / "history.csv").read_text().splitlines() for name in ("run", "all")]
-    heads = tables[0][0].split(",")
-    rows = [dict(zip(heads, table[-1].split(","), strict=True)) for table in tables]
-    for name in (*names, "time", "pressure"):
-        assert rows[0][name] == rows[1][name]
-    angles = [float(rows[0][name]) for name in names]
+    asked = scene("radial", **{"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": names})
+    found = goes_on(asked.with_values({"output.fields": ["fibre_angle_unloaded"], "time.end": 4.0}), tmp_path, 2.0)
+    assert "[[natural.layers]]" in (found.path / "scene.toml").read_text()
+    angles = [float(found.history[name][-1]) for name in names]
     assert np.ptp(angles) > 1.0 and len({round(angle, 3) for angle in angles}) == 3

@@ -76,39 +76,6 @@ def test_a_line_of_the_mesh_that_is_there_already_changes_nothing() -> None:
         np.testing.assert_allclose(points[elements], others[same], rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize("regions, line", [
-    ({"media": {"radius": 1.5}}, "regions.media.radius = 1.5: unknown key; did you mean regions.media.outer_radius?"),
-    ({"media": {"outer_radius": 1.0}, "adventitia": {}},
-     "regions.media.outer_radius = 1.0: must be greater than geometry.inner_radius = 1.0, at most outer_radius = 3.0"),
-    ({"media": {"outer_radius": 3.5}, "adventitia": {}},
-     "regions.media.outer_radius = 3.5: must be greater than geometry.inner_radius = 1.0, at most outer_radius = 3.0"),
-    ({"media": {"outer_radius": 2.0}, "adventitia": {"outer_radius": 2.0}},
-     "regions.adventitia.outer_radius = 2.0: regions.media ends at 2.0 too; each layer has an outer radius of its own"),
-    ({"media": {}, "adventitia": {}},
-     "regions.adventitia.outer_radius: regions.media ends at 3.0 too; each layer has an outer radius of its own"),
-    ({"media": {"outer_radius": 2.0}, "adventitia": {"outer_radius": 2.5}},
-     "regions.adventitia.outer_radius = 2.5: the outermost region ends at geometry.outer_radius = 3.0, or leaves it "),
-    ({f"layer{k}": {"outer_radius": 1.1 + 0.1 * k} for k in range(8)} | {"last": {}},
-     "regions: 8 elements through the wall; 9 regions need one each: a larger mesh.refinement"),
-    ({"media": {"outer_radius": 1.00001}, "adventitia": {}},
-     "regions.media.outer_radius = 1.00001: the layer is a length of 1e-05 is too small beside one of 3; allowed is a "
-     "ratio up to 10000"),
-    ({"inner": {}}, "regions.inner: the column 'fibre_angle_inner' has another meaning; choose another name"),
-    ({"1st layer": {}}, "regions.'1st layer': the name of a region must be a letter, then letters, digits and _"),
-    ({"media": {"outer_radius": "2 kPa"}}, "regions.media.outer_radius = '2 kPa': 'kPa' is no unit of length; "),
-    ({"media": 2.0}, "regions.media = 2.0: must be a table"),
-])  # fmt: skip
-def test_bad_regions_are_refused_in_one_line(regions: dict[str, Any], line: str) -> None:
-    with pytest.raises(SceneError) as refusal:
-        layered(regions)
-    assert str(refusal.value).startswith(line), refusal.value
-
-
-def test_a_body_without_regions_refuses_them_by_name() -> None:
-    with pytest.raises(SceneError, match="^regions.core: a cube has no regions; shapes with regions: 'tube', 'mesh'$"):
-        Scene(geometry={"shape": "cube"}, regions={"core": {}}, time={"end": 1.0})
-
-
 def test_an_outer_radius_where_no_layer_is_is_refused() -> None:
     """Also by shapes of scripts that have regions and say no more about them."""
     mesh = SHAPES["mesh"](file="vessel.msh")

@@ -12,6 +12,7 @@ from remodel_fenicsx import Scene, SceneError, Simulation
 from remodel_fenicsx.body.reductions import choice
 from remodel_fenicsx.body.tube import whole_tube
 from tests.body.test_natural import scene
+from tests.runs import last_row
 
 SELF = MPI.COMM_SELF
 
@@ -21,13 +22,6 @@ def surrounded(stiffness: float, kinematics: str = "radial", tangential: float =
     values: dict[str, Any] = {"natural.opening_angle": 0.0}
     values |= {"supports": {"outer": springs}} if stiffness else {}
     return scene(kinematics, **(values | changes))
-
-
-def end_of(of: Scene, domain: Any = None) -> dict[str, float]:
-    simulation = Simulation(of, SELF, domain)
-    row = [dict(step.row) for step in simulation.steps()][-1]
-    simulation.close()
-    return row
 
 
 def test_a_stiffer_surrounding_turns_the_outside_further() -> None:
@@ -52,8 +46,8 @@ def test_a_stiffer_surrounding_turns_the_outside_further() -> None:
 def test_kinematics_agree_on_springs() -> None:
     """Of fixed direction, square to the face: on one radius, a half-plane, a quarter and the whole tube."""
     few = {"time.end": 6.0, "loads.pressure.ramp": [[0, 0], [5, 1]], "loads.elongation.ramp": [[0, 0], [5, 1]]}
-    ends = {name: end_of(surrounded(2.0, name, **few)) for name in ("radial", "axisymmetric", "sector")}
-    without = end_of(surrounded(0.0, "radial", **few))
+    ends = {name: last_row(surrounded(2.0, name, **few)) for name in ("radial", "axisymmetric", "sector")}
+    without = last_row(surrounded(0.0, "radial", **few))
     assert without["outer_radius"] - ends["radial"]["outer_radius"] > 0.02
     for name in ("axisymmetric", "sector"):
         for column in ("inner_radius", "outer_radius"):
@@ -68,24 +62,10 @@ def test_springs_along_the_wall_need_what_shows_them() -> None:
     assert choice(surrounded(2.0, "auto", 0.0)).name == "radial"
     with pytest.raises(SceneError, match="supports.outer.tangential is above 0: sections do not stay plane"):
         surrounded(2.0, "radial", 1.0)
-    half = end_of(surrounded(2.0, "axisymmetric", 1.0, **few))
+    half = last_row(surrounded(2.0, "axisymmetric", 1.0, **few))
     whole = surrounded(2.0, "full", 1.0, **few)
-    full = end_of(whole, whole_tube(whole.geometry, (16, 4, 6), "hexahedron", 2, SELF))
-    across = end_of(surrounded(2.0, "axisymmetric", 0.0, **few))
+    full = last_row(whole, whole_tube(whole.geometry, (16, 4, 6), "hexahedron", 2, SELF))
+    across = last_row(surrounded(2.0, "axisymmetric", 0.0, **few))
     assert abs(half["stored_energy"] / across["stored_energy"] - 1) > 1e-3
     assert full["stored_energy"] == pytest.approx(half["stored_energy"], rel=3e-3)
     assert full["outer_radius"] == pytest.approx(half["outer_radius"], abs=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"inner": {"kind": "elastic", "stiffness": 1.0}}, "allowed beside is supports.outer of kind 'elastic'"),
-        ({"outer": {"kind": "held"}}, "supports.outer.kind = 'held': allowed here is 'elastic'"),
-        ({"outer": {"kind": "elastic"}}, "supports.outer.stiffness: missing; a support of kind 'elastic' needs it"),
-    ],
-)
-def test_other_supports_of_a_tube_are_refused(table: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError) as refused:
-        scene("radial", **{"natural.opening_angle": 0.0, "supports": table})
-    assert words in str(refused.value)

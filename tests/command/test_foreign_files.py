@@ -219,22 +219,16 @@ FORGERIES = {
     "a row less": array("function", lambda old: old[:-1]),
     "a row more": array("function", lambda old: np.vstack([old, old])),
     "a column less": array("function", lambda old: old[:, :-1]),
-    "no table": array("function", lambda old: old[0]),
-    "deeper": array("function", lambda old: old[..., None]),
     "empty": array("function", lambda old: old[:0]),
     "text": array("function", lambda old: old.astype(str)),
-    "complex": array("function", lambda old: old + 1j),
     "NaN": array("function", lambda old: old * np.nan),
     "infinite": array("function", lambda old: old + np.inf),
-    "dates": array("function", lambda old: old.astype("datetime64[s]")),
-    "one number": array("function", lambda old: np.float64(1)),
     "points of text": array("points", lambda old: old.astype(str)),
     "fewer points": array("points", lambda old: old[:-1]),
     "moved points": array("points", lambda old: old + 1.0),
     "points NaN": array("points", lambda old: old * np.nan),
     "other elements": array("elements", lambda old: old[:, ::-1]),
     "fewer elements": array("elements", lambda old: old[:-1]),
-    "elements flat": array("elements", lambda old: old.ravel()),
 }
 
 
@@ -344,14 +338,11 @@ def test_elements_of_nodes_that_are_not_there_are_refused(by: int, folder: Path)
 
 
 @pytest.mark.parametrize("name", ["history.csv", "run.log", "scene.toml", "checkpoint-a.npz", "fields.vtkhdf"])
-@pytest.mark.parametrize("change", ["folder", "circle", "gone", "text", "infinite"])
+@pytest.mark.parametrize("change", ["folder", "circle", "text"])
 def test_every_reader_of_a_damaged_run_names_its_folder(name: str, change: str, folder: Path) -> None:
     """In one line with exit code 2, if it reads the file at all."""
     path = folder / name
-    if change == "infinite":
-        path.write_bytes(path.read_bytes().replace(b"1", b"inf"))
-    else:
-        path.unlink()
+    path.unlink()
     if change == "folder":
         path.mkdir()
     elif change == "circle":
@@ -404,7 +395,13 @@ def test_fields_that_are_kept_elsewhere_are_refused(kind: str, folder: Path, vic
 
 @pytest.mark.parametrize("name", ["fields.vtkhdf", "fields_chains.vtkhdf"])
 def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(name: str, folder: Path) -> None:
-    """HDF5's own check sums: by a run that would go on, and by whoever reads the values."""
+    """HDF5's own check sums, and times and offsets, which follow from the numbers of nodes, elements and steps."""
+    for place, wrong in (("Steps/Values", -1.0), ("Steps/PointDataOffsets/displacement", 7)):
+        copy = shutil.copy(folder / name, folder.with_name("copy.vtkhdf"))
+        with h5py.File(copy, "r+") as file:
+            file[f"VTKHDF/{place}"][2] = wrong
+        with pytest.raises(ValueError, match="is damaged"):
+            check_file(copy)
     path = folder / name
     with h5py.File(path) as file:
         values = file["VTKHDF/PointData/displacement"]
@@ -420,11 +417,6 @@ def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(name: str, f
         with pytest.raises(RecordingError, match="is damaged"):
             for recorded in Recording(folder).times:
                 Recording(folder).fields(recorded)
-
-
-def test_a_file_that_is_whole_is_taken(finished: Path) -> None:
-    check_file(finished / "fields.vtkhdf")
-    check_file(finished / "fields_chains.vtkhdf")
 
 
 # ---------------------------------------------------------------- a folder that goes, or that is nobody's
@@ -468,16 +460,7 @@ def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> Non
     for name, text in put_there.items():
         (tmp_path / name).write_text(text)
     (tmp_path / "scene.toml").write_text(pulled_cube(1.0).to_toml())
-    command = [
-        sys.executable,
-        PROJECT / "bin" / "remodel-fenicsx",
-        "ensemble",
-        "scene.toml",
-        "--seeds",
-        "2",
-        "-o",
-        "out",
-    ]
+    command = [sys.executable, PROJECT / "bin" / "remodel-fenicsx", *"ensemble scene.toml --seeds 2 -o out".split()]
     own = {"PETSC_OPTIONS": "-remodel_snes_monitor ascii:the-users-own::append"}
     done = subprocess.run([*command, "-q"], cwd=tmp_path, env=os.environ | own, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
@@ -655,14 +638,3 @@ def test_no_step_after_the_end() -> None:
     with pytest.raises(RuntimeError, match="has been closed"):
         next(simulation.steps())
     simulation.close()
-
-
-def test_a_flipped_bit_in_the_places_of_values_is_noticed(folder: Path) -> None:
-    """Times and offsets have no check sum of their own: they follow from the numbers of nodes, elements and steps."""
-    for name, wrong in (("Steps/Values", -1.0), ("Steps/PointDataOffsets/displacement", 7)):
-        copy = folder.with_name("copy.vtkhdf")
-        shutil.copy(folder / "fields.vtkhdf", copy)
-        with h5py.File(copy, "r+") as file:
-            file[f"VTKHDF/{name}"][2] = wrong
-        with pytest.raises(ValueError, match="is damaged"):
-            check_file(copy)

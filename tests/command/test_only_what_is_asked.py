@@ -25,6 +25,7 @@ from remodel_fenicsx.solver.continuation import Blend, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.watch.warnings import LockingWarning
 from tests.parts import pulled_cube
+from tests.runs import rows_of
 
 SELF = MPI.COMM_SELF
 
@@ -124,13 +125,9 @@ def test_cells_that_never_move_have_no_pass(
 
 def test_columns_that_are_named_are_the_only_ones_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     energy = Calls(monkeypatch, Equilibrium, "stored_energy")
-    simulation = Simulation(scene(output={"columns": ["mean_stretch"]}), SELF)
-    rows = [step.row for step in simulation.steps()]
-    simulation.close()
+    rows = rows_of(scene(output={"columns": ["mean_stretch"]}))
     assert list(rows[0]) == ["time", "force", "mean_stretch"] and energy.number == 0
-    simulation = Simulation(scene(output={"columns": ["pass_residual"]}), SELF)
-    rows = [step.row for step in simulation.steps()]
-    simulation.close()
+    rows = rows_of(scene(output={"columns": ["pass_residual"]}))
     assert {"mean_stretch", "stored_energy", "pass_residual"} < set(rows[0]) and energy.number == 4
     with pytest.raises(SceneError, match="output.columns = 'inner_radius': no such column"):
         scene(output={"columns": ["inner_radius"]})

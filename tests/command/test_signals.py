@@ -253,19 +253,3 @@ os.kill(os.getpid(), signal.SIGUSR1)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, process_group=0)
     assert done.returncode == -signal.SIGUSR1, done.stderr
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, *slowly(signal.SIGINT)])
-def test_what_was_done_before_a_signal_is_resumed(number: signal.Signals, tmp_path: Path) -> None:
-    """Checkpoints only at the end: the end that a signal makes is one too."""
-    out = tmp_path / "out"
-    words = [*COMMAND, "--set", "output.checkpoint=0", "--set", "time.end=400", "-q", "-o", str(out)]
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-    wait_for_rows(process, out, 5)
-    process.send_signal(number)
-    assert process.wait(200) == 128 + number
-    last = read_history(out)["time"][-1]
-    done = forked("remodel-fenicsx", "run", "--resume", out, "--set", f"time.end={last + 2}")
-    assert done.returncode == 0, done.stderr
-    assert f"goes on from the checkpoint of time {last:g}, step {last:g}\n" in (out / "run.log").read_text()
-    assert read_history(out)["time"].tolist() == [float(number) for number in range(int(last) + 3)]

@@ -20,6 +20,7 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tube")
     file = changed(folder / "tube.msh")
     changed(folder / "twice.msh", ("$Elements\n128\n", "$Elements\n129\n9999 3 2 2 1 1 17 81 2\n"))
+    (folder / "folder.msh").mkdir()
     (folder / "fibres.txt").write_text("angle\n30\n")
     (folder / "short.csv").write_text("angle\n30\n")
     (folder / "broken.vtu").write_text("<VTKFile>")

@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx import Recording, Scene, SceneError, Simulation
+from remodel_fenicsx import Recording, Scene, Simulation
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
@@ -250,23 +250,6 @@ def test_the_artery_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
 
 
 # ---------------------------------------------------------------- scenes and records
-@pytest.mark.parametrize(
-    ("changes", "allowed", "words"),
-    [
-        ({"remodeling.law": "rate"}, {"remodeling.law": "relaxation"}, "'rate' has no limit"),
-        ({"remodeling.law": "rotation", "model.kinematics": "full"}, {"remodeling.law": "explicit"}, "no limit"),
-        ({"remodeling.law": "none"}, {"remodeling.law": "explicit"}, "no limit"),
-        ({"remodeling.kappa": 0.0}, {"remodeling.kappa": 0.1}, "never change"),
-        ({"material.chain_density": 0.0}, {"material.chain_density": 1e21}, "needs chains"),
-        ({"time.end": "soon"}, {"time.end": 3.0}, "a finite number greater than 0, or 'equilibrium'"),
-        ({"time.end": -1.0}, {"time.end": 1}, "a finite number greater than 0, or 'equilibrium'"),
-    ],
-)
-def test_what_has_no_equilibrium_is_refused(changes: dict[str, Any], allowed: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError, match=words) as error:
-        artery().with_values(changes)
-    assert str(error.value).startswith("time.end = ") and "\n" not in str(error.value)
-    artery().with_values(allowed)
 
 
 def test_a_run_that_goes_on_to_the_equilibrium(tmp_path: Path) -> None:

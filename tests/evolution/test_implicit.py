@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.implicit import Implicit
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx import Recording
-from remodel_fenicsx.running import resume, run as record
-from remodel_fenicsx.scene.scene import SceneError, scene_from_dict
+from remodel_fenicsx.running import run as record
+from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from tests.conftest import Case, slowly
 from tests.parts import tube
+from tests.runs import goes_on, taylor_orders
 
 Array = NDArray[np.float64]
 
@@ -127,24 +128,6 @@ def test_both_laws_have_the_same_biological_equilibrium() -> None:
     np.testing.assert_allclose(angles[0], angles[1], atol=0.1)
 
 
-@pytest.mark.parametrize("where", ["", "regions.inside."])
-@pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
-def test_cells_that_jump_from_rank_to_rank_are_refused(law: str, where: str) -> None:
-    """Random cells and a printed law: one line with key, value, the law 'tensor' and what else is allowed."""
-    scene = {
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0},
-        "cells": {"initial": "isotropic"},
-        "regions": {"inside": {"outer_radius": 1.5}, "outside": {"outer_radius": 2.0}},
-        "remodeling": {"law": law, "coupling": "implicit"},
-        "time": {"end": 2.0},
-    }
-    with pytest.raises(SceneError) as raised:
-        scene_from_dict(scene).with_values({f"{where}cells.initial": "random"})
-    text = str(raised.value)
-    assert text.startswith("remodeling.coupling = 'implicit': needs remodeling.law = 'tensor'") and "\n" not in text
-    assert all(name in text for name in ("'isotropic'", "'aligned'", "'staggered'", "'relaxed'"))
-
-
 def test_a_run_of_before_ends_at_a_step_without_a_solution(tmp_path: Path) -> None:
     """A scene as 0.3.0 ran it is read, random cells under a printed law or not: exit code 3, and rows are kept."""
     values = cube(1.0) | {"format": 2, "remodeling": {"law": "explicit", "coupling": "implicit", "driver": "finger"}}
@@ -223,29 +206,8 @@ def test_the_tangent_is_the_derivative_of_the_residual() -> None:
     run(simulation)
     coupling: Any = simulation.stepper.coupling
     assert isinstance(coupling, Implicit)
-    answering, equilibrium, unknown = coupling.answering, coupling.newton.equilibrium, simulation.unknown
-    answering.begin(5.0, 0.0)
-    residual, matrix = unknown.x.petsc_vec.duplicate(), equilibrium.create_matrix()
-    direction = np.random.default_rng(3).standard_normal(len(unknown.x.array)) * 1e-4
-    free = np.isnan(equilibrium.prescribed_values())
-    direction[~free] = 0.0
-    start = unknown.x.array.copy()
-
-    def force(h: float) -> Array:
-        unknown.x.array[:] = start + h * direction
-        equilibrium.assemble_internal(residual)
-        loads = residual.duplicate()
-        equilibrium.assemble_external(loads)
-        total: Array = (residual.array + loads.array)[free]
-        return total
-
-    zero = force(0.0)
-    equilibrium.assemble_tangent(matrix)
-    change, step = matrix.createVecLeft(), matrix.createVecRight()
-    step.array[:] = direction
-    matrix.mult(step, change)
-    remainders = [np.linalg.norm(force(h) - zero - h * change.array[free]) for h in (1.0, 0.5, 0.25)]
-    np.testing.assert_allclose(np.log2(np.array(remainders[:-1]) / remainders[1:]), 2.0, atol=0.15)
+    coupling.answering.begin(5.0, 0.0)
+    np.testing.assert_allclose(taylor_orders(simulation, coupling.newton.equilibrium, 1e-4), 2.0, atol=0.15)
 
 
 def test_other_frozen_cells_have_another_stress_at_the_same_unknowns() -> None:
@@ -290,11 +252,4 @@ def test_one_and_two_ranks_agree(case: Case) -> None:
 
 
 def test_a_run_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
-    whole, parts = (tmp_path / name for name in ("whole", "parts"))
-    record(scene_from_dict(cube(6.0)), whole, MPI.COMM_SELF)
-    record(scene_from_dict(cube(3.0)), parts, MPI.COMM_SELF)
-    resume(parts, ["time.end=6.0"], MPI.COMM_SELF)
-    histories = [Recording(folder).history for folder in (whole, parts)]
-    for name in histories[0]:
-        if name != "seconds":
-            np.testing.assert_array_equal(histories[1][name], histories[0][name], err_msg=name)
+    goes_on(cube(6.0), tmp_path, 3.0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError
+from remodel_fenicsx import Scene
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.schema.settings import COUPLINGS
@@ -118,21 +118,6 @@ def test_the_equilibrium_waits_for_the_slowest_region() -> None:
 
 def _hashable(changes: Any) -> tuple[tuple[str, Any], ...]:
     return tuple((key, tuple(map(tuple, value)) if isinstance(value, list) else value) for key, value in changes)
-
-
-@pytest.mark.parametrize("changes, line", [
-    ({"remodeling.law": "rotation"}, "regions.media.remodeling.kappa = 0.08: the law 'rotation' has no kappa"),
-    ({"time.end": "equilibrium", "regions.adventitia.remodeling.kappa": 0.0},
-     "time.end = 'equilibrium': regions.adventitia.remodeling.kappa = 0: the cells never change"),
-    ({"regions.media.remodeling.kappa": -1.0},
-     "regions.media.remodeling.kappa = -1.0: must be a finite number at least 0"),
-    ({"regions.media.remodeling.law": "rate"}, "regions.media.remodeling.law = 'rate': unknown key; did you mean "
-     "remodeling.law?"),
-])  # fmt: skip
-def test_what_kappa_by_region_cannot_be_is_refused(changes: dict[str, Any], line: str) -> None:
-    with pytest.raises(SceneError) as refusal:
-        scene(FIRST, SECOND, "tensor", "staggered", **changes)
-    assert str(refusal.value) == line
 
 
 def test_a_body_whose_law_never_changes_cells_takes_any_kappa() -> None:

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.laws import relaxed
-from remodel_fenicsx.scene import SceneError, preset_scene, scene_from_dict
+from remodel_fenicsx.scene import preset_scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
 from tests.parts import tube
@@ -89,12 +89,6 @@ def test_the_relaxed_pass_settles_where_the_printed_one_jumps(caplog: pytest.Log
     assert settled[0]["pass_residual"] == pytest.approx(printed[0]["pass_residual"], rel=1e-9)
     assert settled[-1]["pass_residual"] < 0.2
     assert sum(row["newton_iterations"] for row in settled) < 0.6 * sum(row["newton_iterations"] for row in printed)
-
-
-def test_an_unknown_column_is_refused_in_one_line() -> None:
-    words = "output.columns = 'pass_residuum': no such column on request; allowed for shape 'cube' are 'pass_"
-    with pytest.raises(SceneError, match=words):
-        preset_scene(PAPER, "cube").with_values({"output.columns": ["pass_residuum"]})
 
 
 @pytest.mark.slow

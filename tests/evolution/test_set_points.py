@@ -7,17 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import SceneError, Simulation
 from remodel_fenicsx.model import tensor_law
-from remodel_fenicsx.scene import scene_from_dict
-
-
-def last_row(values: dict[str, Any]) -> dict[str, float]:
-    simulation = Simulation(scene_from_dict(values))
-    try:
-        return [dict(step.row) for step in simulation.steps()][-1]
-    finally:
-        simulation.close()
+from tests.runs import last_row
 
 
 @pytest.mark.parametrize(("exponent", "angle"), [(1.0, 35.26), (2.0, 26.57), (4.0, 14.04)])
@@ -80,24 +71,3 @@ def test_the_target_of_any_exponent() -> None:
         assert found.share == pytest.approx(tensor_law.target(tensor[None], 0.0).share)
     zero = tensor_law.target(-np.eye(3)[None], 0.0, 1.0)
     assert not zero.direction.any() and np.isfinite(zero.share).all()
-
-
-@pytest.mark.parametrize(
-    ("remodeling", "words"),
-    [
-        ({"law": "explicit", "coupling": "staggered", "exponent": 1.0}, "remodeling.exponent = 1"),
-        ({"law": "rate", "coupling": "staggered", "threshold": 1.0}, "remodeling.threshold = 1"),
-        ({"driver": "finger", "threshold": 1.0}, "remodeling.threshold = 1"),
-        ({"coupling": "implicit", "exponent": 1.0}, "remodeling.coupling = 'implicit': needs remodeling.exponent = 2"),
-    ],
-)
-def test_what_has_no_set_point_is_refused(remodeling: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError, match=words):
-        scene_from_dict(stiff_cube() | {"remodeling": {"law": "tensor"} | remodeling})
-
-
-@pytest.mark.parametrize(("key", "reason"), [("threshold", "is above 0: where cells"), ("exponent", "is not 2")])
-def test_no_equilibrium_is_computed_with_them(key: str, reason: str) -> None:
-    values = stiff_cube(**{key: 1.0}) | {"time": {"end": "equilibrium"}}
-    with pytest.raises(SceneError, match=f"time.end = 'equilibrium': remodeling.{key} {reason}"):
-        scene_from_dict(values)

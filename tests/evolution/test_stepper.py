@@ -157,24 +157,6 @@ class Raising(Watcher):
         self._raise("completed")
 
 
-@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
-@pytest.mark.parametrize("stage", ["solved", "completed"])
-def test_a_step_that_a_watcher_ends_has_not_happened(stage: str, error: type[BaseException]) -> None:
-    made, stepper = pulled_cube()
-    plain, undisturbed = pulled_cube()
-    for one in (stepper, undisturbed):
-        one.advance(0.5)
-    before = everything(stepper.state)
-    raising = Raising(stage, error)
-    with pytest.raises(error, match=stage):
-        stepper.advance(2.0, [raising])
-    assert_same(before, everything(stepper.state))
-    assert before["time"] == 0.5 and before["number"] == 1
-    stepper.advance(2.0, [raising])
-    undisturbed.advance(2.0)
-    assert_same(everything(undisturbed.state), everything(stepper.state))
-
-
 def test_watchers_forget_a_step_that_has_not_happened_the_last_one_first() -> None:
     _, stepper = pulled_cube()
     notes: list[tuple[str, float]] = []
@@ -192,16 +174,6 @@ def test_watchers_forget_a_step_that_has_not_happened_the_last_one_first() -> No
     assert notes == [("second", 0.5), ("first", 0.5)]
     stepper.advance(0.5, watchers)
     assert len(notes) == 2
-
-
-@pytest.mark.parametrize("time", [0.5, 0.25, 0.0, -1.0])
-def test_time_goes_forward(time: float) -> None:
-    made, stepper = pulled_cube()
-    stepper.advance(0.5)
-    before = everything(stepper.state)
-    with pytest.raises(ValueError, match="does not come after 0.5"):
-        stepper.advance(time)
-    assert_same(before, everything(stepper.state))
 
 
 def test_a_state_starts_unloaded_and_a_snapshot_is_a_copy() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import dolfinx.fem
@@ -13,6 +11,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene, SceneError, Simulation
+from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
@@ -23,6 +22,7 @@ from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
 from tests.parts import cube, tube
 from tests.reference.radial import RadialMaterial, solve_radial
+from tests.runs import SELF, last_row, simulated
 
 SELECTIVE = "selective-integration"
 STIFF = Material(lame_mu=3.103, lame_lambda=3.103e4)
@@ -148,18 +148,11 @@ def test_the_guard_knows_j_where_the_formulation_takes_it() -> None:
 
 
 # ---------------------------------------------------------------- bodies that lock
-@contextmanager
-def simulated(scene: Scene, divisions: tuple[int, int, int] | None = None) -> Iterator[tuple[Simulation, list[dict]]]:
-    """A simulation at its end, and its rows."""
-    domain, shape = None, scene.geometry
-    if divisions is not None:
-        size = shape.inner_radius, shape.outer_radius, shape.length
-        domain = tube(*size, 1, scene.mesh.element, scene.mesh.degree, MPI.COMM_SELF, divisions)
-    simulation = Simulation(scene, MPI.COMM_SELF, domain)
-    try:
-        yield simulation, [step.row for step in simulation.steps()]
-    finally:
-        simulation.close()
+def meshed(scene: Scene, around: int, through: int, along: int = 1) -> Domain:
+    """A tube with so many elements."""
+    shape, mesh = scene.geometry, scene.mesh
+    size = shape.inner_radius, shape.outer_radius, shape.length
+    return tube(*size, 1, mesh.element, mesh.degree, SELF, (around, through, along))
 
 
 @pytest.mark.parametrize(("around", "through", "tolerance"), [(16, 8, 0.035), *slowly((32, 16, 0.01))])
@@ -167,7 +160,7 @@ def test_a_thick_tube_does_not_lock(around: int, through: int, tolerance: float,
     """Incompressible, closed form."""
     # few halvings: the three steps that go three times as far as their first Newton step are not looked into again
     scene = thick_tube(1e4, SELECTIVE).with_values({"solver.maximum_halvings": 4})
-    with caplog.at_level(logging.WARNING), simulated(scene, (around, through, 1)) as (_, rows):
+    with caplog.at_level(logging.WARNING), simulated(scene, meshed(scene, around, through)) as (_, rows):
         assert rows[-1]["inner_radius"] - 1 == pytest.approx(EXACT_TUBE, rel=tolerance)
         assert max(row["newton_iterations"] for row in rows) <= 9
         assert {row["substeps"] for row in rows[1:]} == {1.0}
@@ -176,7 +169,8 @@ def test_a_thick_tube_does_not_lock(around: int, through: int, tolerance: float,
 
 def test_a_tube_that_locks_is_told(caplog: Any) -> None:
     """Once, with what to set and about how much the displacement lacks."""
-    with caplog.at_level(logging.WARNING), simulated(thick_tube(1e3, "displacement"), (16, 8, 1)) as (_, rows):
+    locking = thick_tube(1e3, "displacement")
+    with caplog.at_level(logging.WARNING), simulated(locking, meshed(locking, 16, 8)) as (_, rows):
         lacking = 1 - (rows[-1]["inner_radius"] - 1) / EXACT_TUBE
     (record,) = caplog.records
     assert record.getMessage().startswith("time 1: the elements lock, displacements are off by about ")
@@ -243,7 +237,7 @@ def test_elements_that_lock_in_an_elongated_tube_are_told(kinematics: str, press
 def test_when_elements_are_said_to_lock(changes: dict[str, Any], told: bool, caplog: Any) -> None:
     """Whole sections: plane sides and turning directions are part of what elements cannot follow."""
     scene = thick_tube(8.8, "displacement", 0.5).with_values({**changes, "time.end": 1.0})
-    with caplog.at_level(logging.WARNING), simulated(scene, (24, 12, 1)):
+    with caplog.at_level(logging.WARNING), simulated(scene, meshed(scene, 24, 12)):
         pass
     assert ["displacements are off by" in record.getMessage() for record in caplog.records] == [True] * told
 
@@ -266,8 +260,8 @@ WATCHED = ("inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_mid
 
 def at_the_end(scene: Scene) -> np.ndarray:
     """Radii and angles of the last row."""
-    with simulated(scene) as (_, rows):
-        return np.array([rows[-1][name] for name in WATCHED])
+    row = last_row(scene)
+    return np.array([row[name] for name in WATCHED])
 
 
 def mean_angles(ratio: float) -> np.ndarray:
@@ -363,9 +357,8 @@ def random_artery(**values: Any) -> Scene:
 
 def test_the_papers_artery_is_fine_enough(caplog: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where its random cells make strain vary most: two thirds of what is said."""
-    divisions = (16, 8, 2)
     artery = random_artery(**{"time.end": 5.0})
-    with caplog.at_level(logging.WARNING), simulated(artery, divisions) as (simulation, _):
+    with caplog.at_level(logging.WARNING), simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _):
         watcher = LockingWarning(simulation.stepper, True)
         missing = sum(watcher.missing())
         assert 0.025 < missing < 0.038
@@ -378,7 +371,8 @@ def test_the_papers_artery_is_fine_enough(caplog: Any, monkeypatch: pytest.Monke
 def test_what_cells_do_is_no_lack_of_elements(caplog: Any) -> None:
     """Under a tenth of the paper's pressure random cells deform the wall by more than the load does."""
     values = {"loads.pressure.value": 0.48, "loads.elongation.value": 0.0, "time.end": 3.0}
-    with caplog.at_level(logging.WARNING), simulated(random_artery(**values), (16, 8, 1)) as (simulation, _):
+    artery = random_artery(**values)
+    with caplog.at_level(logging.WARNING), simulated(artery, meshed(artery, 16, 8)) as (simulation, _):
         watcher = LockingWarning(simulation.stepper, True)
         assert sum(watcher.energies()[1:]) > 0.2 * watcher.work()[0]
     assert not [record for record in caplog.records if "displacements are off by" in record.getMessage()]
@@ -400,26 +394,6 @@ def test_a_uniform_body_never_locks(element: str, caplog: Any) -> None:
     with caplog.at_level(logging.WARNING), simulated(scene):
         pass
     assert not caplog.records
-
-
-@pytest.mark.slow
-def test_remodeling_in_a_stiff_bulk_is_that_of_fine_quadratic_elements() -> None:
-    """Chains that remodel: radii and layers of the stiff tube do not depend on elements or formulation."""
-    scene = thick_tube(1e4, SELECTIVE, 2.4, chain_density=2e21).with_values({
-        "cells.axes": "cylindrical", "remodeling.law": "explicit", "time.end": 8.0
-    })  # fmt: skip
-    found = {}
-    for name, values, divisions in (
-        ("linear", {}, (16, 8, 1)),
-        ("quadratic", {"mesh.degree": 2}, (8, 4, 1)),
-        ("locked", {"mesh.formulation": "displacement"}, (16, 8, 1)),
-    ):
-        with simulated(scene.with_values(values), divisions) as (_, rows):
-            found[name] = np.array([rows[-1][key] for key in ("inner_radius", "outer_radius", "fibre_angle_middle")])
-    linear, quadratic, locked = found["linear"], found["quadratic"], found["locked"]
-    assert linear[0] - 1 == pytest.approx(quadratic[0] - 1, rel=0.03)
-    assert linear[2] == pytest.approx(quadratic[2], abs=1.5)
-    assert locked[0] - 1 < 0.1 * (quadratic[0] - 1)
 
 
 RANDOM_CUBE = {

@@ -11,14 +11,14 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli
-from remodel_fenicsx.body.reductions import AUTO, choice
+from remodel_fenicsx import Recording, Scene, Simulation, cli
+from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
+from tests.runs import goes_on
 
 SELF = MPI.COMM_SELF
 END = 4.0
@@ -154,41 +154,12 @@ def test_one_and_two_ranks_agree(case: Case) -> None:
 
 
 # ---------------------------------------------------------------- scenes and records
-@pytest.mark.parametrize(
-    ("changes", "allowed", "words"),
-    [
-        ({"supports.ends": "closed"}, {"supports.ends": "clamped"}, "loads.elongation.value = 0.1: must be 0 where"),
-        (
-            {"loads.axial_force.value": 1.0, "loads.axial_force.ramp": [[0, 1]]},
-            {"loads.axial_force.value": 1.0, "loads.axial_force.ramp": [[0, 1]], "loads.elongation.value": 0.0},
-            "loads.elongation.value = 0.1: must be 0 where",
-        ),
-    ],
-)
-def test_a_length_is_prescribed_or_unknown(changes: dict[str, Any], allowed: dict[str, Any], words: str) -> None:
-    scene = scene_from_dict(values(AUTO, {"elongation": {"value": 0.1, "ramp": [[0, 1]]}}))
-    with pytest.raises(SceneError, match=words):
-        scene.with_values(changes)
-    assert choice(scene.with_values(allowed)).name in ("radial", "axisymmetric")
-
-
-def test_only_a_tube_can_be_closed() -> None:
-    with pytest.raises(SceneError, match="supports.ends = 'closed': allowed for shape 'cube' is 'free'"):
-        scene_from_dict(
-            {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "cube"}, "supports": {"ends": "closed"}}
-        )
 
 
 def test_a_recorded_run_goes_on_and_is_revolved(tmp_path: Path) -> None:
     scene = scene_from_dict(values(AUTO, {}, supports={"ends": "closed"}))
-    whole, parts = (tmp_path / name for name in ("whole", "parts"))
-    run(scene, whole, SELF)
-    run(scene.with_values({"time.end": 2.0}), parts, SELF)
-    resume(parts, [f"time.end={END}"], SELF)
-    first, second = (Recording(folder) for folder in (whole, parts))
+    first, whole = goes_on(scene, tmp_path, 2.0), tmp_path / "whole"
     assert first.scene.model.kinematics == "radial"
-    for name in ("axial_elongation", "inner_radius", "stored_energy"):
-        np.testing.assert_array_equal(first.history[name], second.history[name])
     assert cli.main(["revolve", str(whole)]) == 0
     (whole / "fields.vtkhdf").write_bytes((whole / "fields_body.vtkhdf").read_bytes())
     body = Recording(whole)

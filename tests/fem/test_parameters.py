@@ -13,13 +13,13 @@ import pytest
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError, Simulation
+from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Cells, Remodeling
 from tests import parts
-from tests.parts import cube, tube
+from tests.parts import cube
 
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 FORCE = 6.0
@@ -151,14 +151,6 @@ def test_whatever_else_is_refused(parameter: str, bad: Any) -> None:
     assert "\n" not in str(caught.value) and "must be" in str(caught.value)
 
 
-def test_numbers_of_all_kinds_are_taken() -> None:
-    made = bar()
-    material = Tissue(27, np.float64(3.103), np.float32(1.5), np.int64(2), 1.0)
-    stepper = Stepper(made.state(), material, ELASTIC, parts.TIGHT, lambda t: {"force": t})
-    assert stepper.advance(1.0).work.newton_iterations > 1
-    stepper.close()
-
-
 # ---------------------------------------------------------------- without chains
 def neo_hookean_stretch(stress: float, lame_lambda: float, lame_mu: float) -> float:
     """Stretch a of a bar under a nominal stress: P_zz = stress and P_xx = 0 of eq. (4a), by Newton's method."""
@@ -203,37 +195,6 @@ def test_without_chains_nothing_locks(law: str) -> None:
     simulation.close()
 
 
-def test_a_load_that_a_scene_does_not_name_is_zero() -> None:
-    printed: dict[str, Any] = {"material": {"repulsion": "axes"}, "remodeling": {"law": "explicit"}}
-    scene = Scene(geometry={"shape": "cube"}, model={"kinematics": "full"}, **printed, time={"end": 1.0})
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    (row,) = [step.row for step in simulation.steps()]
-    simulation.close()
-    assert row["force"] == 0.0 and row["mean_stretch"] == pytest.approx(1.0, abs=1e-12)
-
-
 # ---------------------------------------------------------------- a mesh of the user's
 TUBE = {"preset": "kuhl-holzapfel-2007", "time": {"end": 1.0},
         "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0}}  # fmt: skip
-
-
-@pytest.mark.parametrize(("changes", "line"), [
-    ({"geometry": {"shape": "cube"}}, "geometry.shape = 'cube': the mesh is a 'tube'"),
-    ({"mesh": {"element": "tetrahedron"}}, "mesh.element = 'tetrahedron': the mesh has elements of type 'hexahedron'"),
-    ({"mesh": {"degree": 2}}, "mesh.degree = 2: the mesh has degree 1"),
-    ({"geometry": {**TUBE["geometry"], "length": 1.1}}, "geometry.length = 1.1: that of the mesh is 1"),
-    ({"geometry": {**TUBE["geometry"], "outer_radius": 2.5}}, "geometry.outer_radius = 2.5: that of the mesh is 2"),
-])  # fmt: skip
-def test_a_domain_that_is_not_the_scenes_is_refused_with_one_line(changes: dict[str, Any], line: str) -> None:
-    domain = tube(1.0, 2.0, 1.0, divisions=(8, 1, 1), comm=MPI.COMM_SELF)
-    assert Simulation(Scene(**TUBE), MPI.COMM_SELF, domain).domain is domain
-    with pytest.raises(SceneError) as caught:
-        Simulation(Scene(**{**TUBE, **changes}), MPI.COMM_SELF, domain)
-    assert str(caught.value) == line
-
-
-def test_a_domain_without_one_of_the_shapes_faces_is_refused() -> None:
-    domain = tube(1.0, 2.0, 1.0, divisions=(8, 1, 1), comm=MPI.COMM_SELF)
-    del domain.faces["inner"]
-    with pytest.raises(SceneError, match="^geometry.shape = 'tube': the mesh has no face inner$"):
-        Simulation(Scene(**TUBE), MPI.COMM_SELF, domain)

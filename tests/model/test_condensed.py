@@ -15,14 +15,7 @@ from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import REPULSIONS, Tissue
-from remodel_fenicsx.model.implicit import (
-    CondensedPoints,
-    LocalSolution,
-    OrthotropicCells,
-    StepOfCells,
-    Strain,
-    ranked_response,
-)
+from remodel_fenicsx.model import implicit
 from remodel_fenicsx.model.laws import LAWS, Drive
 from remodel_fenicsx.model.turnover import TurnoverRule, at_the_end, rates
 
@@ -48,7 +41,7 @@ def deformations(number: int, rng: np.random.Generator) -> Array:
 
 def points(
     law: str, repulsion: str, driver: str, frame: str, number: int, initial: str = "isotropic", **changes: Any
-) -> CondensedPoints:
+) -> implicit.CondensedPoints:
     rng = np.random.default_rng(5)
     tissue = Tissue(27.3, 3.1, 1.57, 1.594, 1.0, repulsion=REPULSIONS[repulsion])
     lengths = np.full((number, 3), 1 / np.sqrt(3))
@@ -58,21 +51,23 @@ def points(
     cells = UnitCell(lengths, Rotation.random(number, random_state=rng).as_matrix())
     nothing = np.zeros((number, 3, 3))
     drive = Drive(nothing, nothing, DRIVERS[driver], FRAMES[frame], 1e-13, lengths.copy(), np.ones(number), 0.025)
-    step = StepOfCells(LAWS[law], drive._replace(rounding=1e-13), cells, structure_tensor(*cells[:2]), 8.0, 12.0)
+    step = implicit.StepOfCells(
+        LAWS[law], drive._replace(rounding=1e-13), cells, structure_tensor(*cells[:2]), 8.0, 12.0
+    )
     step = step._replace(drive=step.drive._replace(**changes))
-    return CondensedPoints(tissue.map(lambda name, value: np.full(number, value)), step)
+    return implicit.CondensedPoints(tissue.map(lambda name, value: np.full(number, value)), step)
 
 
-def with_pairing(some: CondensedPoints, pairing: spectral.Pairing) -> CondensedPoints:
+def with_pairing(some: implicit.CondensedPoints, pairing: spectral.Pairing) -> implicit.CondensedPoints:
     return replace(some, step=some.step._replace(drive=some.step.drive._replace(pairing=pairing)))
 
 
-def solved(some: CondensedPoints, F: Array, start: Array | None = None) -> LocalSolution:
+def solved(some: implicit.CondensedPoints, F: Array, start: Array | None = None) -> implicit.LocalSolution:
     """From the axes of C, on which isotropic cells lie."""
     return some.solve(F, np.swapaxes(F, 1, 2) @ F if start is None else start)
 
 
-def difference_quotient(some: CondensedPoints, F: Array, H: Array, h: float, start: Array) -> Array:
+def difference_quotient(some: implicit.CondensedPoints, F: Array, H: Array, h: float, start: Array) -> Array:
     up, down = (solved(some, F + sign * h * H, start).first_piola_kirchhoff for sign in (1, -1))
     return (up - down) / (2 * h)
 
@@ -113,9 +108,11 @@ def test_points_without_tension_answer_nothing() -> None:
     some = points("relaxation", "axes", "cauchy", "material", 1)
     cells = UnitCell(some.step.cells.dimensions, np.eye(3)[None, [1, 2, 0]])
     some = replace(some, step=some.step._replace(cells=cells))
-    strain = Strain.of(np.diag([1.2, 1.1, 1.0])[None])
+    strain = implicit.Strain.of(np.diag([1.2, 1.1, 1.0])[None])
     with np.errstate(all="raise"):
-        found = ranked_response(some.step, strain, strain.inside(np.diag([-3.0, -2.0, -1.0])[None]), derivatives=True)
+        found = implicit.ranked_response(
+            some.step, strain, strain.inside(np.diag([-3.0, -2.0, -1.0])[None]), derivatives=True
+        )
     assert not np.any(found.by_tensor) and not np.any(found.by_stretch)
 
 
@@ -144,8 +141,8 @@ def test_cells_by_rank_answer_to_the_driving_tensor_and_to_the_stretch(frame: st
     R = Rotation.random(30, random_state=rng).as_matrix()
     X = np.swapaxes(R, 1, 2) @ ((rng.uniform(0.8, 1.2, (30, 3)) * [6.0, 3.0, 1.0])[:, :, None] * R)
     U, changes = np.tile(np.diag([0.8, 1.1, 1.3]), (30, 1, 1)), rng.standard_normal((30, 3, 3))
-    H, strain = changes + np.swapaxes(changes, 1, 2), Strain.of(U)
-    found = ranked_response(step, strain, strain.inside(X), derivatives=True)
+    H, strain = changes + np.swapaxes(changes, 1, 2), implicit.Strain.of(U)
+    found = implicit.ranked_response(step, strain, strain.inside(X), derivatives=True)
     assert found.by_tensor is not None and (found.by_stretch is not None) == (frame == "material")
     for derivative, by_stretch in ((found.by_tensor, False), (found.by_stretch, True)):
         if derivative is None:
@@ -156,11 +153,11 @@ def test_cells_by_rank_answer_to_the_driving_tensor_and_to_the_stretch(frame: st
         np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=1e-6)
 
 
-def outside(step: StepOfCells, U: Array, X: Array) -> UnitCell:
+def outside(step: implicit.StepOfCells, U: Array, X: Array) -> UnitCell:
     """The cells that X makes at U, in the global basis."""
-    strain = Strain.of(U)
-    cells = ranked_response(step, strain, strain.inside(X), derivatives=False).cells
-    assert isinstance(cells, OrthotropicCells)
+    strain = implicit.Strain.of(U)
+    cells = implicit.ranked_response(step, strain, strain.inside(X), derivatives=False).cells
+    assert isinstance(cells, implicit.OrthotropicCells)
     return UnitCell(cells.cell.dimensions, cells.cell.axes @ np.swapaxes(strain.basis, 1, 2))
 
 
@@ -186,7 +183,7 @@ def test_the_cells_belong_to_the_stress(law: str, repulsion: str, driver: str, f
     np.testing.assert_allclose(structure_tensor(*again[:2]), structure_tensor(*cells[:2]), atol=1e-6)
 
 
-def cells_of(found: LocalSolution) -> UnitCell:
+def cells_of(found: implicit.LocalSolution) -> UnitCell:
     """Of the law for A the roots and axes of A."""
     if found.cells is not None:
         return found.cells
@@ -274,12 +271,12 @@ def test_a_long_step_is_followed_where_newtons_method_does_not_find_its_end() ->
 RULE = TurnoverRule(40.0, 1.1, 1.0)
 
 
-def turning_over(repulsion: str, driver: str, duration: float) -> CondensedPoints:
+def turning_over(repulsion: str, driver: str, duration: float) -> implicit.CondensedPoints:
     """With content and natural length of their own at the start of the step."""
     some, rng = points("tensor", repulsion, driver, "material", 40), np.random.default_rng(11)
     content, length = rng.uniform(0.7, 2.0, 40), rng.uniform(0.95, 1.3, 40)
     step = some.step._replace(time_new=some.step.time_old + duration, turnover=RULE)
-    return CondensedPoints(replace(some.tissue, content=content, natural_length=length), step)
+    return implicit.CondensedPoints(replace(some.tissue, content=content, natural_length=length), step)
 
 
 @pytest.mark.parametrize("duration", [4.0, 1e3, 1e5])

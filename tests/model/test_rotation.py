@@ -123,15 +123,6 @@ def test_the_fibre_is_the_largest_dimension_whatever_its_number() -> None:
     np.testing.assert_array_less(angle_to(expected.axes, goal[:, 0]), angle_to(old.axes, goal[:, 0]))
 
 
-def test_points_do_not_see_each_other() -> None:
-    """The same however the points are shared out among processes."""
-    old, stress, _ = random_case(6)
-    whole = updated(old, pulled(stress), 2.0).axes
-    shares = [slice(start, start + 7) for start in range(0, 40, 7)]
-    found = [updated(UnitCell(old.dimensions[i], old.axes[i]), pulled(stress[i]), 2.0).axes for i in shares]
-    np.testing.assert_allclose(np.concatenate(found), whole, atol=1e-15)
-
-
 # ---------------------------------------------------------------- where the remark's formula has no answer
 X, Y, Z = np.eye(3)
 

@@ -39,13 +39,6 @@ def test_distinct_values(size: float) -> None:
     assert np.all(cosines[np.abs(cosines) > 1e-3] > 0)
 
 
-def test_only_the_symmetric_part_counts() -> None:
-    rng = np.random.default_rng(2)
-    tensors, previous = rng.normal(size=(COUNT, 3, 3)), random_axes(rng)
-    for one, other in zip(principal(tensors, previous), principal(np.swapaxes(tensors, 1, 2), previous)):
-        np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize("values, single, pair", [([5.0, 5.0, -2.0], 2, (0, 1)), ([5.0, -2.0, -2.0], 0, (1, 2))])
 def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     values: list[float], single: int, pair: tuple[int, int]
@@ -131,11 +124,6 @@ def test_swapped_ranks_take_their_sign_from_the_other_previous_axes() -> None:
         np.testing.assert_array_equal(axes[0], sign * np.eye(3)[[2, 1, 0]])
 
 
-def test_previous_axes_need_not_be_orthonormal() -> None:
-    skew = np.array([[[2.0, 0.0, 0.0], [3.0, 0.1, 0.0], [1.0, 1.0, 5.0]]])
-    np.testing.assert_allclose(principal(np.zeros((1, 3, 3)), skew)[1], np.eye(3)[None], atol=1e-15)
-
-
 def test_without_previous_axes_the_coordinate_axes_decide() -> None:
     nothing = np.zeros((2, 3, 3))
     np.testing.assert_array_equal(principal(np.zeros((2, 3, 3)), nothing)[1], np.broadcast_to(np.eye(3), (2, 3, 3)))
@@ -143,22 +131,6 @@ def test_without_previous_axes_the_coordinate_axes_decide() -> None:
         true = random_axes(np.random.default_rng(9))
         _, axes = principal(tensor(values, true), np.zeros_like(true))
         assert_orthonormal(axes)
-
-
-def test_points_do_not_influence_each_other() -> None:
-    rng = np.random.default_rng(10)
-    true, previous = random_axes(rng, 4), random_axes(rng, 4)
-    tensors = np.concatenate(
-        [
-            tensor(values, true[[i]])
-            for i, values in enumerate(([3.0, 2.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0, 1.0]))
-        ]
-    )
-    _, together = principal(tensors, previous)
-    for i in range(4):
-        np.testing.assert_array_equal(principal(tensors[[i]], previous[[i]])[1][0], together[i])
-    values, axes = principal(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
-    assert values.shape == (0, 3) and axes.shape == (0, 3, 3)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

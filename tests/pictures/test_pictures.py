@@ -19,6 +19,7 @@ from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.results.whole_body import WholeBody
 from tests.report.conftest import Recorded
+from tests.tables import rows
 
 FROM_THE_FRONT = "--view=0,-1,0"  # faces that look there have the colours of the scale as they are
 Drawn = Callable[..., np.ndarray]
@@ -93,17 +94,6 @@ def test_all_that_is_written_lies_outside_of_the_body(drawn: Drawn) -> None:
         assert np.count_nonzero(~filled[:-1] & filled[1:]) >= 6  # head, time, body, loads, scale, its label, notes
     scale = picture[-picture.shape[0] // 4 :]
     assert levels(scale, 0.0005) == set(range(18))
-
-
-def test_other_times_are_other_pictures_at_one_scale(recorded: Recorded, drawn: Drawn) -> None:
-    run = Recording(recorded("tendon"))
-    body = panel(drawn("tendon", "--time", "0", "5", FROM_THE_FRONT))
-    left, right = np.array_split(body, 2, axis=1)
-    heights = [np.ptp(run.points[:, 2] + run.fields(time)["displacement"][:, 2]) for time in (0.0, 5.0)]
-    assert outline(right)[0] / outline(left)[0] == pytest.approx(heights[1] / heights[0], rel=0.02)
-    angles = [Recording(recorded("tendon")).fields(time)["fibre_angle_deformed"].mean() for time in (0.0, 5.0)]
-    red = [np.mean(half[..., 0].astype(int) - half[..., 2] > 60) / np.mean(half < 245) for half in (left, right)]
-    assert angles[1] < angles[0] - 3 and red[1] > 1.2 * red[0]
 
 
 def test_a_cut_shows_the_inside_and_layers_are_taken_off(recorded: Recorded, drawn: Drawn) -> None:
@@ -260,36 +250,16 @@ def test_mp4_without_ffmpeg_is_one_line(
 
 
 # ---------------------------------------------------------------- what is refused
-@pytest.mark.parametrize(("name", "words", "said"), [
-    ("cube", ["picture", "DIR", "--time", "11"], "--time 11: allowed are times from 0 to 10"),
-    ("cube", ["picture", "DIR", "--time", "nan"], "--time nan: allowed are times from 0 to 10"),
-    ("cube", ["picture", "DIR", "--view", "behind"], "--view behind: allowed is front, above or X,Y,Z, wh"),
-    ("cube", ["picture", "DIR", "--view", "0,0,0"], "--view 0,0,0: allowed is "),
-    ("cube", ["picture", "DIR", "--view", "1,inf,0"], "--view 1,inf,0: allowed is "),
-    ("cube", ["picture", "DIR", "--view", "1,2"], "--view 1,2: allowed is "),
-    ("tendon", ["picture", "DIR", "--layers", "0"], "--layers 0: allowed is a whole number from 1 to 10, from the bot"),
-    ("artery", ["animate", "DIR", "--layers", "9"], "--layers 9: allowed is a whole number from 1 to 8, from the in"),
-    ("cube", ["picture", "DIR", "--cut", "half"], "--cut half: no whole element of this body lies in that part"),
-    ("cube", ["picture", "DIR", "-o", "x.jpg"], "-o x.jpg: allowed is a name that ends in .png, .svg, .pdf"),
-    ("cube", ["picture", "DIR", "-o", "x.gif"], "-o x.gif: allowed is a name that ends in .png, .svg, .pdf"),
-    ("cube", ["animate", "DIR", "-o", "x.png"], "-o x.png: allowed is a name that ends in .gif, .webp, .mp4"),
-    ("cube", ["animate", "DIR", "-o", "no/x.gif"], "-o no/x.gif: there is no folder no"),
-    ("cube", ["animate", "DIR", "--frames", "1"], "--frames 1: allowed is a whole number from 2 to 500"),
-    ("cube", ["animate", "DIR", "--frames", "501"], "--frames 501: allowed is a whole number from 2 to 500"),
-    ("cube", ["picture", "nowhere"], "nowhere: there is no such folder"),
-    ("cube", ["animate", "."], ".: is not the folder of a run, it has no scene.toml"),
-    ("without fields", ["picture", "DIR"], "DIR: the run recorded no fields of a body (output.fields)"),
-    ("without fields", ["animate", "DIR"], "DIR: the run recorded no fields of a body (output.fields)"),
-])  # fmt: skip
+@pytest.mark.parametrize(("name", "words", "said"), rows(__file__, "refused.txt"))
 def test_bad_input_is_one_line_and_writes_nothing(
-    recorded: Recorded, name: str, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    recorded: Recorded, name: str, words: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture,
 ) -> None:  # fmt: skip
     folder = recorded(name)
     before = sorted(os.listdir(folder))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rendering.subprocess, "run", lambda *command, **how: pytest.fail("something was drawn"))
-    assert cli.main([str(folder) if word == "DIR" else word for word in words]) == 2
+    assert cli.main([str(folder) if word == "DIR" else word for word in words.split()]) == 2
     message = capsys.readouterr().err
     assert message.startswith(f"remodel-fenicsx: {said.replace('DIR', str(folder))}") and message.count("\n") == 1
     assert os.listdir() == [] and sorted(os.listdir(folder)) == before

@@ -114,13 +114,6 @@ def test_a_plot_has_the_colours_and_the_chains_of_all_pictures(recorded: Recorde
     assert black(with_chains) > 5 * black(without) + 200
 
 
-def test_a_plot_peels_and_shows_other_fields(recorded: Recorded, tmp_path: Path) -> None:
-    recording = Recording(recorded("artery"))
-    whole = plotted(recording, tmp_path / "whole.npy", name="chain_extension", chains=False, time=5.0)
-    peeled = plotted(recording, tmp_path / "one.npy", name="chain_extension", chains=False, time=5.0, layers=1)
-    assert np.abs(whole.astype(int) - peeled).mean() > 1
-
-
 def test_a_plot_shows_the_deformed_body(recorded: Recorded) -> None:
     """Its bounds: making a plotter opens no window."""
     recording = Recording(recorded("tendon"))

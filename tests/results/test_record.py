@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -38,26 +37,6 @@ def test_a_row_with_other_columns_is_refused(tmp_path: Path) -> None:
     history.append({"time": 3.0})
     history.close()
     assert read_history(tmp_path)["time"].tolist() == [1.0, 3.0]
-
-
-@pytest.mark.parametrize("room", [1, 5, 12, 17])
-def test_a_full_disk_leaves_whole_rows(room: int, tmp_path: Path) -> None:
-    """A limit on the size of files stands for the full disk: the same error from the same system call."""
-    path = tmp_path / "history.csv"
-    history = History(path)
-    history.append({"time": 1.0, "stretch": 1.0123456789})
-    before = path.read_bytes()
-    old = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + room, old[1]))
-    try:
-        with pytest.raises(OSError):
-            history.append({"time": 2.0, "stretch": 1.9876543210123})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, old)
-    assert path.read_bytes() == before
-    history.append({"time": 2.0, "stretch": 1.9876543210123})
-    history.close()
-    np.testing.assert_array_equal(read_history(tmp_path)["stretch"], [1.0123456789, 1.9876543210123])
 
 
 def test_a_row_holds_each_number_under_its_own_name() -> None:

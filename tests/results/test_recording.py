@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -16,7 +15,7 @@ import pytest
 
 from remodel_fenicsx.results import run_folder
 from remodel_fenicsx import Recording
-from remodel_fenicsx.results.recording import RecordingError, read_history
+from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 
@@ -94,13 +93,6 @@ def test_a_time_or_column_that_is_not_there_is_named_with_those_that_are(folder:
         recording.value("radius", 1.0)
 
 
-def test_of_many_times_some_are_named(folder: Path) -> None:
-    rows = "".join(f"{time}\n" for time in range(151))
-    (folder / "history.csv").write_text("time\n" + rows)
-    with pytest.raises(RecordingError, match=r"recorded are 0, 1, 2, ..., 149, 150$"):
-        Recording(folder).value("time", 0.5)
-
-
 def test_a_run_under_way_is_read(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(scene().to_toml())
     history = run_folder.History(tmp_path / "history.csv")
@@ -161,20 +153,6 @@ def test_a_scene_of_another_kind_is_damage_of_the_folder(folder: Path) -> None:
         _ = Recording(folder).scene
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("time,force\n1.0,2.0\n2.0,", "ends in the middle of a row"),
-    ("time,force\n1.0,2.0\n2.0\n", "line 3 has 1 values, but there are 2 columns"),
-    ("time,force\n1.0,strong\n", "could not convert string to float: 'strong'"),
-    ("a,b\n1,2\n", "is not the history of a run, it has no column 'time'"),
-])  # fmt: skip
-def test_a_damaged_history_is_said(text: str, said: str, folder: Path) -> None:
-    (folder / "history.csv").write_text(text)
-    with pytest.raises(RecordingError, match=said):
-        _ = Recording(folder).history
-    with pytest.raises(RecordingError, match=said):
-        read_history(folder)
-
-
 def cut_short(path: Path) -> None:
     os.truncate(path, path.stat().st_size - 100)
 
@@ -196,14 +174,6 @@ def without_last_values(path: Path) -> None:
 def without_offsets(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["VTKHDF/Steps/PointDataOffsets/displacement"]
-
-
-@pytest.mark.parametrize("damage", [cut_short, of_text, of_another_program, without_last_values, without_offsets])
-def test_damaged_fields_are_said_in_one_line(damage: Callable[[Path], None], folder: Path) -> None:
-    damage(folder / "fields.vtkhdf")
-    with pytest.raises(RecordingError, match="fields.vtkhdf: is damaged or of another kind: ") as error:
-        Recording(folder).fields(2.0)
-    assert "\n" not in str(error.value)
 
 
 def test_a_step_that_was_not_finished_is_not_there(folder: Path) -> None:

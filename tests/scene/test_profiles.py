@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx import SceneError, cli, read_scene
+from remodel_fenicsx import cli, read_scene
 from remodel_fenicsx.scene.presets import PROFILES, RANDOM_CELLS
 from remodel_fenicsx.scene.scene import scene_from_dict
 
@@ -102,8 +102,3 @@ def test_validate_says_what_was_measured_for_random_cells(tmp_path: Path, capsys
     assert RANDOM_CELLS["balanced"].in_words("balanced") in words and "the artery of random cells" in words
     assert cli.main(["validate", str(path), "--profile", "balanced", "--set", "cells.initial=isotropic"]) == 0
     assert PROFILES["balanced"].in_words("balanced") in capsys.readouterr().out
-
-
-def test_an_unknown_one_is_refused() -> None:
-    with pytest.raises(SceneError, match="profile = 'best': allowed are 'fast', 'balanced', 'reference'"):
-        scene_from_dict(TUBE | {"profile": "best"})

@@ -19,6 +19,7 @@ from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.solver.diagnosis import diagnosed
 from tests.locking_bodies import thick_tube
+from tests.runs import made
 
 LARGEST = 0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
 
@@ -39,11 +40,8 @@ def thin_tube(pressure: float = 0.5, end: float = 1.0, **values: Any) -> Scene:
 
 def radii(scene: Scene) -> tuple[list[float], int]:
     """Inner radius of the steps, and their Newton iterations."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
+    with made(scene) as simulation:
         steps = list(simulation.steps())
-    finally:
-        simulation.close()
     return [step.row["inner_radius"] for step in steps], sum(step.work.newton_iterations for step in steps)
 
 

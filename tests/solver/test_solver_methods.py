@@ -11,16 +11,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx import Simulation
-from remodel_fenicsx.fem.solver_methods import (
-    LARGE,
-    LARGE_ON_RANKS,
-    SMALL_BODY,
-    SMALL_REDUCTION,
-    SOLVER_METHODS,
-    chosen,
-)
+from remodel_fenicsx.fem import solver_methods as methods
 from remodel_fenicsx import kernels as single
-from remodel_fenicsx.scene import SceneError, preset_scene
+from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear, newton
 from remodel_fenicsx.solver.newton import Limits, LoadPhase
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants, worth
@@ -55,30 +48,19 @@ def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]])
 
 
 # ---------------------------------------------------------------- what is chosen
-@pytest.mark.parametrize(("small", "reduced"), [(SMALL_BODY, False), (SMALL_REDUCTION, True)])
+@pytest.mark.parametrize(("small", "reduced"), [(methods.SMALL_BODY, False), (methods.SMALL_REDUCTION, True)])
 def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
+    large, on_ranks = methods.LARGE, methods.LARGE_ON_RANKS
     for unknowns, ranks, method in (
         (small, 1, "direct"), (small + 1, 1, "lagged"), (small, 2, "direct"), (small + 1, 2, "lagged"),
-        (LARGE, 1, "lagged"),
-        (LARGE + 1, 1, "iterative"), (LARGE_ON_RANKS, 2, "lagged"), (LARGE_ON_RANKS + 1, 2, "iterative"),
+        (large, 1, "lagged"), (large + 1, 1, "iterative"), (on_ranks, 2, "lagged"), (on_ranks + 1, 2, "iterative"),
     ):  # fmt: skip
-        held = "iterative" if unknowns > LARGE else chosen("auto", unknowns, 1, reduced)
-        assert chosen("auto", unknowns, ranks, reduced, held=True) == held
-        assert chosen("auto", unknowns, ranks, reduced) == method
-        assert all(chosen(name, unknowns, ranks, reduced) == name for name in SOLVER_METHODS)
-    assert chosen("auto", LARGE + 1, 1, reduced, multigrid=False) == "lagged"
-    assert chosen("auto", LARGE_ON_RANKS + 1, 2, reduced, multigrid=False) == "lagged"
-
-
-@pytest.mark.parametrize(
-    "changes", [{"supports.ends": "closed"}, {"loads.axial_force": {"value": 1.0, "ramp": [[0.0, 0.0], [25.0, 1.0]]}}]
-)
-def test_multigrid_is_refused_where_the_length_is_an_unknown(changes: dict[str, Any]) -> None:
-    """One row of the tangent is full then: GMRES with GAMG ends after thousands of iterations, or not."""
-    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"loads.elongation.value": 0.0} | changes)
-    with pytest.raises(SceneError, match="solver.method = 'iterative': allowed where the length is an unknown"):
-        scene.with_values({"solver.method": "iterative"})
-    assert scene.with_values({"solver.method": "lagged"}).has_free_length
+        held = "iterative" if unknowns > methods.LARGE else methods.chosen("auto", unknowns, 1, reduced)
+        assert methods.chosen("auto", unknowns, ranks, reduced, held=True) == held
+        assert methods.chosen("auto", unknowns, ranks, reduced) == method
+        assert all(methods.chosen(name, unknowns, ranks, reduced) == name for name in methods.SOLVER_METHODS)
+    assert methods.chosen("auto", methods.LARGE + 1, 1, reduced, multigrid=False) == "lagged"
+    assert methods.chosen("auto", methods.LARGE_ON_RANKS + 1, 2, reduced, multigrid=False) == "lagged"
 
 
 def test_the_paper_s_tendon_has_few_factors() -> None:
@@ -401,7 +383,7 @@ def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptu
     """The paper's artery begins with one, by the stress of random cells. CHOLMOD cannot take it."""
     caplog.set_level(logging.INFO)
     scene, rows, said = preset_scene("kuhl-holzapfel-2007", "tube"), {}, {}
-    for method in SOLVER_METHODS:
+    for method in methods.SOLVER_METHODS:
         domain = tube(divisions=(12, 4, 8), comm=SELF)
         simulation = Simulation(scene.with_values({"time.end": 1.0, "solver.method": method}), SELF, domain)
         rows[method] = [step.row for step in simulation.steps()]

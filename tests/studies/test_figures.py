@@ -36,12 +36,7 @@ from tests.studies.test_children import children_of, is_alive
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
 DOCS = PACKAGE.parent / "docs"
-TINY = {
-    "name": "tiny",
-    "preset": "kuhl-holzapfel-2007",
-    "geometry": {"shape": "tendon"},
-    "time": {"end": 2.0},
-}
+TINY = {"name": "tiny", "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tendon"}, "time": {"end": 2.0}}
 
 
 def loaded(path: Path) -> Any:
@@ -83,16 +78,10 @@ def test_the_command_of_old_names_the_script(tmp_path: Path, monkeypatch: pytest
     assert os.listdir() == []
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["fig12"], "fig12: no such figure; allowed are fig1, fig5"),
-        (["fig1", "Fig5"], "Fig5: no such figure"),
-        (["fig1", "--jobs", "0"], "--jobs 0"),
-        (["fig1", "-o", "taken"], "-o taken: is a file"),
-        (["fig1", "--runs", "taken"], "--runs taken: is a file"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "named"), [
+    (["fig12"], "fig12: no such figure; allowed are fig1, fig5"), (["fig1", "--jobs", "0"], "--jobs 0"),
+    (["fig1", "-o", "taken"], "-o taken: is a file"), (["fig1", "--runs", "taken"], "--runs taken: is a file"),
+])  # fmt: skip
 def test_bad_input_is_one_line_and_writes_nothing(
     arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -176,52 +165,37 @@ def test_a_recorded_run_is_complete_when_all_of_it_is_there(tmp_path: Path) -> N
     assert answers(tmp_path, without) is True
 
 
-def another_scene(folder: Path) -> None:
-    (folder / "scene.toml").write_text(tiny(cells__seed=2).to_toml())
+def cut_text(name: str, change: Callable[[str], str]) -> Callable[[Path], object]:
+    """A file of the folder with another text."""
+    return lambda folder: (folder / name).write_text(change((folder / name).read_text()))
 
 
-def no_scene(folder: Path) -> None:
-    (folder / "scene.toml").unlink()
+def resized(dataset: str, length: int) -> Callable[[Path], None]:
+    """Fields with fewer of these values."""
+
+    def damage(folder: Path) -> None:
+        with h5py.File(folder / "fields.vtkhdf", "r+") as file:
+            file[f"VTKHDF/{dataset}"].resize(length, axis=0)
+
+    return damage
 
 
-def no_fields(folder: Path) -> None:
-    (folder / "fields.vtkhdf").unlink()
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "another scene": cut_text("scene.toml", lambda text: tiny(cells__seed=2).to_toml()),
+    "no scene": lambda folder: (folder / "scene.toml").unlink(),
+    "no fields": lambda folder: (folder / "fields.vtkhdf").unlink(),
+    "no second row": cut_text("history.csv", lambda text: re.sub("\n1.0,.*", "", text)),
+    "half a row": cut_text("history.csv", lambda text: text[:-4]),
+    "fields cut short": lambda folder: os.truncate(folder / "fields.vtkhdf", 5000),
+    "no last values": resized("CellData/fibre_angle", 2),
+    "no last time": resized("Steps/Values", 5),
+}
 
 
-def history_without_its_second_row(folder: Path) -> None:
-    lines = (folder / "history.csv").read_text().splitlines(keepends=True)
-    (folder / "history.csv").write_text("".join(lines[:2] + lines[3:]))
-
-
-def history_with_half_a_row(folder: Path) -> None:
-    (folder / "history.csv").write_text((folder / "history.csv").read_text()[:-4])
-
-
-def fields_cut_short(folder: Path) -> None:
-    os.truncate(folder / "fields.vtkhdf", os.path.getsize(folder / "fields.vtkhdf") - 100)
-
-
-def fields_that_are_none(folder: Path) -> None:
-    (folder / "fields.vtkhdf").write_text("")
-
-
-def fields_without_their_last_values(folder: Path) -> None:
-    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
-        file["VTKHDF/CellData/fibre_angle"].resize(2, axis=0)
-
-
-def fields_without_their_last_time(folder: Path) -> None:
-    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
-        file["VTKHDF/Steps/Values"].resize(5, axis=0)
-
-
-@pytest.mark.parametrize("damage", [
-    another_scene, no_scene, no_fields, history_without_its_second_row, history_with_half_a_row, fields_cut_short,
-    fields_that_are_none, fields_without_their_last_values, fields_without_their_last_time,
-])  # fmt: skip
-def test_a_damaged_run_is_not_complete(damage: Callable[[Path], None], tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_run_is_not_complete(damage: str, tmp_path: Path) -> None:
     scene = tiny(time__end=5.0)
-    damage(record(tmp_path, scene))
+    DAMAGES[damage](record(tmp_path, scene))
     assert answers(tmp_path, scene) is not True
 
 
@@ -257,7 +231,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
 
 def test_a_damaged_run_ends_the_script_with_the_line_of_the_run(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     path = figures.run_all([tiny()], tmp_path, 1)["tiny"].path
-    history_with_half_a_row(path)
+    DAMAGES["half a row"](path)
     capfd.readouterr()
     with pytest.raises(SystemExit) as end:
         figures.run_all([tiny()], tmp_path, 1)

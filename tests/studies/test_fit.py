@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from PIL import Image
 
 from benchmarks.recovery import MOST, TRUTH as RECOVERED, fitted, noisy, tables, tube as tube_of_the_benchmark
-from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, read_scene
+from remodel_fenicsx import Scene, SceneError, cli, preset_scene, read_scene
 from remodel_fenicsx.results.recording import FolderTaken, RunLock
 from remodel_fenicsx.schema.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
 from remodel_fenicsx.studies.fit import read_measurements
+from tests.runs import rows_of
+from tests.tables import rows
 
 ROOT, FITS = Path(__file__).parents[2], Path(__file__).with_name("fits")
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}
@@ -39,20 +40,11 @@ def tube(**changes: Any) -> Scene:
     return preset_scene("kuhl-holzapfel-2007", "tube").with_values(values | TRUTH | changes)
 
 
-def rows(scene: Scene) -> list[dict[str, float]]:
-    """Of the steps after t = 0."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
-        return [step.row for step in simulation.steps() if step.time > 0]
-    finally:
-        simulation.close()
-
-
 def inflated() -> list[dict[str, float]]:
     """Virgin tissue under rising pressure at once with the whole elongation."""
     ramp = [[0.0, 0.0], *([number + 1.0, p / 1.2] for number, p in enumerate(PRESSURES))]
     changes = {"remodeling.law": "none", "time.end": 6.0, "loads.pressure.ramp": ramp}
-    return rows(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
+    return rows_of(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +53,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     (folder / "scene.toml").write_text(tube().to_toml())
     virgin = [[p * PER_MMHG, row["outer_radius"]] for p, row in zip(PRESSURES, inflated(), strict=True)]
-    kept = [row for row in rows(tube()) if row["time"] in (10.0, 20.0, 30.0, 40.0)]
+    kept = [row for row in rows_of(tube()) if row["time"] in (10.0, 20.0, 30.0, 40.0)]
     names = ["time", "fibre_angle_outer", "inner_radius"]
     tables = {"virgin": [["pressure", "outer_radius"], *virgin]}
     tables["history"] = [names, *([row[name] for name in names] for row in kept)]
@@ -243,7 +235,7 @@ def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
 def test_a_passive_test_of_remodeled_tissue(folder: Path) -> None:
     """Cells of t = 40 that stay: at the loads of the run's own end it has the radii of the run's own next row."""
     end = tube(**{"time.end": 41.0})
-    expected = rows(end)[-1]
+    expected = rows_of(end)[-1]
     (folder / "after.csv").write_text("pressure,outer_radius,inner_radius\n0.6,1.4,1.2\n1.2,1.4,1.2\n")
     sd, state = "outer_radius = 0.01, inner_radius = 0.01", "state = 'after'\ntime = 40.0"
     data = written(folder, {"material.lame_mu": 3.0}, "after.csv", sd, state)
@@ -276,36 +268,14 @@ def test_what_the_data_cannot_tell_apart_is_named(folder: Path) -> None:
 MODULI = ("lame_lambda", "lame_mu", "chain_density")
 
 
-@pytest.mark.parametrize(("old", "new", "named"), [
-    ('"mmHg"', '"mm"', "measured[0].units.pressure = 'mm'"),
-    ('"mmHg"', '"nonsense"', "'nonsense' is no unit of stress"),
-    ("virgin.csv", "none.csv", "measured[0].file = 'none.csv'"),
-    ("virgin.csv", "bad.csv", "measured[0].file = 'bad.csv': row 2, outer_radius: 'nan'"),
-    ("virgin.csv", "short.csv", "measured[0].file = 'short.csv': row 1"),
-    ("virgin.csv", "other.csv", "'diameter'"),
-    ("virgin.csv", "twice.csv", "measured[0].file = 'twice.csv': the column outer_radius is there twice"),
-    ("sd = { outer_radius = 0.01 }", "sd = {}", "measured[0].sd.outer_radius"),
-    ("sd = { outer_radius = 0.01 }", "sd = { outer_radius = -1 }", "measured[0].sd.outer_radius = -1"),
-    ("sd = { outer_radius = 0.01 }", "sd = { radius = 1.0 }", "measured[0].sd.radius"),
-    ("sd = { outer_radius = 0.01 }", "sd = { outer_radius = 0.01, pressure = 1 }", "measured[0].sd.pressure"),
-    ("sd = { outer_radius = 0.01 }", "scale = { pressure = 2 }", "measured[0].scale.pressure = 2: must be 'unknown'"),
-    ("lower = 1e20", "lower = 2e21", "start = 1.5e+21: must lie between lower 2e+21 and upper 1e+23"),
-    ("lower = 1e20", "lower = 'low'", "lower = 'low': must be a finite number greater than 0"),
-    ("material.lame_mu", "material.lame", "material.lame"),
-    ('"material.lame_mu" = { start = 4.0', '"time.end" = { start = 40.0', "unknowns.time.end: "),
-    ('state = "history"', 'state = "past"', "measured[1].state = 'past': allowed are 'virgin', 'history', 'after'"),
-    ('state = "history"', 'state = "after"', "measured[1].time"),
-    ("start = 4.0", "start = 4.0, prior = 3.0", "prior = 3.0: prior and prior_sd"),
-    ("start = 4.0", "strt = 4.0", "strt = 4.0: unknown key"),
-    ("[unknowns]", "[unknown]", "unknown = "),
-])  # fmt: skip
+@pytest.mark.parametrize(("old", "new", "named"), rows(str(FITS / "x"), "refused.txt"))
 def test_bad_data_is_one_line(folder: Path, old: str, new: str, named: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit code 2, before any solve, and nothing is written."""
     (folder / "bad.csv").write_text("pressure,outer_radius\n1,1.3\n2,nan\n")
     (folder / "short.csv").write_text("pressure,outer_radius\n1\n")
     (folder / "twice.csv").write_text("pressure,outer_radius,Outer_Radius\n1,1.3,1.4\n")
     (folder / "other.csv").write_text("pressure,diameter\n1,1.3\n2,1.4\n")
-    assert old in DATA
+    assert old in DATA, old
     (folder / "data.toml").write_text(DATA.replace(old, new, 1))
     words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(folder / "out"), "-q"]
     assert cli.main(words) == 2

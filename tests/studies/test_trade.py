@@ -18,18 +18,7 @@ from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies import trade as rungs, trade as study
-from remodel_fenicsx.studies.trade import (
-    Result,
-    Setting,
-    Trade,
-    compared_times,
-    estimated,
-    ladder,
-    limit,
-    pareto,
-    typical,
-)
+from remodel_fenicsx.studies import trade
 from tests.conftest import forked_children
 from tests.reference.radial import solve_radial
 
@@ -42,7 +31,7 @@ def artery(**changes: Any) -> Scene:
     return preset_scene(PAPER, "tube").with_values({"cells.initial": "isotropic", **changes})
 
 
-def made_up(setting: Setting, noise: float = 0.0, jagged: float = 0.0) -> Result:
+def made_up(setting: trade.Setting, noise: float = 0.0, jagged: float = 0.0) -> trade.Result:
     """A result with an error of first order in the step and of second in the size of elements over their degree."""
     kinematics, refinement, degree = setting.mesh
     step = setting.step or setting.scene.time.tolerance or 0.0
@@ -53,41 +42,42 @@ def made_up(setting: Setting, noise: float = 0.0, jagged: float = 0.0) -> Result
     angles, lengths = 45.0 + error, 2.0 * (1 + 0.01 * error[:, :2])
     dear = {"full": 100.0}.get(kinematics, 1.0) * (20.0 if setting.scene.remodeling.coupling == "implicit" else 1.0)
     cost = refinement * degree / step * dear
-    return Result(setting, angles, lengths, cost, cost, noise, (angles, lengths))
+    return trade.Result(setting, angles, lengths, cost, cost, noise, (angles, lengths))
 
 
-def exact(result: Result) -> float:
-    return typical(result.angles - 45.0)
+def estimated(**how: float) -> tuple[list[trade.Row], list[str]]:
+    """Rows and notes on all of the artery's ladder."""
+    return trade.estimated([made_up(setting, **how) for setting in trade.ladder(artery())])
+
+
+def assert_right(rows: list[trade.Row]) -> None:
+    """Each says its own error."""
+    for row in rows:
+        exact = trade.typical(row.result.angles - 45.0)
+        assert row.angle_error == pytest.approx(exact, rel=0.05, abs=2e-3), row.result.setting.name
 
 
 # ---------------------------------------------------------------- estimates
 def test_an_order_is_seen_and_what_is_left_with_it() -> None:
     for order in (1, 2, 4):
-        found = limit([10.0 + 0.5 ** (order * k) * SMOOTH for k in range(4)])
+        found = trade.limit([10.0 + 0.5 ** (order * k) * SMOOTH for k in range(4)])
         assert found.trusted and found.order == pytest.approx(order)
         np.testing.assert_allclose(found.beyond, -(0.5 ** (3 * order)) * SMOOTH, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "results",
-    [
-        [SMOOTH, 0 * SMOOTH, SMOOTH],  # to and fro
-        [SMOOTH, 1.1 * SMOOTH, 1.21 * SMOOTH],  # growing
-        [SMOOTH, 0.5 * SMOOTH],  # too few
-        [SMOOTH, 0 * SMOOTH, np.array([[0.3, -0.3, 0.0], [0.0, 0.3, 0.3]])],  # another way
-    ],
-)
+@pytest.mark.parametrize("results", [
+    [SMOOTH, 0 * SMOOTH, SMOOTH], [SMOOTH, 1.1 * SMOOTH, 1.21 * SMOOTH], [SMOOTH, 0.5 * SMOOTH],
+    [SMOOTH, 0 * SMOOTH, np.array([[0.3, -0.3, 0.0], [0.0, 0.3, 0.3]])],
+], ids=["to and fro", "growing", "too few", "another way"])  # fmt: skip
 def test_where_no_order_shows_nothing_is_extrapolated(results: list[np.ndarray]) -> None:
-    found = limit(results)
+    found = trade.limit(results)
     assert not found.trusted and not found.beyond.any()
 
 
 def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
-    results = [made_up(setting) for setting in ladder(artery())]
-    rows, notes = estimated(results)
-    for row in rows:
-        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3), row.result.setting.name
-        assert not row.doubt
+    rows, notes = estimated()
+    assert_right(rows)
+    assert not any(row.doubt for row in rows)
     said = "\n".join(notes)
     assert "time: no error (steps 5, 2.5 on refinement 1, degree 1)" in said  # of 'implicit', whose guess is taken
     assert "mesh: order 2 (refinements 1, 2, 4 of degree 2)" in said
@@ -97,33 +87,31 @@ def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
 
 
 def test_without_an_exact_coupling_orders_in_time_and_mesh_are_seen() -> None:
-    results = [made_up(setting) for setting in ladder(artery()) if setting.way[1] == "staggered"]
-    rows, notes = estimated(results)
-    for row in rows:
-        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3), row.result.setting.name
+    results = [made_up(setting) for setting in trade.ladder(artery()) if setting.way[1] == "staggered"]
+    rows, notes = trade.estimated(results)
+    assert_right(rows)
     assert any(note.startswith("time: order 1 (steps 1, 0.5, 0.25 on refinement 2, degree 2)") for note in notes)
     assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
 
 
-def varies_one_factor(setting: Setting) -> bool:
-    return {key.partition(".")[0] for key in setting.changes if key != rungs.COUPLING} in (set(), {"time"}, {"mesh"})
+def varies_one_factor(setting: trade.Setting) -> bool:
+    return {key.partition(".")[0] for key in setting.changes if key != trade.COUPLING} in (set(), {"time"}, {"mesh"})
 
 
 def test_a_budget_that_ends_early_still_estimates_both_factors() -> None:
     """The finest of each sweep stand beside each other; nothing has both."""
-    results = [made_up(s) for s in ladder(artery()) if s.mesh[0] == "radial" and varies_one_factor(s)]
-    for row in estimated(results)[0]:
-        assert row.angle_error == pytest.approx(exact(row.result), rel=0.05, abs=2e-3)
+    results = [made_up(s) for s in trade.ladder(artery()) if s.mesh[0] == "radial" and varies_one_factor(s)]
+    assert_right(trade.estimated(results)[0])
 
 
 def test_doubts_are_said() -> None:
-    rows, notes = estimated([made_up(setting, jagged=1.0) for setting in ladder(artery())])
+    rows, notes = estimated(jagged=1.0)
     assert any("no order seen" in note for note in notes)
     assert any(row.doubt == "no order seen" for row in rows)
-    rows, _ = estimated([made_up(setting, noise=1.0) for setting in ladder(artery())])
+    rows, _ = estimated(noise=1.0)
     assert {row.doubt for row in rows if row.angle_error < 1.0} == {"noise of random cells 1"}
-    only_time = [made_up(s) for s in ladder(artery()) if s.mesh == ("radial", 1, 1)]
-    rows, notes = estimated(only_time)
+    only_time = [made_up(s) for s in trade.ladder(artery()) if s.mesh == ("radial", 1, 1)]
+    rows, notes = trade.estimated(only_time)
     assert "mesh: fewer than two settings were run, so its error is in no estimate" in notes
     assert {row.doubt for row in rows} == {"a factor was not varied"}
 
@@ -132,7 +120,7 @@ def test_random_cells_are_compared_in_the_mean() -> None:
     """A step on the cells of one seed is compared with another step on the same cells."""
     shift = 5.0
     results = []
-    for setting in ladder(artery(**{"cells.initial": "random"})):
+    for setting in trade.ladder(artery(**{"cells.initial": "random"})):
         result = made_up(setting)
         single = result.angles + shift, result.lengths
         if len(setting.seeds) == 1:
@@ -140,26 +128,26 @@ def test_random_cells_are_compared_in_the_mean() -> None:
         else:
             result = replace(result, noise=0.01, single=single)
         results.append(result)
-    assert {len(result.setting.seeds) for result in results} == {1, rungs.SEEDS}
-    rows, notes = estimated(results)
+    assert {len(result.setting.seeds) for result in results} == {1, trade.SEEDS}
+    rows, notes = trade.estimated(results)
     for row in rows:
         assert row.angle_error < 5.0
     # what steps cost does not drown in the noise of cells: 0.4 of SMOOTH for a step of one
-    cost = 0.4 * typical(SMOOTH)
+    cost = 0.4 * trade.typical(SMOOTH)
     words = next(note for note in notes if note.startswith("steps alone, on the same cells"))
     assert "an order shows" in words and f"step 2.5 {2.5 * cost:.2g}, " in words and f"step 1 {cost:.2g}, " in words
-    assert not any("same cells" in note for note in estimated([made_up(setting) for setting in ladder(artery())])[1])
+    assert not any("same cells" in note for note in estimated()[1])
 
 
 def test_the_front() -> None:
-    assert pareto([1.0, 2.0, 3.0, 3.0], [4.0, 2.0, 3.0, 1.0]) == [True, True, False, True]
-    assert pareto([1.0, 2.0], [np.nan, 1.0]) == [False, True]
+    assert trade.pareto([1.0, 2.0, 3.0, 3.0], [4.0, 2.0, 3.0, 1.0]) == [True, True, False, True]
+    assert trade.pareto([1.0, 2.0], [np.nan, 1.0]) == [False, True]
 
 
 # ---------------------------------------------------------------- the ladder
 def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
     scene = artery()
-    settings = ladder(scene)
+    settings = trade.ladder(scene)
     assert len({setting.name for setting in settings}) == len(settings) > 20
     assert {setting.mesh[0] for setting in settings} == {"radial", "sector", "full"}
     coarse = [s for s in settings if s.mesh == ("radial", 1, 1) and s.step]
@@ -171,10 +159,10 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
     assert profiles["fast"].scene == scene.with_values(fast)
     assert profiles["reference"].expected_seconds < 5.0  # measured: 1.4
     assert profiles["reference"].scene.remodeling.coupling == "implicit"
-    times = compared_times(scene, settings)
+    times = trade.compared_times(scene, settings)
     assert times[0] == 5.0 and 25.0 in times and times[-1] == 150.0
     for setting in settings:
-        run = rungs.as_run(setting, 3, times)
+        run = trade.as_run(setting, 3, times)
         assert run.cells.seed == 3 and run.output.times == tuple(times) and not run.output.fields
         assert setting.scene.output == scene.output
 
@@ -182,14 +170,14 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
 def test_a_scene_with_a_profile_has_a_ladder_too() -> None:
     """With fixed steps on the profile's mesh, and other profiles."""
     scene = artery().with_values({"profile": "balanced", "mesh.degree": 2})
-    settings = ladder(scene)
+    settings = trade.ladder(scene)
     assert {"fast", "reference"} <= {setting.profile for setting in settings}
     assert len({setting.step for setting in settings if setting.mesh[2] == 2}) > 4
-    assert compared_times(scene, settings)[-1] == 150.0
+    assert trade.compared_times(scene, settings)[-1] == 150.0
 
 
 def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
-    settings = ladder(preset_scene(PAPER, "tendon"))
+    settings = trade.ladder(preset_scene(PAPER, "tendon"))
     assert {setting.mesh[0] for setting in settings} == {"full"}
     assert {setting.seeds for setting in settings} == {(1,), (1, 2, 3)}
 
@@ -200,19 +188,19 @@ def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
 ])  # fmt: skip
 def test_implicit_is_there_where_it_has_no_error_in_time(changes: dict[str, Any]) -> None:
     """Profiles have a formulation of their own."""
-    settings = [setting for setting in ladder(artery(**changes)) if not setting.profile]
+    settings = [setting for setting in trade.ladder(artery(**changes)) if not setting.profile]
     assert {setting.scene.remodeling.coupling for setting in settings} == {"staggered"} and len(settings) > 15
 
 
 def test_a_point_has_no_mesh() -> None:
     """No row for one, no doubt for want of one, no word of one."""
     scene = preset_scene(PAPER, "cube").with_values({"cells.initial": "isotropic"})
-    settings = ladder(scene)
+    settings = trade.ladder(scene)
     assert {setting.mesh[1:] for setting in settings} == {(1, 1)} and len(settings) > 15
     points = [setting for setting in settings if setting.mesh[0] == "point"]
     assert not any("refinement" in setting.in_words() for setting in points)
     for coupling in ("staggered", "implicit"):
-        rows, notes = estimated([made_up(setting) for setting in points if setting.way[1] == coupling])
+        rows, notes = trade.estimated([made_up(setting) for setting in points if setting.way[1] == coupling])
         assert not any(row.doubt for row in rows) and not any("mesh" in note for note in notes)
 
 
@@ -223,7 +211,7 @@ def test_hats_add_up_to_one_and_are_one_at_their_places() -> None:
 
 def test_noise_is_the_standard_error_of_the_mean() -> None:
     """Of seeds whose angles differ by a known standard deviation; the angles are their mean."""
-    setting = next(s for s in ladder(artery(**{"cells.initial": "random"})) if len(s.seeds) == rungs.SEEDS)
+    setting = next(s for s in trade.ladder(artery(**{"cells.initial": "random"})) if len(s.seeds) == trade.SEEDS)
     spread, times = np.array([-1.0, 0.0, 1.0]), [0.0, 1.0]  # a sample of standard deviation 1
 
     def history(number: int) -> HistoryColumns:
@@ -232,28 +220,22 @@ def test_noise_is_the_standard_error_of_the_mean() -> None:
         return HistoryColumns(columns, time=np.array(times), processor_seconds=np.full(2, 1.0 + number))
 
     members = [SimpleNamespace(history=lambda number=number: history(number)) for number in range(3)]
-    result = study.read(setting, members, times)  # type: ignore[arg-type]
+    result = trade.read(setting, members, times)  # type: ignore[arg-type]
     assert result.noise == pytest.approx(3**-0.5)
     np.testing.assert_allclose(result.angles, 30.0)
     assert result.seconds == pytest.approx(4.0)  # of one run, two rows of 1, 2 and 3
-    assert study.read(setting, members[:1], times).noise == 0.0  # type: ignore[arg-type]
+    assert trade.read(setting, members[:1], times).noise == 0.0  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------- the command
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """On a cube whose stress is the same everywhere: three steps; again: nothing is run; a row is a scene."""
-    for name, value in (
-        ("STEPS", (2.0, 0.5)),
-        ("MESHES", ()),
-        ("TOGETHER", ()),
-        ("TOLERANCES", ()),
-        ("PROFILES", {}),
-    ):
-        monkeypatch.setattr(rungs, name, value)
+    for name, value in {"STEPS": (2.0, 0.5), "MESHES": (), "TOGETHER": (), "TOLERANCES": (), "PROFILES": {}}.items():
+        monkeypatch.setattr(trade, name, value)
     path, out = tmp_path / "cube.toml", tmp_path / "out"
     changes = {"model.kinematics": "point", "time.end": 20.0, "remodeling.kappa": 0.1}
     path.write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
-    monkeypatch.setattr(rungs, "objections", lambda scene, name: ["left out by the test"])
+    monkeypatch.setattr(trade, "objections", lambda scene, name: ["left out by the test"])
     out.mkdir()
     (out / "point-1-degree-1-step-0.5-1").write_text("a file of the user's: this run fails")
     with forked_children():
@@ -288,7 +270,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
     assert {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")} == before
     with monkeypatch.context() as patch:
-        patch.setattr(rungs, "TOLERANCES", (0.5,))
+        patch.setattr(trade, "TOLERANCES", (0.5,))
         assert cli.main(["trade", str(path), "-o", str(out), "--budget", "0.001s", "-q"]) == 0
     assert "left out, over the budget: point-1-degree-1-tolerance-0.5" in capsys.readouterr().out
     assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s", "-q"]) == 4
@@ -297,10 +279,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert re.search(r"is kept, a larger budget goes on; the cheapest 2 need about \S+ s for their steps", said)
     assert said.count("\n") == 1
 
-    monkeypatch.setattr(study, "ladder", lambda scene: ladder(scene)[:2])
+    first = trade.ladder(read_scene(path))[:2]
+    monkeypatch.setattr(trade, "ladder", lambda scene: first)
     lone = tmp_path / "lone"
     lone.mkdir()
-    (lone / f"{ladder(read_scene(path))[0].name}-1").write_text("a file of the user's")
+    (lone / f"{first[0].name}-1").write_text("a file of the user's")
     with forked_children():
         assert cli.main(["trade", str(path), "-o", str(lone), "--jobs", "2", "-q"]) == 3
     failure, verdict = capsys.readouterr().err.splitlines()
@@ -309,8 +292,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_words() -> None:
-    rows, notes = estimated([made_up(setting) for setting in ladder(artery())])
-    text = Trade(artery(), rows, notes).in_words()
+    rows, notes = estimated()
+    text = trade.Trade(artery(), rows, notes).in_words()
     assert "order 2" in text
     assert sum(line.startswith("* ") for line in text.splitlines()) == sum(row.on_front for row in rows) > 2
     assert "radial       refinement 1 degree 1 tolerance 1 (profile fast)" in text and "radii %" in text
@@ -318,8 +301,8 @@ def test_words() -> None:
 
 
 def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:
-    rows, notes = estimated([made_up(setting, noise=0.3) for setting in ladder(artery())])
-    Trade(artery(), rows, notes).write(tmp_path)
+    rows, notes = estimated(noise=0.3)
+    trade.Trade(artery(), rows, notes).write(tmp_path)
     with (tmp_path / "trade.csv").open() as file:
         table = list(csv.DictReader(file))
     assert [entry["trusted"] == "1" for entry in table] == [entry["doubt"] == "" for entry in table]
@@ -328,8 +311,8 @@ def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:
 
 def test_the_picture_stays_in_its_frame_and_no_word_lies_on_a_point() -> None:
     """Numbers lie in their own points alone."""
-    rows, _ = estimated([made_up(setting) for setting in ladder(artery())])
-    figure = Trade(artery(), rows).figure()
+    rows, _ = estimated()
+    figure = trade.Trade(artery(), rows).figure()
     figure.draw_without_rendering()
     (axes,) = figure.axes
     shown = [row for row in rows if row.angle_error > 0]
@@ -359,10 +342,10 @@ def test_the_picture_stays_in_its_frame_and_no_word_lies_on_a_point() -> None:
 def test_estimates_of_the_artery_are_the_true_errors(tmp_path: Path) -> None:
     """Against the one-dimensional reference with small steps: eight of ten rows within a factor of two."""
     scene = artery(**{"model.kinematics": "radial"})
-    folder, found = study.trade(scene, tmp_path / "out", budget=3000.0)
-    times = compared_times(scene, ladder(scene))
+    folder, found = trade.trade(scene, tmp_path / "out", budget=3000.0)
+    times = trade.compared_times(scene, trade.ladder(scene))
     coarse, fine = (_reference(step, times) for step in (1 / 8, 1 / 16))
-    true = {row.result.setting.name: typical(row.result.angles - (2 * fine - coarse)) for row in found.rows}
+    true = {row.result.setting.name: trade.typical(row.result.angles - (2 * fine - coarse)) for row in found.rows}
     ratios = [row.angle_error / true[row.result.setting.name] for row in found.rows]
     assert np.mean([0.5 <= ratio <= 2.0 for ratio in ratios]) >= 0.8, sorted(ratios)
 

@@ -18,6 +18,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.stability import stability, unseen_by
 from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
+from tests.runs import made
 
 MU, LAME = 3.103, 27.293
 YOUNG, POISSON = MU * (3 * LAME + 2 * MU) / (LAME + MU), LAME / (2 * (LAME + MU))
@@ -46,13 +47,10 @@ def slender(kinematics: str, pressure: float, **changes: Any) -> Scene:
 @contextmanager
 def watched(scene: Scene) -> Iterator[BucklingWarning]:
     """The watcher at the end of a run."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
+    with made(scene) as simulation:
         for _ in simulation.steps():
             pass
         yield BucklingWarning(simulation.stepper, scene.geometry.strut(scene.supports.ends))
-    finally:
-        simulation.close()
 
 
 # ---------------------------------------------------------------- in closed form

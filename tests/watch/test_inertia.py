@@ -26,6 +26,7 @@ from remodel_fenicsx.watch import stability as equilibrium_stability
 from remodel_fenicsx.watch.stability import EquilibriumStability
 from tests import parts
 from tests.parts import cube, tube
+from tests.runs import made
 
 DEMOS = Path(__file__).parents[2] / "demos"
 COLUMN = {"output.columns": ["negative_eigenvalues"]}
@@ -40,11 +41,8 @@ def pushed_cube(force: float, **values: Any) -> Scene:
 
 def run(scene: Scene, domain: Any = None) -> list[Step]:
     """Its steps."""
-    simulation = Simulation(scene, MPI.COMM_SELF, domain)
-    try:
+    with made(scene, domain) as simulation:
         return list(simulation.steps())
-    finally:
-        simulation.close()
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:

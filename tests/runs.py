@@ -1,0 +1,91 @@
+"""Scenes, or tables of them, run to their end in this process alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from remodel_fenicsx import Recording, Scene, Simulation
+from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.scene.scene import scene_from_dict
+
+SELF = MPI.COMM_SELF
+Rows = list[dict[str, float]]
+
+
+@contextmanager
+def made(scene: Scene | Mapping[str, Any], domain: Any = None) -> Iterator[Simulation]:
+    """A simulation before its first step, which is closed in the end."""
+    simulation = Simulation(scene if isinstance(scene, Scene) else scene_from_dict(dict(scene)), SELF, domain)
+    try:
+        yield simulation
+    finally:
+        simulation.close()
+
+
+@contextmanager
+def simulated(
+    scene: Scene | Mapping[str, Any], domain: Any = None, watchers: Sequence[Any] = ()
+) -> Iterator[tuple[Simulation, Rows]]:
+    """A simulation at its end, and its rows."""
+    with made(scene, domain) as simulation:
+        yield simulation, [dict(step.row) for step in simulation.steps(watchers)]
+
+
+def rows_of(scene: Scene | Mapping[str, Any], domain: Any = None, watchers: Sequence[Any] = ()) -> Rows:
+    """All rows of its steps."""
+    with simulated(scene, domain, watchers) as (_, rows):
+        return rows
+
+
+def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, float]:
+    """The row of its end."""
+    return rows_of(scene, domain)[-1]
+
+
+def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:
+    """Its rows by column."""
+    rows = rows_of(scene, domain)
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def goes_on(scene: Scene | Mapping[str, Any], folder: Path, *stops: float) -> Recording:
+    """A run that stops at these times and goes on has the rows of one that does not, to the last digit."""
+    asked = scene if isinstance(scene, Scene) else scene_from_dict(dict(scene))
+    whole = Recording(run(asked, folder / "whole", SELF)).history
+    parts = run(asked.with_values({"time.end": stops[0]}), folder / "parts", SELF)
+    for end in (*stops[1:], asked.time.end):
+        resume(parts, [f"time.end={end}"], SELF)
+    found = Recording(parts)
+    assert list(found.history) == list(whole)
+    for name in set(whole) - {"seconds"}:
+        np.testing.assert_array_equal(found.history[name], whole[name], err_msg=name)
+    return found
+
+
+def taylor_orders(simulation: Simulation, equilibrium: Any, size: float) -> np.ndarray:
+    """Orders of what the tangent leaves of the forces, for a random change of the free unknowns, halved twice."""
+    x, unknown = simulation.unknown.x.petsc_vec, simulation.unknown.x.array
+    residual, loads, matrix = x.duplicate(), x.duplicate(), equilibrium.create_matrix()
+    free, start = np.isnan(equilibrium.prescribed_values()), unknown.copy()
+    direction = np.where(free, np.random.default_rng(3).standard_normal(len(unknown)) * size, 0.0)
+
+    def force(h: float) -> np.ndarray:
+        unknown[:] = start + h * direction
+        equilibrium.assemble_internal(residual)
+        equilibrium.assemble_external(loads)
+        return np.asarray((residual.array + loads.array)[free])
+
+    zero = force(0.0)
+    equilibrium.assemble_tangent(matrix)
+    step, change = matrix.createVecRight(), matrix.createVecLeft()
+    step.array[:] = direction
+    matrix.mult(step, change)
+    left = [np.linalg.norm(force(h) - zero - h * change.array[free]) for h in (1.0, 0.5, 0.25)]
+    unknown[:] = start
+    return np.asarray(np.log2(np.divide(left[:-1], left[1:])))
