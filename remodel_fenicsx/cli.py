@@ -442,12 +442,43 @@ def _export(options: argparse.Namespace) -> None:
     "new",
     ["new kuhl-holzapfel-2007 --shape tube > mine.toml"],
     option(f"preset PRESET  The model: {', '.join(PRESETS)}."),
-    option("--shape SHAPE  The body: cube, tendon or tube (default: tube).", default="tube"),
+    option("--shape SHAPE  The body: cube, tendon, sheet or tube (default: tube).", default="tube"),
 )
 def _new(options: argparse.Namespace) -> None:
     """Print a scene of a published model, with every key."""
     scene: Scene = preset_scene(options.preset, options.shape)
     _say(scene.to_toml(f"a scene of the preset {options.preset}").rstrip("\n"))
+
+
+@command(
+    "wall",
+    [
+        "wall lumen.stl --thickness 0.6 --size 0.9 -o vessel.msh",
+        "wall lumen.ply --layers media=0.6 adventitia=0.4 --size 0.5 -o vessel.msh",
+    ],
+    option("surface FILE  The surface of the lumen, open at its ends: STL, PLY, VTP or OBJ.", type=Path),
+    option(
+        "--thickness VALUE  Thickness of the wall in the unit of the surface, or the name of an array at its points."
+    ),
+    option(
+        "--layers NAME=VALUE  Layers from the lumen outwards, each a region, with their thickness.",
+        nargs="+",
+        default=(),
+    ),
+    option("--size LENGTH  Length of an element along the wall, about its thickness.", type=float, required=True),
+    option("--through K  Elements through the wall, at least one a layer (default: %(default)s).", default=2),
+    option("-o --output FILE  Write to this new file (default: SURFACE.msh)."),
+    needs=COMPUTES,
+    alone=True,
+)
+def _wall(options: argparse.Namespace) -> None:
+    """Make the mesh of a vessel's wall from the surface of its lumen."""
+    from remodel_fenicsx.body.lumen import write_wall
+
+    path = options.output or options.surface.with_suffix(".msh")
+    with _stopping("nothing is written"):
+        lines = write_wall(options.surface, path, options.thickness, options.layers, options.size, options.through)
+    _say("\n".join(lines))
 
 
 @command("validate", ["validate artery.toml", "validate artery.toml --profile fast"], *SCENE)

@@ -1,0 +1,188 @@
+"""From the surface of a lumen to a wall: volumes of closed form, formats, orientation, branches, what is refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from remodel_fenicsx import cli
+from remodel_fenicsx.body.lumen import oriented, Surface
+from remodel_fenicsx.scene import scene_from_dict
+
+RADIUS, LENGTH, AROUND, ALONG = 1.0, 4.0, 48, 24
+Triangles = NDArray[np.int64]
+
+
+def tube(bend: float = 0.0) -> tuple[NDArray[np.float64], Triangles]:
+    """A grid of triangles around the z axis, perhaps along an arc, open at its ends, normals outwards."""
+    z, around = np.meshgrid(np.linspace(0, LENGTH, ALONG + 1), 2 * np.pi * np.arange(AROUND) / AROUND)
+    x, y = RADIUS * np.cos(around), RADIUS * np.sin(around)
+    if bend:
+        radius = LENGTH / bend
+        x, z = (radius + x) * np.cos(z / radius) - radius, (radius + x) * np.sin(z / radius)
+    number = np.arange(z.size).reshape(z.shape)
+    a, b = number[:, :-1], np.roll(number, -1, axis=0)[:, :-1]
+    rows = [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, b + 1), (a, b + 1, a + 1))]
+    return np.stack([x, y, z], axis=-1).reshape(-1, 3), np.concatenate(rows)
+
+
+def written(path: Path, points: Any, triangles: Any, **arrays: Any) -> Path:
+    """In the format of its ending; .vtp as VTK writes it."""
+    if path.suffix != ".vtp":
+        meshio.Mesh(points, [("triangle", triangles)], point_data=arrays).write(path)
+        return path
+    pyvista = pytest.importorskip("pyvista")
+    data = pyvista.PolyData(points, np.column_stack([np.full(len(triangles), 3), triangles]))
+    for name, values in arrays.items():
+        data.point_data[name] = values
+    data.save(path, binary=True)
+    return path
+
+
+def volumes(file: Path) -> dict[str, float]:
+    """Of the regions, by straight-sided tetrahedra."""
+    mesh = meshio.read(file)
+    corners = mesh.points[mesh.get_cells_type("tetra10")[:, :4]]
+    signed = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    assert (signed > 0).all()
+    tags = mesh.get_cell_data("gmsh:physical", "tetra10")
+    names = {int(tag): name for name, (tag, dimension) in mesh.field_data.items() if dimension == 3}
+    return {name: float(signed[tags == tag].sum()) for tag, name in names.items()}
+
+
+def ring(inner: float, outer: float) -> float:
+    return float(np.pi * (outer**2 - inner**2) * LENGTH)
+
+
+def wall(*words: Any) -> int:
+    return cli.main(["wall", *map(str, words)])
+
+
+@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "vtp"])
+@pytest.mark.parametrize("inwards", [False, True])
+def test_layers_have_their_volumes_whatever_the_file(ending: str, inwards: bool, tmp_path: Path) -> None:
+    """Of a straight tube, whichever way its triangles look; one in three looks the other way."""
+    points, triangles = tube()
+    turned = triangles[:, ::-1] if inwards else triangles.copy()
+    turned[::3] = turned[::3, ::-1]
+    file, path = written(tmp_path / f"lumen.{ending}", points, turned), tmp_path / "vessel.msh"
+    assert wall(file, "--layers", "media=0.3", "adventitia=0.2", "--size", 0.3, "-o", path) == 0
+    found = volumes(path)
+    assert found["media"] == pytest.approx(ring(1.0, 1.3), rel=0.03)
+    assert found["adventitia"] == pytest.approx(ring(1.3, 1.5), rel=0.03)
+
+
+def test_its_faces_lie_where_they_belong_and_a_scene_takes_it(tmp_path: Path) -> None:
+    """Bent by a right angle: ends stay flat; the thickness comes from an array of the file."""
+    points, triangles = tube(bend=np.pi / 2)
+    thick = np.where(points[:, 1] > 0, 0.6, 0.3)
+    file, path = written(tmp_path / "lumen.vtp", points, triangles, wall=thick), tmp_path / "vessel.msh"
+    assert wall(file, "--thickness", "wall", "--size", 0.5, "--through", 3, "-o", path) == 0
+    mesh = meshio.read(path)
+    tags = mesh.get_cell_data("gmsh:physical", "triangle6")
+    places = {
+        name: mesh.points[np.unique(mesh.get_cells_type("triangle6")[tags == tag])]
+        for name, (tag, dimension) in mesh.field_data.items()
+        if dimension == 2
+    }
+    assert set(places) == {"inner", "outer", "inlet", "outlet_1"}
+    assert np.abs(places["inlet"][:, 2]).max() < 1e-9
+    centre = -LENGTH / (np.pi / 2)
+    assert np.abs(places["outlet_1"][:, 0] - centre).max() < 1e-6
+    distance = np.hypot(np.hypot(places["outer"][:, 0] - centre, places["outer"][:, 2]) + centre, places["outer"][:, 1])
+    assert distance.max() == pytest.approx(1.6, abs=0.05) and distance.min() == pytest.approx(1.3, abs=0.05)
+    geometry = {"shape": "mesh", "file": str(path), "length_unit": "mm", "faces": {"outlet": "outlet_1"}}
+    checked: Any = scene_from_dict({"geometry": geometry, "time": {"end": 1.0, "step": 1.0}}).geometry
+    assert checked.checked() is not None
+
+
+def test_a_branch_is_taken_and_its_ends_are_counted(tmp_path: Path) -> None:
+    file, path = Path(__file__).with_name("files") / "branch.stl", tmp_path / "vessel.msh"
+    assert wall(file, "--thickness", 0.3, "--size", 0.4, "-o", path) == 0
+    names = {name for name, (_, dimension) in meshio.read(path).field_data.items() if dimension == 2}
+    assert names == {"inner", "outer", "inlet", "outlet_1", "outlet_2"}
+    assert min(volumes(path).values()) > 0
+
+
+def closed() -> tuple[Any, Any]:
+    points, triangles = tube()
+    ends = np.arange(len(points)).reshape(AROUND, ALONG + 1)
+    caps = [
+        np.stack([rim, np.roll(rim, -1), np.full(AROUND, len(points) + k)], 1)
+        for k, rim in enumerate(ends[:, [0, -1]].T)
+    ]
+    return np.vstack([points, [[0, 0, 0], [0, 0, LENGTH]]]), np.vstack([triangles, *caps])
+
+
+def two() -> tuple[Any, Any]:
+    points, triangles = tube()
+    return np.vstack([points, points + [5.0, 0, 0]]), np.vstack([triangles, triangles + len(points)])
+
+
+def of_three() -> tuple[Any, Any]:
+    points, triangles = tube()
+    return np.vstack([points, [[2.0, 0, 2.0]]]), np.vstack([triangles, [[*triangles[7, :2], len(points)]]])
+
+
+@pytest.mark.parametrize(
+    ("made", "words", "said"),
+    [
+        (closed, ["--thickness", 0.3], "the surface is closed; cut its ends open"),
+        (two, ["--thickness", 0.3], "has 2 parts"),
+        (of_three, ["--thickness", 0.3], r"three triangles or more meet in one edge, at \("),
+        (lambda: tube(3.5), ["--thickness", 1.0], r"--thickness: too thick: the wall .* at \("),
+        (tube, ["--thickness", 0], "--thickness 0: allowed is a number above 0"),
+        (tube, [], "--thickness: missing"),
+        (tube, ["--thickness", 1, "--layers", "media=0.3"], "the layers come to 0.3"),
+        (tube, ["--layers", "media"], "--layers media: allowed is NAME=THICKNESS"),
+        (tube, ["--thickness", 0.3, "--size", -1], "--size: allowed"),
+        (tube, ["--thickness", 0.3, "--through", 0], "--through: allowed"),
+    ],
+)
+def test_what_is_no_lumen_is_refused_in_one_line(
+    made: Any, words: list[Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = written(tmp_path / "lumen.stl", *made())
+    size = [] if "--size" in words else ["--size", 0.5]
+    assert wall(file, *words, *size, "-o", tmp_path / "vessel.msh") == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and re.search(said, lines[0]), lines
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("lumen.stl", b"solid nothing"), ("lumen.ply", b"ply\nformat ascii 1.0\nelement vertex 99999999999\n"),
+        ("lumen.vtp", b"<!DOCTYPE x [<!ENTITY a 'b'>]><VTKFile/>"), ("lumen.obj", b"v 0 0\nf 1 2 3\n"),
+        ("lumen.step", b""), ("lumen.vtp", b"<VTKFile type='PolyData'><xi:include href='/etc/passwd'/></VTKFile>"),
+    ],
+)  # fmt: skip
+def test_files_that_are_none_are_refused_in_one_line(
+    name: str, text: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(text)
+    assert wall(tmp_path / name, "--thickness", 1, "--size", 1, "-o", tmp_path / "vessel.msh") == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and name in lines[0]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_normals_look_out_of_a_bend() -> None:
+    points, triangles = tube(bend=np.pi / 2)
+    for given in (triangles, triangles[:, ::-1]):
+        found = oriented(Surface(points, given, {}), "it")
+        a, b, c = (points[found.triangles[:, k]] for k in range(3))
+        centre = -LENGTH / (np.pi / 2)
+        middle = (a + b + c) / 3
+        radius = np.hypot(middle[:, 0] - centre, middle[:, 2])
+        on_axis = np.stack(
+            [centre + -centre * (middle[:, 0] - centre) / radius, 0 * radius, -centre * middle[:, 2] / radius], 1
+        )
+        assert (np.einsum("ni,ni->n", np.cross(b - a, c - a), middle - on_axis) > 0).all()
