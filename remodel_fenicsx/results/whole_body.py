@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.body.shape import Shape
@@ -39,6 +38,8 @@ class TurnedFields:
     def __init__(
         self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
     ):
+        from scipy.spatial import cKDTree  # a run that draws nothing needs none
+
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
         self.nodes = cKDTree(own_points).query(back)[1]
