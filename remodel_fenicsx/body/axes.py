@@ -55,12 +55,18 @@ def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outle
 
 def _radial(mesh: Any, degree: int, dx: Any, inner: Facets, outer: Facets, thickness: float) -> Any:
     """Projected unit gradients of the harmonic function."""
-    phi, found = lagrange(mesh, degree, ()), lagrange(mesh, degree, (3,))
-    solve_positive(_stiffness(phi, dx), None, phi, [_held(phi, inner, 0.0), _held(phi, outer, 1.0)])
+    phi, found = harmonic(mesh, degree, dx, inner, outer), lagrange(mesh, degree, (3,))
     slope, least = ufl.grad(phi), dolfinx.fem.Constant(mesh, np.float64(LEAST_SLOPE / thickness))
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
     trial, test = _arguments(found)
     solve_positive(ufl.inner(trial, test) * dx, ufl.inner(direction, test) * dx, found)
+    return found
+
+
+def harmonic(mesh: Any, degree: int, dx: Any, low: Facets, high: Facets) -> Any:
+    """The harmonic function that is 0 on some facets and 1 on others. Collective."""
+    found = lagrange(mesh, degree, ())
+    solve_positive(_stiffness(found, dx), None, found, [_held(found, low, 0.0), _held(found, high, 1.0)])
     return found
 
 
