@@ -380,7 +380,10 @@ def view(run: ReportedRun) -> Card | None:
     }  # fmt: skip
     html = (ASSETS / "view.html").read_text(encoding="utf-8")
     html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.whole.depth) - 1))
-    html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in _notes(run, body)))
+    notes, kept, all_times = body.whole.notes(body.is_deformed), len(body.times), len(run.recording.times)
+    if kept < all_times:
+        notes.append(f"{kept} of {all_times} recorded times are kept here, to save room.")
+    html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in notes))
     return Card("view", html, data, arrays)
 
 
@@ -393,18 +396,6 @@ def _ways_to_show(arrays: Mapping[str, Array]) -> str:
     }  # fmt: skip
     there = {name: text for name, (text, needed) in ways.items() if needed <= set(arrays)}
     return "".join(f'<option value="{name}">{text}</option>' for name, text in there.items())
-
-
-def _notes(run: ReportedRun, body: ShownBody) -> list[str]:
-    """What is to be known of the view."""
-    found = []
-    if body.whole.is_turned:
-        found.append(f"Solved with the kinematics {run.recording.scene.model.kinematics!r}, shown as the whole body.")
-    if not body.is_deformed:
-        found.append("Displacements were not recorded: this is the reference body.")
-    if len(body.times) < len(run.recording.times):
-        found.append(f"{len(body.times)} of {len(run.recording.times)} recorded times are kept here, to save room.")
-    return found
 
 
 def angles(run: ReportedRun) -> Card | None:
