@@ -114,14 +114,9 @@ def profile_weights(depth: Array) -> Array:
     )
 
 
-def _profile_value(number: int, measurement: Any) -> float:
-    return float(measurement.tool_of_step("angle profile", lambda: _profile(measurement))[number])
-
-
-def _profile(measurement: Any) -> Array:
-    quadrature, local_axes = measurement.quadrature, measurement.state.cells.local_axes
-    hats = measurement.tool("hats", lambda: profile_weights(local_axes.depth))
-    return np.array([quadrature.mean_of_known(measurement.fibre_angle, hats[..., k]) for k in range(PROFILE_PLACES)])
+def _profile(number: int, m: Any) -> float:
+    hats = m.tool("hats", lambda: profile_weights(m.state.cells.local_axes.depth))
+    return float(m.quadrature.mean_of_known(m.fibre_angle, hats[..., number]))
 
 
 _PROFILE_COLUMNS = tuple(
@@ -130,7 +125,7 @@ _PROFILE_COLUMNS = tuple(
         "degrees",
         f"mean reference fibre angle near {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, or "
         "along z in a cube or tendon; the weight is a hat function as wide as a quarter of the way",
-        partial(_profile_value, number),
+        partial(_profile, number),
         by_case=False,
     )
     for number, name in enumerate(PROFILE)
