@@ -21,7 +21,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.domain import Domain, cells_of, corners_of
+from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, dof_of_node
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import SolveStopped, of_all_ranks, over_ranks, solve_positive
 from remodel_fenicsx.fem.compat import geometry_dofmap
@@ -214,7 +214,8 @@ def found_axes(
             log.info("the local axes are %s; those of the nearest point are used there", words)
         _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
-    nodal = _share(*(_at_nodes(length) for length in lengths[:2]))
+    dofs = dof_of_node(domain.mesh, lengths[0].function_space)
+    nodal = _share(*(np.real(length.x.array[dofs]) for length in lengths[:2]))
     makers = (lambda: axes), (lambda: depth), (lambda: station), (lambda: nodal)
     return LocalAxes(quadrature.coordinates, *makers, values[..., 6] + values[..., 7], ~known)
 
@@ -241,14 +242,6 @@ def _share(first: Array, second: Array) -> Array:
 def _at_points(fields: Sequence[Any], quadrature: Quadrature) -> Array:
     compiled = jit.expression(ufl.as_vector(fields), quadrature.points)
     return quadrature.evaluate(compiled, (len(fields),))
-
-
-def _at_nodes(function: Any) -> Array:
-    """Of a scalar of the mesh's degree, by local geometry node: node k of an element is dof k of it."""
-    space = function.function_space
-    found = np.zeros(len(space.mesh.geometry.x))
-    found[geometry_dofmap(space.mesh).reshape(-1)] = np.real(function.x.array[space.dofmap.list.reshape(-1)])
-    return found
 
 
 def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:

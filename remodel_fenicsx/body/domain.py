@@ -275,6 +275,14 @@ def _corners_of_facets(mesh: Any) -> npt.NDArray[np.int64]:
     return np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[mesh.topology.dim - 1])
 
 
+def dof_of_node(mesh: Any, space: Any) -> npt.NDArray[np.int64]:
+    """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
+    # the element and the geometry have the same degree: node k of an element is dof k of that element
+    found = np.zeros(len(mesh.geometry.x), dtype=np.int64)
+    found[compat.geometry_dofmap(mesh).reshape(-1)] = space.dofmap.list.reshape(-1)
+    return found
+
+
 # ---------------------------------------------------------------- structured, without Gmsh
 
 # places (second direction, first one) of a quadrilateral's nodes in the order of basix: corners, edges, inside

@@ -12,10 +12,10 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.domain import Domain, dof_of_node
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.fem import compat, jit
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.axes import LocalAxes
@@ -263,18 +263,8 @@ class NodalGather:
 
     def __init__(self, domain: Domain, state: State):
         self.domain, self.state = domain, state
-        self._dof_of_node = dof_of_node(domain, state.kinematics.nodal_space(state.unknown))
+        self._dof_of_node = dof_of_node(domain.mesh, state.kinematics.nodal_space(state.unknown))
 
     def __call__(self) -> Array | None:
         values = self.state.kinematics.nodal_displacement(self.state.unknown)[self._dof_of_node]
         return self.domain.gather_nodes(values)
-
-
-def dof_of_node(domain: Domain, space: Any) -> NDArray[np.int64]:
-    """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
-    dofs = space.dofmap.list.reshape(-1)
-    nodes = compat.geometry_dofmap(domain.mesh).reshape(-1)
-    # the element and the geometry have the same degree: node k of an element is dof k of that element
-    found = np.zeros(len(domain.node_number), dtype=np.int64)
-    found[nodes] = dofs
-    return found
