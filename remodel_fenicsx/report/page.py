@@ -299,7 +299,6 @@ ASSETS = Path(__file__).with_name("assets")
 MOST_TILES = 8
 MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
 LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
-LAST = ("min_jacobian", "newton_iterations", "linear_iterations", "substeps", "seconds", "processor_seconds")
 
 
 @dataclass(frozen=True)
@@ -322,7 +321,7 @@ class ReportedRun:
         names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
         if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
             names.remove("substeps")
-        names.sort(key=lambda name: (name not in own, name in LAST))
+        names.sort(key=lambda name: name not in own)
         return [known.get(name) or Column(name, "", "", lambda m: np.nan) for name in names]
 
     def unit(self, column: Column) -> str:
