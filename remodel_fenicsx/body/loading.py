@@ -212,10 +212,8 @@ class Loading:
         if change is None:
             return
         dx = ufl.Measure("dx", domain=self.domain.mesh)
-        one = dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(1.0))
-        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * dx))
-        volume = float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
-        force = self.magnitude(name, 1.0 / volume)  # spread over the body: the change of the length has no place
+        # spread over the body: the change of the length has no place
+        force = self.magnitude(name, 1.0 / self._integral(dx))
         self.add_potential(lambda u: -force * change(u) * self.weight * dx)
 
     def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
@@ -362,11 +360,14 @@ class Loading:
 
     def area(self, face: str) -> float:
         """Reference area of a named face."""
-        one = dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(1.0))
-        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * self.measure_alone(face)))
-        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+        return self._integral(self.measure_alone(face))
 
     # ------------------------------------------------------------ inside
+    def _integral(self, measure: Any) -> float:
+        """Volume or area of the body."""
+        local = dolfinx.fem.assemble_scalar(jit.form(self.constant(1.0) * self.weight * measure))
+        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+
     def constant(self, value: float) -> Any:
         """A number as an argument of kernels, so that another one compiles nothing."""
         return dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(value))

@@ -142,6 +142,12 @@ class WholeBody:
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
         self.layer, self.depth = _layers(self._depths(shape), self.elements)
 
+    def notes(self, is_deformed: bool) -> list[str]:
+        """What is to be known of pictures of it."""
+        turned = f"Solved with the kinematics {self.recording.scene.model.kinematics!r}, shown as the whole body."
+        reference = "Displacements were not recorded: this is the reference body."
+        return [*([turned] if self.is_turned else []), *([] if is_deformed else [reference])]
+
     def _depths(self, shape: Shape) -> Array:
         """Of the elements, (m,): as recorded, or by their places."""
         recording = self.recording

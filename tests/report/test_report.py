@@ -21,8 +21,7 @@ import pytest
 from remodel_fenicsx import Recording, cli
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
-from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, of_angles
-from remodel_fenicsx.report.page import Story
+from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, ReportedRun, of_angles
 from remodel_fenicsx.results.recording import ANGLE_COLOURS, HistoryColumns, kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.results.recording import unit_of, with_unit
@@ -265,9 +264,9 @@ def test_the_state_of_a_run_is_said(folder: Path, lines: str, rows: str, state: 
         log.write(f"2026-01-02 03:05:05,678 {lines}\n" if lines else "")
     with (folder / "history.csv").open("a") as history:
         history.write(rows)
-    story = Story.of(Recording(folder))
-    assert (story.state, story.words, story.ranks, story.began) == (state, words, "2", "2026-01-02 03:04:05")
+    assert ReportedRun(Recording(folder)).state == (state, words)
     text = write_report(folder).read_text()
+    assert ", 2 ranks" in text and "2026-01-02 03:04:05" in text
     assert f'<span class="badge {state}">{state}</span>' in text and html.escape(words) in text
 
 
@@ -275,8 +274,7 @@ def test_a_run_that_goes_on_is_said_to(folder: Path) -> None:
     from remodel_fenicsx.results.recording import RunLock
 
     with RunLock(folder):
-        story = Story.of(Recording(folder))
-    assert (story.state, story.words) == ("running", "step 2 of 10, at t = 2 of 10")
+        assert ReportedRun(Recording(folder)).state == ("running", "step 2 of 10, at t = 2 of 10")
 
 
 def test_warnings_come_once_with_their_number(folder: Path) -> None:
@@ -284,7 +282,7 @@ def test_warnings_come_once_with_their_number(folder: Path) -> None:
         log.write("2026-01-02 03:04:06,000 WARNING before all\n2026-01-02 03:04:06,000 INFO time 1, force 25\n")
         log.write("2026-01-02 03:04:07,000 WARNING locks at 3 points\n2026-01-02 03:04:07,000 INFO time 2, force 50\n")
         log.write("2026-01-02 03:04:08,000 WARNING locks at 12 points\n2026-01-02 03:04:08,000 WARNING two\nlines\n")
-    found = [(one.text, one.count, one.time) for one in Story.of(Recording(folder)).warnings]
+    found = [(one.text, one.count, one.time) for one in ReportedRun(Recording(folder)).warnings]
     assert found == [("before all", 1, ""), ("locks at 3 points", 2, "1"), ("two\nlines", 1, "2")]
     text = write_report(folder).read_text()
     assert "<h2>Warnings (4)</h2>" in text and "(2 times, first after t = 1)" in text
@@ -359,14 +357,14 @@ def test_a_report_that_fails_is_one_warning(tmp_path: Path) -> None:
     command = ["run", str(DEMOS / "cube.toml"), "--set", "time.end=1", "-o", str(tmp_path / "run"), "-q"]
     done = forked("python", program, *command)
     assert done.returncode == 0 and done.stderr == "WARNING: no report.html: no room\n"
-    assert [one.text for one in Story.of(Recording(tmp_path / "run")).warnings] == ["no report.html: no room"]
+    assert [one.text for one in ReportedRun(Recording(tmp_path / "run")).warnings] == ["no report.html: no room"]
 
 
 def test_a_run_that_fails_says_so_in_its_page(recorded: Recorded) -> None:
     for name in ("failed", "one time"):
         text = (recorded(name) / REPORT).read_text()
         assert '<span class="badge failed">' in text
-        assert html.escape(Story.of(Recording(recorded(name))).words) in text
+        assert html.escape(ReportedRun(Recording(recorded(name))).state[1]) in text
 
 
 # ---------------------------------------------------------------- what is in it of others
