@@ -1,7 +1,7 @@
 """A scene: what to simulate, as TOML or as Python objects, validated before any solve.
 
 `read_scene` reads a file, `Scene(...)` and `scene_from_dict` take the same keys from Python. docs/scene.md lists all
-keys (`scene.reference`).
+keys.
 """
 
 from __future__ import annotations
