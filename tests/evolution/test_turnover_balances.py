@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.model.turnover import rates
+from remodel_fenicsx.model.laws import turnover_rates
 from remodel_fenicsx.scene import scene_from_dict
 from tests.evolution.test_turnover_bodies import TURNOVER, grown
 
@@ -34,7 +34,7 @@ class Powers(Watcher):
         tissue, F = simulation.stepper.remodeling.parameters.at_points(), state.elastic_gradient()
         cells = [simulation.cells.point_cells]
         length = np.sqrt(simulation.cells.kernels.squared_length(F, cells[0]))
-        content, natural = rates(tissue, length, TURNOVER["time"], 1.1, 1.0)
+        content, natural = turnover_rates(tissue, length, TURNOVER["time"], 1.1, 1.0)
 
         def energy(time: float) -> np.ndarray:
             m, rho = tissue.content * np.exp(time * content), tissue.natural_length * np.exp(time * natural)

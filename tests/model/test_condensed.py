@@ -16,8 +16,7 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import REPULSIONS, Tissue
 from remodel_fenicsx.model import implicit
-from remodel_fenicsx.model.laws import LAWS, Drive
-from remodel_fenicsx.model.turnover import TurnoverRule, at_the_end, rates
+from remodel_fenicsx.model.laws import LAWS, Drive, TurnoverRule, turned_over_at_the_end, turnover_rates
 
 Array = NDArray[np.float64]
 
@@ -306,7 +305,7 @@ def test_content_and_natural_length_belong_to_the_end_of_the_step() -> None:
     C, tissue = np.swapaxes(F, 1, 2) @ F, some.tissue
     r = np.sqrt(np.einsum("nij,nij->n", found.structure, C))
     end = replace(tissue, content=m, natural_length=rho)
-    content, length = rates(end, r, *RULE)
+    content, length = turnover_rates(end, r, *RULE)
     np.testing.assert_allclose(np.log(m / tissue.content), 4.0 * content, atol=1e-12)
     np.testing.assert_allclose(np.log(rho / tissue.natural_length), 4.0 * length, atol=1e-12)
     assert np.ptp(content) > 0.02  # some fall, some grow as fast as they can
@@ -321,13 +320,13 @@ def test_chains_that_turnover_cannot_follow_are_locked() -> None:
     tissue = Tissue(*(v * ones for v in (27.3, 3.1, 1.57, 1.594, 1.0)), content=ones, natural_length=ones)
     largest = 1.594 * np.exp(20.0 * 2.0 / 40.0 * (1.594 / 1.1 - 1.0))
     r = largest * np.array([0.9999, 1.0001])
-    ratio = r / at_the_end(RULE, tissue, r, 20.0).natural_length / 1.594
+    ratio = r / turned_over_at_the_end(RULE, tissue, r, 20.0).natural_length / 1.594
     assert ratio[0] < 1.0 < ratio[1] and ratio == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_step_without_end_leads_to_the_stretch_of_deposition() -> None:
     ones = np.ones(3)
     tissue = Tissue(*(v * ones for v in (27.3, 3.1, 1.57, 1.594, 1.0)), content=ones, natural_length=ones)
-    found = at_the_end(RULE, tissue, np.array([0.7, 1.1, 3.0]), 1e8)
+    found = turned_over_at_the_end(RULE, tissue, np.array([0.7, 1.1, 3.0]), 1e8)
     np.testing.assert_allclose(found.natural_length, np.array([0.7, 1.1, 3.0]) / 1.1, rtol=1e-5)
     np.testing.assert_allclose(found.natural_length_slope, 1.0, atol=1e-5)
