@@ -17,7 +17,7 @@ from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.unloading import NoUnloadedShape
 from tests.body.test_natural import scene
 from tests.mesh_files import write_tube
-from tests.runs import last_row
+from tests.runs import last_row, made, simulated
 
 SELF = MPI.COMM_SELF
 LOADED = {"geometry.is": "loaded", "geometry.inner_radius": 1.4, "geometry.outer_radius": 3.05, "geometry.length": 2.2}
@@ -46,11 +46,10 @@ def test_a_tube_comes_back_to_its_loaded_radii_and_length(
     found = unloaded(of, SELF)
     runs = int(caplog.records[-1].getMessage().split("(")[1].split()[0])
     assert runs <= 7
-    simulation = Simulation(found, SELF)
-    row = [step.row for step in simulation.steps()][-1]
-    places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
-    moved = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
-    simulation.close()
+    with made(found) as simulation:
+        row = [step.row for step in simulation.steps()][-1]
+        places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
+        moved = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
     radii = np.hypot(moved[:, 0], moved[:, 1])
     assert radii.min() == pytest.approx(1.4, abs=1e-7)
     assert radii.max() == pytest.approx(3.05, abs=1e-7)
@@ -109,11 +108,9 @@ method = "direct"
 
 def nodes_of(of: Scene) -> np.ndarray:
     """At the end of a run."""
-    simulation = Simulation(of, SELF)
-    list(simulation.steps())
-    places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
-    moved: np.ndarray = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
-    simulation.close()
+    with simulated(of) as (simulation, _):
+        places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
+        moved: np.ndarray = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
     return moved
 
 

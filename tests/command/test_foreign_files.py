@@ -38,6 +38,7 @@ from tests.command.test_run import demo, run
 from tests.conftest import slowly
 from tests.forks import forked
 from tests.parts import pulled_cube
+from tests.runs import made
 
 PROJECT = Path(__file__).parents[2]
 SELF = MPI.COMM_SELF
@@ -629,12 +630,11 @@ def test_a_simulation_says_what_it_needs(scene: Any) -> None:
 
 
 def test_no_step_after_the_end() -> None:
-    simulation = Simulation(pulled_cube(3.0), SELF)
-    steps = simulation.steps()
-    next(steps)
-    simulation.close()
-    with pytest.raises(RuntimeError, match="has been closed"):
+    with made(pulled_cube(3.0)) as simulation:
+        steps = simulation.steps()
         next(steps)
-    with pytest.raises(RuntimeError, match="has been closed"):
-        next(simulation.steps())
-    simulation.close()
+        with pytest.raises(RuntimeError, match="has been closed"):
+            next(steps)
+        with pytest.raises(RuntimeError, match="has been closed"):
+            next(simulation.steps())
+        simulation.close()

@@ -21,7 +21,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.fit import fit
 from remodel_fenicsx.studies.stability import stability
 from tests.reference.radial import CIRCUMFERENTIAL, RadialMaterial, Tube, cauchy_stress, structure
-from tests.runs import goes_on, rows_of
+from tests.runs import goes_on, made, rows_of, simulated
 
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 TURNOVER = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
@@ -114,20 +114,18 @@ def test_against_an_independent_program() -> None:
         mean = sum(weight * stress for weight, stress in zip(weights, stresses, strict=True))
         squares = structure(squares, mean, kappa * step, 1.0)
     cases = [{"weight": w, "loads": {"pressure": f}} for w, f in zip(weights, factors, strict=True)]
-    simulation = Simulation(scene_from_dict(artery(
-        cases, end, remodeling={"coupling": "staggered"}, material={"repulsion": "log"}
-    )))  # fmt: skip
-    found = [step.row for step in simulation.steps()]
-    simulation.close()
-    names = ("inner_radius", "outer_radius", "inner_radius@2", "outer_radius@2")
-    np.testing.assert_allclose([[row[name] for name in names] for row in found], rows, rtol=5e-4)
-    assert found[-1]["inner_radius@2"] > found[-1]["inner_radius"] + 0.05
-    order = np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
-    cells, local = simulation.cells, simulation.cells.local_axes.axes
-    around = np.einsum("epa,epab,epb->ep", local[..., 0, :], cells.structure_tensor(), local[..., 0, :]).ravel()[order]
-    depth = simulation.quadrature.coordinates[..., 0].ravel()[order]
-    expected = np.interp(depth, tube.points, squares[:, CIRCUMFERENTIAL])
-    np.testing.assert_allclose(around, expected, atol=5e-3)
+    with made(artery(cases, end, remodeling={"coupling": "staggered"}, material={"repulsion": "log"})) as simulation:
+        found = [step.row for step in simulation.steps()]
+        names = ("inner_radius", "outer_radius", "inner_radius@2", "outer_radius@2")
+        np.testing.assert_allclose([[row[name] for name in names] for row in found], rows, rtol=5e-4)
+        assert found[-1]["inner_radius@2"] > found[-1]["inner_radius"] + 0.05
+        order = np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
+        cells, local = simulation.cells, simulation.cells.local_axes.axes
+        radial = local[..., 0, :]
+        around = np.einsum("epa,epab,epb->ep", radial, cells.structure_tensor(), radial).ravel()[order]
+        depth = simulation.quadrature.coordinates[..., 0].ravel()[order]
+        expected = np.interp(depth, tube.points, squares[:, CIRCUMFERENTIAL])
+        np.testing.assert_allclose(around, expected, atol=5e-3)
 
 
 def test_which_case_is_first_changes_no_cell() -> None:
@@ -220,10 +218,8 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
     tables = {"remodeling": GROWING[0], "columns": columns}
     changes = []
     for cases in (pulse(0.33), *([case | {"weight": 1.0}] for case in pulse(0.33))):
-        simulation = Simulation(scene_from_dict(artery(cases, end=4.0, **tables)))
-        list(simulation.steps())
-        changes.append([np.log(simulation.stepper.turnover._values(name)) for name in columns[:2]])
-        simulation.close()
+        with simulated(artery(cases, end=4.0, **tables)) as (simulation, _):
+            changes.append([np.log(simulation.stepper.turnover._values(name)) for name in columns[:2]])
     both, diastole, systole = np.array(changes)
     np.testing.assert_allclose(both, 2 / 3 * diastole + 1 / 3 * systole, atol=1e-12)
     assert np.abs(systole - diastole).max() > 1e-3
@@ -318,12 +314,11 @@ def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
         [{"weight": 0.9}, {"weight": 0.1, "loads": {"elongation": 40.0}}],
         remodeling={"law": "none", "coupling": "staggered"},
     )
-    simulation = Simulation(scene_from_dict(values | {"solver": {"maximum_halvings": 1}}))
-    states, before = list(simulation.state.cases().values()), []
-    with pytest.raises(StepFailure, match="load case 2: no equilibrium at time"):
-        for step in simulation.steps():
-            before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]
-    simulation.close()
+    with made(values | {"solver": {"maximum_halvings": 1}}) as simulation:
+        states, before = list(simulation.state.cases().values()), []
+        with pytest.raises(StepFailure, match="load case 2: no equilibrium at time"):
+            for step in simulation.steps():
+                before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]
     for state, (unknown, loads, time) in zip(states, before, strict=True):
         np.testing.assert_array_equal(state.unknown.x.array, unknown)
         assert (state.loading.values, state.time) == (loads, time)

@@ -19,7 +19,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
-from tests.runs import goes_on, made, taylor_orders
+from tests.runs import goes_on, last_row, made, taylor_orders
 
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLUMNS = ["content", "natural_length"]
@@ -52,7 +52,7 @@ def opening_angle(simulation: Simulation) -> float:
 
 def simulated(values: dict[str, Any]) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
     """All rows, and content and natural length at the points in the order of their radii."""
-    with made(scene_from_dict(values)) as simulation:
+    with made(values) as simulation:
         rows = [dict(step.row) for step in simulation.steps()]
         turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
         known = {} if turnover is None else {name: turnover._values(name).ravel()[order] for name in COLUMNS}
@@ -407,9 +407,7 @@ def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: f
         values["loads"]["pressure"]["ramp"] += [[1400.0, 1.0], [1424.0, factor]]
         values["time"] = {"end": "equilibrium", "step": 4.0}
         values["output"]["columns"].append("inner_radius")
-        simulation = Simulation(scene_from_dict(values))
-        row = dict([step.row for step in simulation.steps()][-1])
-        simulation.close()
+        row = last_row(values)
         wall_thickness = row["outer_radius"] - row["inner_radius"]
         found.append((wall_thickness, factor * row["inner_radius"] / wall_thickness))
     assert np.divide(found[1], found[0]) == pytest.approx([thickness, stress], rel=0.02)
@@ -421,11 +419,8 @@ def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instabilit
     """A deposition stretch that the load never reaches: the natural length falls too, and the rates with it."""
     values = cube(200.0, 2.0, {"time": 10.0, "deposition_stretch": 1.59})
     values["loads"]["force"]["value"] = 0.3
-    simulation = Simulation(scene_from_dict(values))
     with caplog.at_level(NOTICE):
-        rows = [dict(step.row) for step in simulation.steps()]
-    simulation.close()
-    assert rows[-1]["content"] < 0.1
+        assert last_row(values)["content"] < 0.1
     (said,) = (record for record in caplog.records if "factor of 10" in record.message)
     assert said.levelno == NOTICE and "content has changed" in said.message
     assert not [record for record in caplog.records if record.levelname == "WARNING"]

@@ -19,6 +19,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases
 from tests.evolution.test_load_cases import CUBE
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
+from tests.runs import simulated
 
 SELF = MPI.COMM_SELF
 TURNED = ["content", "natural_length"]
@@ -178,10 +179,8 @@ def test_closed_ends_and_residual_stress() -> None:
         output={"fields": False, "columns": columns},
         loads={"pressure": {"value": 1.2, "ramp": RAMP}, "elongation": {"value": 0.0}},
     )
-    simulation = Simulation(of, SELF)
-    rows = [dict(step.row) for step in simulation.steps()]
-    found, expected = simulation.stepper.remodeling.driving_tensor()[1], cauchy_of_the_energy(simulation)
-    simulation.close()
+    with simulated(of) as (simulation, rows):
+        found, expected = simulation.stepper.remodeling.driving_tensor()[1], cauchy_of_the_energy(simulation)
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(found).max())
     assert rows[0]["opening_angle"] == pytest.approx(120.0, abs=0.01)
     assert rows[-1]["content"] > 1.2 and rows[-1]["axial_elongation"] > rows[3]["axial_elongation"] > 0.05

@@ -14,6 +14,7 @@ from remodel_fenicsx.evolution import stepper
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import PROOF
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
+from tests.runs import made
 
 Attempt = Solution | SolveFailure
 PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent", "implicit": "consistent"}
@@ -62,11 +63,10 @@ def counts(found: list[Attempt]) -> tuple[int, int, int]:
 
 def rows(scene: Scene, found: list[Attempt]) -> Iterator[tuple[dict[str, float], Any, list[Attempt]]]:
     """Row, work and attempts of each step; the latter are forgotten."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    for step in simulation.steps():
-        yield step.row, step.work, list(found)
-        found.clear()
-    simulation.close()
+    with made(scene) as simulation:
+        for step in simulation.steps():
+            yield step.row, step.work, list(found)
+            found.clear()
 
 
 @pytest.mark.parametrize("coupling", PRESETS)

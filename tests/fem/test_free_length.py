@@ -18,7 +18,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
-from tests.runs import goes_on
+from tests.runs import goes_on, made
 
 SELF = MPI.COMM_SELF
 END = 4.0
@@ -45,11 +45,10 @@ def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]],
     domain = None
     if scene.model.kinematics == "full":
         domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
-    simulation = Simulation(scene, SELF, domain)
-    rows, forces = [], []
-    for step in simulation.steps([Looking(simulation, force_of, forces)] if force_of else []):
-        rows.append(step.row)
-    simulation.close()
+    with made(scene, domain) as simulation:
+        rows, forces = [], []
+        for step in simulation.steps([Looking(simulation, force_of, forces)] if force_of else []):
+            rows.append(step.row)
     return rows, forces
 
 

@@ -21,7 +21,7 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, slowly
 from tests.reference.radial import solve_radial
-from tests.runs import columns_of
+from tests.runs import columns_of, made, simulated
 
 SELF = MPI.COMM_SELF
 ISOTROPIC = {"initial": "isotropic"}
@@ -54,12 +54,11 @@ def difference(one: Scene, other: Scene) -> float:
 def ray_and_reference(driver: str, end: float, **mesh: int) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
     """Of tests/reference all; radii (2, steps), angle and the reference's at the quadrature points of a ray."""
     exact = solve_radial(driver=driver, end=end, elements=150)
-    simulation = Simulation(scene("tube", "radial", end, mesh=mesh, remodeling={"driver": driver}), SELF)
-    steps = list(simulation.steps())
-    radii = np.array([[step.row[name] for step in steps] for name in ("inner_radius", "outer_radius")])
-    angle = Measurement(simulation.observer, steps[-1]).fibre_angle
-    expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
-    simulation.close()
+    with made(scene("tube", "radial", end, mesh=mesh, remodeling={"driver": driver})) as simulation:
+        steps = list(simulation.steps())
+        radii = np.array([[step.row[name] for step in steps] for name in ("inner_radius", "outer_radius")])
+        angle = Measurement(simulation.observer, steps[-1]).fibre_angle
+        expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
     assert np.ptp(angle) > 3.0
     return exact, radii, angle, expected
 
@@ -90,17 +89,16 @@ def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     """Its law, typed by hand in the reference too; linear elements, which other tests of this law compile anyway."""
     changes = {"driver": driver, "law": "tensor", "frame": "material"}
     tables: dict[str, Any] = {"mesh": {"refinement": 18}, "material": {"repulsion": "log"}}
-    simulation = Simulation(scene("tube", "radial", 10.0, remodeling=changes, **tables), SELF)
-    steps = list(simulation.steps())
     exact, printed = (solve_radial(driver=driver, law=law, end=10.0, elements=150) for law in ("tensor", "explicit"))
-    inner = [step.row["inner_radius"] for step in steps]
-    np.testing.assert_allclose(inner, exact.inner_radii, rtol=2e-5)
-    assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
-    angle = Measurement(simulation.observer, steps[-1]).fibre_angle
-    expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
-    # linear elements: about their middle the strain rises and falls by 0.1 degrees
-    np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
-    simulation.close()
+    with made(scene("tube", "radial", 10.0, remodeling=changes, **tables)) as simulation:
+        steps = list(simulation.steps())
+        inner = [step.row["inner_radius"] for step in steps]
+        np.testing.assert_allclose(inner, exact.inner_radii, rtol=2e-5)
+        assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
+        angle = Measurement(simulation.observer, steps[-1]).fibre_angle
+        expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
+        # linear elements: about their middle the strain rises and falls by 0.1 degrees
+        np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
 
 
 @pytest.mark.slow
@@ -346,11 +344,9 @@ def test_another_size_compiles_nothing(shape: str, name: str, size: dict[str, fl
 def test_small_reduced_problems_are_factorised_by_petsc_itself() -> None:
     """Whole bodies only where the choice is left to `auto`."""
     for name, method, package in (("point", "direct", "petsc"), ("full", "auto", "petsc"), ("full", "direct", "mumps")):
-        simulation = Simulation(scene("cube", name, 1.0, solver={"method": method}), SELF)
-        list(simulation.steps())
-        factorisation = simulation.stepper.coupling.newton.factorisation()
-        assert factorisation is not None and factorisation.getFactorSolverType() == package
-        simulation.close()
+        with simulated(scene("cube", name, 1.0, solver={"method": method})) as (simulation, _):
+            factorisation = simulation.stepper.coupling.newton.factorisation()
+            assert factorisation is not None and factorisation.getFactorSolverType() == package
 
 
 def test_the_mesh_of_a_reduction_is_where_that_part_of_the_body_lies() -> None:
@@ -359,13 +355,12 @@ def test_the_mesh_of_a_reduction_is_where_that_part_of_the_body_lies() -> None:
         ("axisymmetric", ((1, 3), (0, 0), (0, 8)), np.pi * 8 * 8),
         ("sector", ((0, 3), (0, 3), (0, 8)), 8 * 8 * 16 * np.sin(np.pi / 8) / 2),
     ):
-        simulation = Simulation(scene("tube", name, 1.0), SELF)
-        x = simulation.domain.mesh.geometry.x
-        np.testing.assert_allclose(np.stack([x.min(axis=0), x.max(axis=0)], axis=1), spans, atol=1e-12)
-        assert simulation.quadrature.integral(np.ones(simulation.quadrature.shape)) == pytest.approx(volume, rel=1e-9)
-        whole = simulation.scene
-        assert simulation.domain.number_of_elements == whole.geometry.reductions[name].elements(whole)
-        simulation.close()
+        with made(scene("tube", name, 1.0)) as simulation:
+            x = simulation.domain.mesh.geometry.x
+            np.testing.assert_allclose(np.stack([x.min(axis=0), x.max(axis=0)], axis=1), spans, atol=1e-12)
+            whole, quadrature = simulation.scene, simulation.quadrature
+            assert quadrature.integral(np.ones(quadrature.shape)) == pytest.approx(volume, rel=1e-9)
+            assert simulation.domain.number_of_elements == whole.geometry.reductions[name].elements(whole)
 
 
 TENSOR = {"law": "tensor", "coupling": "extrapolated"}

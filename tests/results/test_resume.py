@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, Scene, SceneError, Simulation
+from remodel_fenicsx import Recording, Scene, SceneError
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.model.cells import structure_tensor
@@ -42,6 +42,7 @@ from remodel_fenicsx.watch.warnings import LockingWarning, Missing
 from remodel_fenicsx.watch.over_correction import OverCorrection
 from tests.conftest import mpirun
 from tests.parts import pulled_cube
+from tests.runs import made
 
 END = 9.0
 COUNTED = ("newton_iterations", "linear_iterations", "substeps", "seconds")
@@ -128,15 +129,14 @@ def test_a_run_at_its_end_stays_as_it_is(half: Path) -> None:
 def test_a_state_comes_back_whole(half: Path) -> None:
     kept = read_checkpoint(half)
     assert kept is not None
-    simulation = Simulation(Recording(half).scene, SELF)
-    state = simulation.state
-    restore_state(state, kept)
-    assert (state.time, state.number, state.loading.values) == (6.0, 6, {"force": 8.0})
-    arrays = gather_state(state)
-    assert arrays is not None and list(arrays) == kept.functions
-    for name, values in arrays.items():
-        np.testing.assert_array_equal(values, kept.arrays[f"function/{name}"], err_msg=name)
-    simulation.close()
+    with made(Recording(half).scene) as simulation:
+        state = simulation.state
+        restore_state(state, kept)
+        assert (state.time, state.number, state.loading.values) == (6.0, 6, {"force": 8.0})
+        arrays = gather_state(state)
+        assert arrays is not None and list(arrays) == kept.functions
+        for name, values in arrays.items():
+            np.testing.assert_array_equal(values, kept.arrays[f"function/{name}"], err_msg=name)
 
 
 def test_steps_after_the_checkpoint_are_done_again(half: Path, whole: Path) -> None:

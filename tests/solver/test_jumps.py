@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from benchmarks.stability_map.cases import all_cases
 from benchmarks.stability_map.running import Runner
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import Change, StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
@@ -79,12 +78,11 @@ def test_a_part_that_starts_where_the_tangent_is_singular_is_no_way_on(caplog: p
 
 def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:
     """The far state that Newton's method ends near may miss the tolerance by a little; the tangent knows better."""
-    simulation = Simulation(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125}), MPI.COMM_SELF)
-    before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
-    last = simulation.unknown.x.array - before
-    failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), residual_over_tolerance=50.0)
-    refusal = diagnosed(simulation.stepper.coupling.newton, failure, last)
-    simulation.close()
+    with made(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125})) as simulation:
+        before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
+        last = simulation.unknown.x.array - before
+        failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), residual_over_tolerance=50.0)
+        refusal = diagnosed(simulation.stepper.coupling.newton, failure, last)
     assert refusal.kind == "limit point"
 
 
@@ -123,10 +121,9 @@ def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
     """Newton's method starts at the wide tube, whose branch reaches down below the limit point."""
     caplog.set_level(logging.INFO)
     narrow, _ = radii(thin_tube(0.29))
-    wide = Simulation(thin_tube(0.5, **{"time.step": 0.25, "solver.relative_tolerance": 1e-9}), MPI.COMM_SELF)
-    list(wide.steps())
-    far = wide.unknown.x.array.copy()
-    wide.close()
+    with made(thin_tube(0.5, **{"time.step": 0.25, "solver.relative_tolerance": 1e-9})) as wide:
+        list(wide.steps())
+        far = wide.unknown.x.array.copy()
     solve, starts = GuardedNewton.solve, [far]
 
     def misled(newton: GuardedNewton, origin: Any = None) -> Any:

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.body.reductions import choice, expected_thrust, explained
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.stability import stability, unseen_by
 from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
-from tests.runs import made
+from tests.runs import made, simulated
 
 MU, LAME = 3.103, 27.293
 YOUNG, POISSON = MU * (3 * LAME + 2 * MU) / (LAME + MU), LAME / (2 * (LAME + MU))
@@ -47,9 +47,7 @@ def slender(kinematics: str, pressure: float, **changes: Any) -> Scene:
 @contextmanager
 def watched(scene: Scene) -> Iterator[BucklingWarning]:
     """The watcher at the end of a run."""
-    with made(scene) as simulation:
-        for _ in simulation.steps():
-            pass
+    with simulated(scene) as (simulation, _):
         yield BucklingWarning(simulation.stepper, scene.geometry.strut(scene.supports.ends))
 
 
@@ -117,11 +115,8 @@ def test_the_whole_tube_loses_its_stability_where_the_ray_says_so(caplog: Any) -
             shares.append(watcher.thrust_share())
         changes = {"mesh.degree": 2, "output.columns": ["negative_eigenvalues"]}
         whole = slender("full", pressure, **changes)
-        simulation = Simulation(
-            whole, MPI.COMM_SELF, tube(1.0, 1.5, 40.0, 1, "hexahedron", 2, MPI.COMM_SELF, (8, 1, 8))
-        )
-        counts.append([step.row["negative_eigenvalues"] for step in simulation.steps()][-1])
-        simulation.close()
+        with made(whole, tube(1.0, 1.5, 40.0, 1, "hexahedron", 2, MPI.COMM_SELF, (8, 1, 8))) as simulation:
+            counts.append([step.row["negative_eigenvalues"] for step in simulation.steps()][-1])
     assert counts == [0, 2]
     assert shares[0] < 0.9 < shares[1]
 

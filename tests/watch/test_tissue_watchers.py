@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Simulation
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.warnings import VolumeLoss
 from tests.conftest import Case, slowly
+from tests.runs import rows_of, simulated
 
 SELF = MPI.COMM_SELF
 
@@ -46,10 +46,7 @@ def said(scene: Scene, caplog: pytest.LogCaptureFixture, word: str) -> list[tupl
     """Lines of a run with a word: level and text."""
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        simulation = Simulation(scene, SELF)
-        for _ in simulation.steps():
-            pass
-        simulation.close()
+        rows_of(scene)
     return [(record.levelno, record.getMessage()) for record in caplog.records if word in record.getMessage()]
 
 
@@ -89,12 +86,10 @@ def test_the_worst_point_alone_is_enough_for_a_warning(caplog: pytest.LogCapture
     assert [level for level, _ in lines] == [logging.WARNING]
     (lost,) = re.findall(r"has lost up to (\d+) % of its volume", lines[0][1])
     assert int(lost) > 40  # of the worst point: the body as a whole has lost a few per cent
-    simulation = Simulation(scene, SELF)
-    rows = [step.row for step in simulation.steps()]
-    watcher = next(watcher for watcher in simulation.watchers if isinstance(watcher, VolumeLoss))
-    assert min(row["min_jacobian"] for row in rows) == watcher._numbers["least"] < 0.6
-    assert watcher._numbers["mean"] > 0.9 and 1.2 < watcher._numbers["x"] < 1.3
-    simulation.close()
+    with simulated(scene) as (simulation, rows):
+        watcher = next(watcher for watcher in simulation.watchers if isinstance(watcher, VolumeLoss))
+        assert min(row["min_jacobian"] for row in rows) == watcher._numbers["least"] < 0.6
+        assert watcher._numbers["mean"] > 0.9 and 1.2 < watcher._numbers["x"] < 1.3
 
 
 def test_chains_that_point_out_of_the_wall_are_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -146,10 +141,8 @@ def test_loads_that_are_hardly_more_than_rounding_are_told(factor: float, told: 
         loads={name: {"value": value, "ramp": [[0, 0], [25, 1]]} for name, value in loads.items()},
         time={"end": 50.0, "step": 2.5},
     )  # fmt: skip
-    simulation = Simulation(scene, MPI.COMM_SELF)
     with caplog.at_level(logging.WARNING):
-        rows = [step.row for step in simulation.steps()]
-    simulation.close()
+        rows = rows_of(scene)
     if factor:
         assert (abs(rows[-1]["fibre_angle_inner"] - 23.03) > 1.0) == told
     assert ["the loads are weak" in record.getMessage() for record in caplog.records] == [True] * told
