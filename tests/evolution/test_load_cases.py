@@ -22,8 +22,8 @@ from remodel_fenicsx.studies.fit import fit
 from remodel_fenicsx.studies.stability import stability
 from tests.reference.radial import CIRCUMFERENTIAL, RadialMaterial, Tube, cauchy_stress, structure
 from tests.runs import goes_on, made, rows_of, simulated
+from tests.values import ANGLES, ramped, isotropic
 
-ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 TURNOVER = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
 GROWING = [{"law": "tensor", "coupling": coupling, "turnover": TURNOVER} for coupling in ("staggered", "extrapolated")]
 LAWS = [("tensor", "extrapolated"), ("tensor", "relaxed"), ("explicit", "staggered")]
@@ -39,19 +39,16 @@ def pulse(a: float) -> list[dict[str, Any]]:
 
 def artery(cases: Any = (), end: float = 30.0, columns: Any = (), pressure: float = 4.8, **tables: Any) -> Any:
     """The paper's artery on one radius."""
-    ramp = [[0.0, 0.0], [24.0, 1.0]]
-    values: dict[str, Any] = {
-        "preset": "consistent",
-        "geometry": {"shape": "tube"},
-        "model": {"kinematics": "radial"},
-        "mesh": {"refinement": 4, "degree": 2},
-        "cells": {"initial": "isotropic"},
-        "material": {"repulsion": "length"},
-        "loads": {"pressure": {"value": pressure, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}},
-        "time": {"end": end, "step": 2.0},
-        "output": {"fields": False, "columns": list(columns)},
-    }
-    return values | ({"cases": list(cases)} if cases else {}) | tables
+    values = isotropic(
+        "consistent",
+        mesh={"refinement": 4, "degree": 2},
+        material={"repulsion": "length"},
+        loads=ramped(24.0, pressure=pressure, elongation=0.1),
+        time={"end": end, "step": 2.0},
+        output={"fields": False, "columns": list(columns)},
+        cases=list(cases) or None,
+    )
+    return values | tables
 
 
 def rest(cases: Any = (), **changes: Any) -> np.ndarray:
@@ -227,9 +224,11 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
 
 def test_kinematics_agree() -> None:
     """One radius, and a half-plane of closed ends: each case has a length of its own."""
-    ramp = [[0.0, 0.0], [8.0, 1.0]]
-    loads = {"pressure": {"value": 4.8, "ramp": ramp}, "elongation": {"value": 0.0, "ramp": ramp}}
-    base = {"loads": loads, "supports": {"ends": "closed"}, "time": {"end": 16.0, "step": 4.0}}
+    base = {
+        "loads": ramped(8.0, pressure=4.8, elongation=0.0),
+        "supports": {"ends": "closed"},
+        "time": {"end": 16.0, "step": 4.0},
+    }
     one, two = (
         rows_of(artery(pulse(0.33), **base, mesh={"degree": 2}, model={"kinematics": name}))[-1]
         for name in ("radial", "axisymmetric")

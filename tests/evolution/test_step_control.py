@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, SceneError, Simulation, cli
+from remodel_fenicsx import Recording, SceneError, Simulation
 from remodel_fenicsx.evolution import time_steps as time_error
 from remodel_fenicsx.evolution.stepper import Pause, Step, Watcher
 from remodel_fenicsx.evolution.time_steps import Estimate
@@ -21,30 +21,18 @@ from remodel_fenicsx.schema.settings import MOST_STEPS, Time
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import TOO_LARGE
 from remodel_fenicsx.system.interrupts import Paused
+from tests.conftest import Refused
 from tests.runs import made
+from tests.values import PAPER, isotropic
 
 END = 40.0
-COUPLINGS = {
-    "staggered": "kuhl-holzapfel-2007",
-    "relaxed": "kuhl-holzapfel-2007",
-    "extrapolated": "consistent",
-    "implicit": "consistent",
-}
+COUPLINGS = {"staggered": PAPER, "relaxed": PAPER, "extrapolated": "consistent", "implicit": "consistent"}
 PRESETS = tuple(dict.fromkeys(COUPLINGS.values()))
 
 
 def tube(coupling: str, end: float = END, **changes: Any) -> Scene:
     """The wall of the paper's artery, of isotropic cells."""
-    scene = scene_from_dict(
-        {
-            "preset": COUPLINGS[coupling],
-            "geometry": {"shape": "tube"},
-            "model": {"kinematics": "radial"},
-            "cells": {"initial": "isotropic"},
-            "remodeling": {"frame": "material", "coupling": coupling},
-            "output": {"fields": False},
-        }
-    )
+    scene = scene_from_dict(isotropic(COUPLINGS[coupling], remodeling={"frame": "material", "coupling": coupling}))
     return scene.with_values({"time.end": end, **changes})
 
 
@@ -437,10 +425,10 @@ def test_with_a_tolerance_any_time_may_be_hit() -> None:
     assert Time(end=MOST_STEPS, tolerance=1.0).in_words() == "steps of an error below 1 degrees"
 
 
-def test_studies_of_equal_steps_refuse_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_studies_of_equal_steps_refuse_it(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(tube("staggered", **{"time.tolerance": 1.0}).to_toml())
-    assert cli.main(["stability", str(path), "-o", str(tmp_path / "a")]) == 2
-    assert "time.tolerance = 1: the analysis needs equal steps" in capsys.readouterr().err
-    assert cli.main(["ensemble", str(path), "--set", "cells.initial=random", "--set", "model.kinematics=full"]) == 2
-    assert "time.tolerance = 1: each seed would have other steps" in capsys.readouterr().err
+    said = refused("stability", path, "-o", tmp_path / "a")
+    assert "time.tolerance = 1: the analysis needs equal steps" in said
+    said = refused("ensemble", path, "--set", "cells.initial=random", "--set", "model.kinematics=full")
+    assert "time.tolerance = 1: each seed would have other steps" in said

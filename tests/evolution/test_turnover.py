@@ -20,27 +20,23 @@ from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
 from tests.runs import goes_on, last_row, made, taylor_orders
+from tests.values import ANGLES, ramped, isotropic
 
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLUMNS = ["content", "natural_length"]
-ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 
 
 def wall(end: float, step: float, turnover: dict[str, float] | None, columns: list[str], **changes: Any) -> Any:
     """A tube of 1 to 1.3 under a pressure of 1.2 and an elongation of 10 %."""
-    ramp = [[0.0, 0.0], [24.0, 1.0]]
-    remodeling = {"turnover": turnover} if turnover else {}
-    return {
-        "preset": "consistent",
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0},
-        "model": {"kinematics": "radial"},
-        "mesh": {"refinement": 2, "degree": 2},
-        "cells": {"initial": "isotropic"},
-        "remodeling": remodeling | changes,
-        "loads": {"pressure": {"value": 1.2, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}},
-        "time": {"end": end, "step": step},
-        "output": {"fields": False, "columns": [*ANGLES, "outer_radius", "stored_energy", *columns]},
-    }
+    return isotropic(
+        "consistent",
+        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0},
+        mesh={"refinement": 2, "degree": 2},
+        remodeling=({"turnover": turnover} if turnover else {}) | changes,
+        loads=ramped(24.0, pressure=1.2, elongation=0.1),
+        time={"end": end, "step": step},
+        output={"fields": False, "columns": [*ANGLES, "outer_radius", "stored_energy", *columns]},
+    )
 
 
 def opening_angle(simulation: Simulation) -> float:
@@ -372,15 +368,10 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
 
 def cube(end: float, step: float, turnover: dict[str, float], **changes: Any) -> dict[str, Any]:
     """Equal cells under a force: one point."""
-    return {
-        "preset": "consistent",
-        "geometry": {"shape": "cube"},
-        "cells": {"initial": "isotropic"},
-        "loads": {"force": {"value": 3.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
-        "remodeling": {"turnover": {"time": 40.0} | turnover} | changes,
-        "time": {"end": end, "step": step},
-        "output": {"fields": False, "columns": COLUMNS},
-    }
+    return isotropic(
+        "consistent", "point", geometry={"shape": "cube"}, loads=ramped(10.0, force=3.0), output={"columns": COLUMNS},
+        remodeling={"turnover": {"time": 40.0} | turnover} | changes, time={"end": end, "step": step},
+    )  # fmt: skip
 
 
 def test_steps_that_are_too_long_for_the_turnover_are_said() -> None:

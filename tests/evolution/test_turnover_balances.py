@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.turnover import rates
 from tests.evolution.test_turnover_bodies import TURNOVER, grown
 from tests.runs import made, simulated
+from tests.values import isotropic, ramped
 
 KAPPA = 0.1
 HELD = 8.0  # from here on no load changes
@@ -98,16 +98,12 @@ def test_collagen_is_neither_made_nor_lost(coupling: str, order: int) -> None:
 # ---------------------------------------------------------------- a held stretch
 def held_stretch(force: float, step: float, coupling: str = "staggered") -> tuple[float, list[dict[str, float]]]:
     """r/r0 of isotropic cells that do not turn, in a matrix so stiff that chains leave it as it is; rows."""
-    values: dict[str, Any] = {
-        "geometry": {"shape": "cube"},
-        "model": {"kinematics": "point"},
-        "cells": {"initial": "isotropic"},
-        "material": {"lame_lambda": 1e8, "lame_mu": 1e8, "chain_density": 1e20, "repulsion": "log"},
-        "remodeling": {"law": "tensor", "kappa": 0.0, "coupling": coupling, "turnover": TURNOVER},
-        "loads": {"force": {"value": force * 1e8, "ramp": [[0.0, 0.0], [step, 1.0]]}},
-        "time": {"end": 20.0 + step, "step": step},
-        "output": {"fields": False, "columns": ["content", "natural_length"]},
-    }
+    values = isotropic(
+        None, "point", geometry={"shape": "cube"}, loads=ramped(step, force=force * 1e8),
+        material={"lame_lambda": 1e8, "lame_mu": 1e8, "chain_density": 1e20, "repulsion": "log"},
+        remodeling={"law": "tensor", "kappa": 0.0, "coupling": coupling, "turnover": TURNOVER},
+        time={"end": 20.0 + step, "step": step}, output={"columns": ["content", "natural_length"]},
+    )  # fmt: skip
     with simulated(values) as (simulation, rows):
         F = simulation.state.deformation_gradient()[0]
     return float(np.sqrt((F**2).sum() / 3)), rows

@@ -15,6 +15,7 @@ from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import PROOF
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests.runs import made
+from tests.values import isotropic
 
 Attempt = Solution | SolveFailure
 PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent", "implicit": "consistent"}
@@ -22,16 +23,7 @@ PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent", "im
 
 def artery(coupling: str, **changes: Any) -> Scene:
     """The wall of the paper's artery, of isotropic cells, for two steps."""
-    scene = scene_from_dict(
-        {
-            "preset": PRESETS[coupling],
-            "geometry": {"shape": "tube"},
-            "model": {"kinematics": "radial"},
-            "cells": {"initial": "isotropic"},
-            "remodeling": {"coupling": coupling, "frame": "material"},
-            "output": {"fields": False},
-        }
-    )
+    scene = scene_from_dict(isotropic(PRESETS[coupling], remodeling={"coupling": coupling, "frame": "material"}))
     return scene.with_values({"time.end": 2.0, **changes})
 
 

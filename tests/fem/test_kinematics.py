@@ -19,7 +19,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases, slowly
+from tests.conftest import Cases, Refused, slowly
 from tests.reference.radial import solve_radial
 from tests.runs import columns_of, made, simulated
 
@@ -412,7 +412,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     [("cube", "point", 3), ("tube", "radial", 3), ("tube", "axisymmetric", 9), ("tube", "sector", 12)],
 )
 def test_recorded_fields_are_revolved_into_the_body(
-    shape: str, name: str, cell: int, whole: Callable[[str], Path], tmp_path: Path
+    shape: str, name: str, cell: int, whole: Callable[[str], Path], tmp_path: Path, refused: Refused
 ) -> None:
     """Held against the full run: nodes and elements of its own mesh. Elements of `full` lie between chords."""
     folders = {name: run(scene(shape, name, 1.0), tmp_path / name, SELF), "full": whole(shape)}
@@ -437,7 +437,7 @@ def test_recorded_fields_are_revolved_into_the_body(
     np.testing.assert_allclose(*structure, rtol=0, atol=0.01)
     with h5py.File(folders[name] / "fields_body_chains.vtkhdf") as file:
         assert file["VTKHDF/NumberOfCells"][0] == 4 * len(full.elements)
-    assert cli.main(["revolve", str(folders[name])]) == 2  # nothing is overwritten
+    refused("revolve", folders[name])  # nothing is overwritten
 
 
 def sum_of_dyads(fields: dict[str, np.ndarray]) -> np.ndarray:
@@ -447,10 +447,9 @@ def sum_of_dyads(fields: dict[str, np.ndarray]) -> np.ndarray:
     return np.swapaxes(scaled, 1, 2) @ scaled
 
 
-def test_a_full_run_has_nothing_to_revolve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_run_has_nothing_to_revolve(tmp_path: Path, refused: Refused) -> None:
     folder = run(scene("cube", "full", 1.0), tmp_path / "run", SELF)
-    assert cli.main(["revolve", str(folder)]) == 2
-    assert "'full': the fields are those of the body already" in capsys.readouterr().err
+    assert "'full': the fields are those of the body already" in refused("revolve", folder)
 
 
 # ---------------------------------------------------------------- what buckles

@@ -188,7 +188,7 @@ def test_without_chains_nothing_locks(law: str) -> None:
         assert rows[-1]["mean_stretch"] == pytest.approx(exact, rel=1e-8)
         assert {row["max_chain_extension"] for row in rows} == {0.0}
         assert {row["remodeling_power"] for row in rows} == {0.0}
-        # no chain is in the kernels: two constants of the matrix, the size of the body; the only field is the displacement
+        # no chain is in the kernels: constants of the matrix and the size of the body; the only field is displacement
         (energy,) = simulation.stepper.coupling.equilibrium.energies
         assert energy.coefficients() == (simulation.unknown,)
         assert {float(c.value) for c in energy.constants()} == {27.293, 3.103, scene.geometry.side}

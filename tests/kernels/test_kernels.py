@@ -19,7 +19,6 @@ from mpi4py import MPI
 from setuptools import Distribution
 
 import remodel_fenicsx.kernels
-from remodel_fenicsx import cli
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx import kernels
@@ -27,6 +26,7 @@ from remodel_fenicsx.kernels import tensor
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.system.environment import KERNELS, versions
+from tests.conftest import Refused
 from tests.runs import simulated
 
 ROOT = Path(__file__).parents[2]
@@ -145,13 +145,12 @@ def test_numpy_does_the_same_and_no_c_runs(
     assert caplog.text.count(f"{KERNELS}=numpy") == 1
 
 
-def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, refused: Refused) -> None:
     """One line, before anything is read."""
     monkeypatch.setenv(KERNELS, "numpy")
     assert type(kernels.point_kernels(MPI.COMM_SELF)) is kernels.PointKernels
     assert tensor.tensor_kernels(MPI.COMM_SELF) is None
     monkeypatch.setenv(KERNELS, "c")
-    assert cli.main(["run", "no-such-scene.toml"]) == 2
-    assert capsys.readouterr().err == f"remodel-fenicsx: {KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
+    assert refused("run", "no-such-scene.toml") == f"{KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
     with pytest.raises(RemodelError, match=KERNELS):
         kernels.point_kernels(MPI.COMM_SELF)

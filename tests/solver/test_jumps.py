@@ -19,22 +19,19 @@ from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.solver.diagnosis import diagnosed
 from tests.locking_bodies import thick_tube
 from tests.runs import made
+from tests.values import ramped, isotropic
 
 LARGEST = 0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
 
 
 def thin_tube(pressure: float = 0.5, end: float = 1.0, **values: Any) -> Scene:
     """Few of its chains run around it: with closed ends its pressure has a largest value."""
-    return scene_from_dict({
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.1, "length": 8.0},
-        "model": {"kinematics": "radial"},
-        "cells": {"initial": [0.4, 0.2, 0.8944271909999159]},
-        "supports": {"ends": "closed"},
-        "remodeling": {"law": "none"},
-        "loads": {"pressure": {"value": pressure, "ramp": [[0.0, 0.0], [1.0, 1.0]]}},
-        "time": {"end": end, "step": 1.0},
-        "output": {"columns": ["inner_radius"]},
-    }).with_values(values)  # fmt: skip
+    scene = isotropic(
+        None, geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.1, "length": 8.0},
+        cells={"initial": [0.4, 0.2, 0.8944271909999159]}, supports={"ends": "closed"}, remodeling={"law": "none"},
+        loads=ramped(1.0, pressure=pressure), time={"end": end, "step": 1.0}, output={"columns": ["inner_radius"]},
+    )  # fmt: skip
+    return scene_from_dict(scene).with_values(values)
 
 
 def radii(scene: Scene) -> tuple[list[float], int]:
@@ -169,16 +166,10 @@ def test_parts_of_quasi_newton_steps_are_no_jump(method: str) -> None:
 @pytest.mark.parametrize("method", ["direct", "lagged"])
 def test_a_step_that_takes_many_tangents_is_gone_in_parts(method: str) -> None:
     """A thin tube of random cells under long steps has several equilibria; 20 to 200 parts lead to this one."""
-    scene = scene_from_dict({
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.2, "length": 3.0},
-        "model": {"kinematics": "sector"},
-        "cells": {"initial": "random", "seed": 1},
-        "loads": {"pressure": {"value": 1.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]},
-                  "elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [4.0, 1.0]]}},
-        "time": {"end": 3.0, "step": 1.0},
-        "solver": {"method": method},
-        "output": {"columns": ["inner_radius"]},
-    })  # fmt: skip
-    found, _ = radii(scene)
+    scene = isotropic(
+        kinematics="sector", geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.2, "length": 3.0},
+        cells={"initial": "random", "seed": 1}, loads=ramped(4.0, pressure=1.0, elongation=0.1),
+        time={"end": 3.0, "step": 1.0}, solver={"method": method}, output={"columns": ["inner_radius"]},
+    )  # fmt: skip
+    found, _ = radii(scene_from_dict(scene))
     assert found[-1] == pytest.approx(1.45346788, rel=1e-8)

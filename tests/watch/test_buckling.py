@@ -19,9 +19,14 @@ from remodel_fenicsx.studies.stability import stability, unseen_by
 from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
 from tests.runs import made, simulated
+from tests.values import isotropic
 
 MU, LAME = 3.103, 27.293
 YOUNG, POISSON = MU * (3 * LAME + 2 * MU) / (LAME + MU), LAME / (2 * (LAME + MU))
+BARE: dict[str, Any] = {
+    "material": {"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
+    "remodeling": {"law": "none", "coupling": "staggered"}, "time": {"end": 1.0},
+}  # fmt: skip
 SECOND_MOMENT = np.pi / 4 * (1.5**4 - 1)
 
 
@@ -32,16 +37,9 @@ def ramped(value: float) -> dict[str, Any]:
 
 def slender(kinematics: str, pressure: float, **changes: Any) -> Scene:
     """A tube without chains, 40 long, its wall from 1 to 1.5."""
-    scene = Scene(
-        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.5, "length": 40.0},
-        material={"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
-        cells={"initial": "isotropic"},
-        model={"kinematics": kinematics},
-        loads={"pressure": ramped(pressure)},
-        remodeling={"law": "none", "coupling": "staggered"},
-        time={"end": 1.0},
-    )
-    return scene.with_values(changes)
+    shape = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.5, "length": 40.0}
+    loads = {"pressure": ramped(pressure)}
+    return Scene(**isotropic(None, kinematics, geometry=shape, loads=loads, **BARE)).with_values(changes)
 
 
 @contextmanager
@@ -78,15 +76,8 @@ def test_eulers_load_of_an_unloaded_tube(kinematics: str, ends: str, factor: flo
 
 def column(force: float, kinematics: str = "point") -> Scene:
     """A slender tendon under a dead force."""
-    return Scene(
-        geometry={"shape": "tendon", "length": 10.0, "area": 0.1},
-        material={"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
-        cells={"initial": "isotropic"},
-        model={"kinematics": kinematics},
-        loads={"force": ramped(force)},
-        remodeling={"law": "none", "coupling": "staggered"},
-        time={"end": 1.0},
-    )
+    shape = {"shape": "tendon", "length": 10.0, "area": 0.1}
+    return Scene(**isotropic(None, kinematics, geometry=shape, loads={"force": ramped(force)}, **BARE))
 
 
 def test_a_tendon_is_a_column_with_a_free_end() -> None:
@@ -159,13 +150,8 @@ def test_auto_is_full_where_thrust_comes_near_eulers_load(changes: dict[str, Any
 
 # ---------------------------------------------------------------- the analysis of passes
 def test_the_analysis_of_a_reduction_says_what_it_does_not_see(tmp_path: Path) -> None:
-    changes = {
-        "material.chain_density": 2e21,
-        "remodeling.law": "explicit",
-        "remodeling.coupling": "staggered",
-        "geometry.length": 8.0,
-    }
-    scene = slender("radial", 0.5, **changes).with_values({"time.end": 2.0})
+    changes = {"material.chain_density": 2e21, "remodeling.law": "explicit", "geometry.length": 8.0, "time.end": 2.0}
+    scene = slender("radial", 0.5, **changes)
     place, found = stability(scene, tmp_path / "radial", 1, MPI.COMM_SELF)
     log = (place / "run.log").read_text()
     (unseen,) = unseen_by(found.scene)

@@ -16,29 +16,19 @@ from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.warnings import VolumeLoss
 from tests.conftest import Case, slowly
 from tests.runs import rows_of, simulated
+from tests.values import PAPER, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 
 
 def tube_scene(**tables: Any) -> Scene:
-    base: dict[str, Any] = {
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "tube"},
-        "model": {"kinematics": "radial"},
-        "cells": {"initial": "isotropic"},
-        "loads": {"pressure": {"value": 0.0, "ramp": [[0, 0], [1, 1]]}, "elongation": {"value": 0.0, "ramp": [[0, 1]]}},
-        "remodeling": {"law": "none"},
-        "time": {"end": 3.0},
-    }
-    return scene_from_dict(base | tables)
+    base = {"loads": ramped(1.0, pressure=0.0, elongation=0.0), "remodeling": {"law": "none"}, "time": {"end": 3.0}}
+    return scene_from_dict(isotropic(**base | tables))
 
 
 def squeezed(elongation: float, ratio: float, **tables: Any) -> Scene:
     """A tube of a matrix alone that is made shorter; ratio is lambda/mu."""
-    loads = {
-        "pressure": {"value": 0.0, "ramp": [[0, 0], [1, 1]]},
-        "elongation": {"value": elongation, "ramp": [[0, 0], [2, 1]]},
-    }
+    loads = ramped(1.0, pressure=0.0) | ramped(2.0, elongation=elongation)
     return tube_scene(material={"chain_density": 0.0, "lame_lambda": ratio, "lame_mu": 1.0}, loads=loads, **tables)
 
 
@@ -105,9 +95,7 @@ def test_chains_that_point_out_of_the_wall_are_said(caplog: pytest.LogCaptureFix
 @pytest.mark.parametrize("refinement", [1, *slowly(2)])
 def test_a_front_within_the_inner_layer_is_said(refinement: int, caplog: pytest.LogCaptureFixture) -> None:
     """Chains turn from circumferential to axial at R = 1.2: in the first of 8 elements, or the second of 16."""
-    ramp = [[0, 0], [25, 1]]
-    loads = {"pressure": {"value": 3.0, "ramp": ramp}, "elongation": {"value": 0.3, "ramp": ramp}}
-    time, remodeling = {"end": "equilibrium"}, {"law": "explicit"}
+    loads, time, remodeling = ramped(25.0, pressure=3.0, elongation=0.3), {"end": "equilibrium"}, {"law": "explicit"}
     scene = tube_scene(loads=loads, mesh={"degree": 2, "refinement": refinement}, remodeling=remodeling, time=time)
     found = said(scene, caplog, "A front lies there")
     assert [level for level, _ in found] == [logging.WARNING] * (refinement == 1)
@@ -117,13 +105,10 @@ def test_a_front_within_the_inner_layer_is_said(refinement: int, caplog: pytest.
 def test_one_and_two_ranks_agree(case: Case) -> None:
     """Of random cells on the whole tube: forces, shares and angles."""
     columns = ["axial_force", "reduced_axial_force", "radial_share", "fibre_angle_inner", "angle_profile_4"]
-    loads = {
-        "pressure": {"value": 2.4, "ramp": [[0, 0], [2, 1]]},
-        "elongation": {"value": -0.2, "ramp": [[0, 0], [2, 1]]},
-    }
     scene = {
-        "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube", "length": 2.0}, "time": {"end": 2.0},
-        "loads": loads, "output": {"columns": columns}, "material": {"lame_lambda": 2.0},
+        "preset": PAPER, "geometry": {"shape": "tube", "length": 2.0}, "time": {"end": 2.0},
+        "loads": ramped(2.0, pressure=2.4, elongation=-0.2), "output": {"columns": columns},
+        "material": {"lame_lambda": 2.0},
     }  # fmt: skip
     one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
     for name in columns:
@@ -134,13 +119,9 @@ def test_one_and_two_ranks_agree(case: Case) -> None:
 @pytest.mark.parametrize(("factor", "told"), [(1e-6, False), (1e-8, True), (0.0, False)])
 def test_loads_that_are_hardly_more_than_rounding_are_told(factor: float, told: bool, caplog: Any) -> None:
     """Whose tensions count in part: the angle is another one than that of loads a hundred times as large."""
-    loads = {"pressure": 4.8 * factor, "elongation": 0.1 * factor}
-    scene = Scene(
-        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0},
-        model={"kinematics": "radial"}, cells={"initial": "isotropic"}, remodeling={"law": "tensor"},
-        loads={name: {"value": value, "ramp": [[0, 0], [25, 1]]} for name, value in loads.items()},
-        time={"end": 50.0, "step": 2.5},
-    )  # fmt: skip
+    shape = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0}
+    loads = ramped(25.0, pressure=4.8 * factor, elongation=0.1 * factor)
+    scene = isotropic(None, geometry=shape, loads=loads, remodeling={"law": "tensor"}, time={"end": 50.0, "step": 2.5})
     with caplog.at_level(logging.WARNING):
         rows = rows_of(scene)
     if factor:
