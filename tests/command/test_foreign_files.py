@@ -625,8 +625,6 @@ def test_no_step_after_the_end() -> None:
     with made(pulled_cube(3.0)) as simulation:
         steps = simulation.steps()
         next(steps)
+    for after in (steps, simulation.steps()):
         with pytest.raises(RuntimeError, match="has been closed"):
-            next(steps)
-        with pytest.raises(RuntimeError, match="has been closed"):
-            next(simulation.steps())
-        simulation.close()
+            next(after)
