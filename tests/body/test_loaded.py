@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomlkit
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, read_scene, run, unloaded
@@ -19,6 +20,7 @@ from tests.conftest import Refused
 from tests.body.test_natural import scene
 from tests.mesh_files import write_tube
 from tests.runs import last_row, made, simulated
+from tests.values import isotropic, ramped
 
 SELF = MPI.COMM_SELF
 LOADED = {"geometry.is": "loaded", "geometry.inner_radius": 1.4, "geometry.outer_radius": 3.05, "geometry.length": 2.2}
@@ -73,37 +75,16 @@ def test_the_scan_of_a_tube_that_has_remodeled() -> None:
 
 
 # ---------------------------------------------------------------- bodies from a file
-RAMP = [[0.0, 0.0], [5.0, 1.0]]
-
-
-def own_scene(folder: Path, pressure: float = 2.4, **tables: Any) -> Path:
+def own_scene(folder: Path, pressure: float = 2.4) -> Path:
     """A tube from a file that is the loaded one."""
     file = write_tube(folder / "loaded.msh", counts=(8, 2, 4))
-    text = f"""
-[geometry]
-shape = "mesh"
-file = "{file.name}"
-is = "loaded"
-[cells]
-initial = "isotropic"
-[loads.pressure]
-value = {pressure}
-ramp = [[0.0, 0.0], [5.0, 1.0]]
-[loads.elongation]
-value = 0.1
-ramp = [[0.0, 0.0], [5.0, 1.0]]
-[remodeling]
-law = "none"
-[time]
-end = 5.0
-step = 1.0
-[output]
-fields = false
-[solver]
-method = "direct"
-"""
+    values = isotropic(
+        None, "auto", geometry={"shape": "mesh", "file": file.name, "is": "loaded"}, remodeling={"law": "none"},
+        loads=ramped(5.0, pressure=pressure, elongation=0.1), time={"end": 5.0, "step": 1.0},
+        solver={"method": "direct"},
+    )  # fmt: skip
     path = folder / "scene.toml"
-    path.write_text(text)
+    path.write_text(tomlkit.dumps(values))
     return path
 
 
