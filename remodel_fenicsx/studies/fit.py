@@ -282,7 +282,7 @@ def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], 
 # ---------------------------------------------------------------- what a scene says where a table has measurements
 # keys whose numbers a simulation takes that is built already (`Simulation.begin_again`)
 TISSUE, OTHERS = r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))", r"loads\.\w+\.value|natural\.\w+"
-NUMBERS = rf"scale\..*|{TISSUE}|{OTHERS}"
+CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
 # what differences of runs divide by a small change is rounding alone
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
@@ -321,7 +321,7 @@ class Kept:
     """Simulations on the way, which nobody hears: they stay, and get other numbers where a scene differs in no more."""
 
     def __init__(self, keys: Sequence[str]):
-        self._may_stay = all(re.fullmatch(NUMBERS, key) for key in keys)
+        self._may_stay = all(re.fullmatch(CAN_BE_SET, key) for key in keys)
         self._known: dict[Any, Simulation] = {}
 
     def simulation(self, scene: Scene, table: Measured, is_passive: bool) -> Simulation:
@@ -653,11 +653,9 @@ def minimised(
     near: tuple[Array, Array] | None = None,
     enough: float = ENOUGH,
 ) -> Any:
-    """SciPy's least squares from a start, logarithms.
-
-    The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells how residuals
-    change: differences are made only where they pay.
-    """
+    """SciPy's least squares from a start, logarithms."""
+    # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells how
+    # residuals change: differences are made only where they pay.
     from scipy.optimize import least_squares
 
     free = np.array([number != held for number in range(len(start))])
