@@ -26,6 +26,7 @@ from docs.making.pages import DOCS, FIGURES, by_column, filled, markdown
 from remodel_fenicsx import Simulation, read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table
+from tests.runs import made
 
 ARTERY = Path(__file__).parents[1] / "demos" / "artery.toml"
 END, STEPS = 40.0, (5.0, 2.5, 1.25, 0.625)
@@ -70,13 +71,11 @@ def layer(scheme: Scheme, cells: str, step: float, coupling: str) -> tuple[np.nd
     changes = {"geometry.length": 0.5, "cells.initial": cells, "output.fields": False, "remodeling.coupling": coupling}
     scene = read_scene(ARTERY, ["time.end=40.0", f"time.step={step}"]).with_values(scheme.values | changes)
     domain = whole_tube(TUBE, (12, 8, 1), "hexahedron", 1, MPI.COMM_SELF)
-    simulation = Simulation(scene, MPI.COMM_SELF, domain)
-    start = clock.process_time()
-    iterations = sum(step.work.newton_iterations for step in simulation.steps())
-    spent = clock.process_time() - start
-    tensor, unknown = simulation.cells.structure_tensor(), simulation.unknown.x.array.copy()
-    simulation.close()
-    return tensor, unknown, spent, iterations
+    with made(scene, domain) as simulation:
+        start = clock.process_time()
+        iterations = sum(step.work.newton_iterations for step in simulation.steps())
+        spent = clock.process_time() - start
+        return simulation.cells.structure_tensor(), simulation.unknown.x.array.copy(), spent, iterations
 
 
 def errors() -> Iterator[dict[str, Any]]:

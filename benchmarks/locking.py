@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from docs.making.pages import DOCS, filled, made_with, markdown
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import scene_from_dict
@@ -29,6 +30,7 @@ from remodel_fenicsx.watch.warnings import LockingWarning, PressureNoise
 from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, registered, thick_tube
 from tests.reference.radial import RadialMaterial, solve_radial
 from tests.parts import tube
+from tests.runs import made
 
 TIP = 4.17  # mm; S. Land et al. 2015, problem 1
 HEXAHEDRA, TETRAHEDRA = "hexahedron", "tetrahedron"
@@ -62,16 +64,14 @@ def result(
     mesh, domain = scene.mesh, None
     if divisions is not None:
         domain = tube(1.0, 3.0, 1.0, 1, mesh.element, mesh.degree, MPI.COMM_SELF, divisions)
-    simulation = Simulation(scene, MPI.COMM_SELF, domain)
     rows: list[dict[str, float]] = []
-    try:
-        for step in simulation.steps():
-            rows.append(step.row)
-        value: float | None = rows[-1][column] - start
-    except StepFailure:
-        value = None
-    missing = sum(LockingWarning(simulation.stepper, FORMULATIONS[mesh.formulation].locks).missing())
-    simulation.close()
+    value: float | None = None
+    with made(scene, domain) as simulation:
+        with suppress(StepFailure):
+            for step in simulation.steps():
+                rows.append(step.row)
+            value = rows[-1][column] - start
+        missing = sum(LockingWarning(simulation.stepper, FORMULATIONS[mesh.formulation].locks).missing())
     iterations = int(sum(row["newton_iterations"] for row in rows))
     return Result(value, iterations, missing, simulation.domain.number_of_elements)
 
@@ -168,12 +168,12 @@ def turning_tube(ratio: float, radius: float, pressure: float, degree: int, form
 
 def turning_cell(scene: Scene, exact: np.ndarray, watched: bool = True) -> str:
     """Largest errors at the end, and by how much the run finds tensions turned by noise."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    watcher, turned = PressureNoise(simulation.stepper), 0.0
-    for step in simulation.steps():
-        turned = max(turned, watcher.degrees()) if watched else 0.0
-    off = np.abs(np.array([step.row[name] for name in COLUMNS_OF_CELLS]) - exact)
-    simulation.close()
+    turned, row = 0.0, {}
+    with made(scene) as simulation:
+        watcher = PressureNoise(simulation.stepper)
+        for step in simulation.steps():
+            turned, row = max(turned, watcher.degrees()) if watched else 0.0, step.row
+    off = np.abs(np.array([row[name] for name in COLUMNS_OF_CELLS]) - exact)
     said = f" ({turned:.2g})" if watched and FORMULATIONS[scene.formulation].locks else ""
     return f"{off[:3].max():.2f}°, {100 * (off[3:] / exact[3:]).max():.2f} %{said}"
 

@@ -21,11 +21,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from benchmarks.against import PROJECT, processor_seconds, run
-from remodel_fenicsx import Recording, Scene, Simulation
+from remodel_fenicsx import Recording, Scene
+from tests.runs import made
 
 TO_VTK = [0, 1, 3, 2, 4, 5, 7, 6]  # nodes of a hexahedron
 OWN = ("solver.method=auto", "solver.predictor=autoregressive")
@@ -47,17 +47,17 @@ def other(steps: int, problem: Path, result: Path, options: argparse.Namespace) 
 
 def write_problem(scene: Scene, path: Path) -> None:
     """What the other one needs to know."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
+    with made(scene) as simulation:
+        lengths = simulation.cells.dimension_values[:, 0]
     mesh, material, tube = simulation.domain.mesh, scene.material, scene.geometry
     np.savez(
         path, points=mesh.geometry.x, elements=mesh.geometry.dofmap[:, TO_VTK],
-        lengths=simulation.cells.dimension_values[:, 0], mu=material.lame_mu, lmbda=material.lame_lambda,
+        lengths=lengths, mu=material.lame_mu, lmbda=material.lame_lambda,
         modulus=material.network_modulus, contour=material.contour_length, initial=scene.cells.end_to_end_length,
         inner_radius=tube.inner_radius, length=tube.length, pressure=scene.loads["pressure"].value,
         drawn=scene.loads["elongation"].value * tube.length, ramp=scene.loads["pressure"].ramp[-1][0],
         kappa=scene.remodeling.kappa,
     )  # fmt: skip
-    simulation.close()
 
 
 def radii(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:

@@ -647,6 +647,7 @@ def _trade(options: argparse.Namespace) -> int:
     option(
         "--starts N  Start from N points: the given one, and others within a factor of two (default: 3).", default=3
     ),
+    option("--jobs N  Follow at most N of the starts and profiles at a time (default: as many as there are cores)."),
     QUIET,
     needs=COMPUTES + DRAWS,
 )
@@ -654,7 +655,7 @@ def _fit(options: argparse.Namespace) -> int:
     """Find numbers of a scene from measurements, with 95 % bands."""
     from remodel_fenicsx.studies.fit import fit
 
-    wishes = options.starts, options.quiet, options.likelihood_profiles
+    wishes = options.starts, options.quiet, options.likelihood_profiles, options.jobs
     with _stopping():
         answer = fit(options.scene, options.data, options.output, *wishes)
     return _answer(*answer)

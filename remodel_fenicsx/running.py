@@ -162,11 +162,17 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
         if checkpoint is None:
             log.info("no checkpoint yet: starts again at t = 0")
         else:
-            check_continuation(_scene_of(checkpoint), scene, checkpoint.time)
-            _check_whole(values, tomllib.loads(checkpoint.scene), place)
+            try:
+                before = tomllib.loads(checkpoint.scene)
+            except (tomllib.TOMLDecodeError, RecursionError) as error:
+                raise CheckpointError(f"the checkpoint's scene is not TOML: {error}") from error
+            check_continuation(scene_from_dict(before), scene, checkpoint.time)
+            _check_whole(values, before, place)
             log.info("goes on from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
             begun = checkpoint.versions
-        _say_changes(begun, versions())
+        for name, version in begun.items():
+            if (now := versions().get(name)) != version:
+                log.warning("goes on with %s %s, the run was begun with %s", name, now, version)
         return scene, checkpoint
 
     scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
@@ -179,19 +185,6 @@ def _check_whole(values: dict[str, Any], before: dict[str, Any], place: Path) ->
         if lost := set(before[table]) - set(values.get(table, {})):
             rule = f"lacks {table}.{min(lost)}, which the run had; write it as it was, or another value"
             raise RecordingError(f"{place / SCENE}: {rule}")
-
-
-def _scene_of(checkpoint: Checkpoint) -> Scene:
-    try:
-        return scene_from_dict(tomllib.loads(checkpoint.scene))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise CheckpointError(f"the checkpoint's scene is not TOML: {error}") from error
-
-
-def _say_changes(begun: dict[str, str], now: dict[str, str]) -> None:
-    for name, version in begun.items():
-        if now.get(name) != version:
-            log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
 
 
 @contextmanager

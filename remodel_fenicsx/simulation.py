@@ -7,9 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from dolfinx.fem import Function
 from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
@@ -104,6 +105,27 @@ class Simulation:
         self.unknown, self.cells, self.loading = self.state.unknown, self.state.cells, self.state.loading
         self.quadrature, self.tissue = self.cells.quadrature, self.stepper.tissue
         self.watchers = watchers(self.scene, parts)
+        self._start = self.state.snapshot()
+
+    def begin_again(self, scene: Scene) -> bool:
+        """From t = 0 with a scene that differs in numbers of tissue, kappa, loads and opening angle; whether it can."""
+        tissue, kappa = parameters_of(scene.properties(), self.domain)
+        known, stepper, kinematics = self.stepper.tissue.parameters, self.stepper, cast(Any, self.state.kinematics)
+        varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
+        if self.control or self.rest or any(varies[name] and not isinstance(known[name], Function) for name in varies):
+            return False
+        for name, value in tissue.parameters.items():
+            numbers = known[name].x.array if isinstance(known[name], Function) else known[name].value
+            numbers[...] = value.x.array if varies[name] else value
+        stepper.load_values = partial(values_of_loads, next(iter(scene.each_case())).loads)
+        stepper.remodeling.set_kappa(kappa)
+        self.state.restore(self._start)
+        if not scene.natural.is_of_the_mesh:
+            values, closed = natural_gradient(scene, self.quadrature, self.domain, self.cells.local_axes)
+            self.quadrature.values(kinematics.gradient, (3, 3))[:] = values
+            kinematics.closing = closed
+        self.scene = scene
+        return True
 
     def load_values(self, time: float, case: int = 0) -> LoadValues:
         """Magnitude of every load at a time, in a load case; the first is 0."""
@@ -240,8 +262,10 @@ def _states(scene: Scene, domain: Domain) -> list[State]:
     properties, local_axes = scene.properties(), scene.geometry.local_axes(domain, quadrature)
     own = {name: properties[name].cells for name in scene.regions}
     if not scene.natural.is_of_the_mesh:
-        natural = from_natural(made[0], scene, quadrature, domain, local_axes)
-        made = [NaturalConfiguration(one, natural.gradient, natural.closing) for one in made]
+        values, closed = natural_gradient(scene, quadrature, domain, local_axes)
+        function = quadrature.function("natural_gradient", (3, 3))
+        quadrature.values(function, (3, 3))[:] = values
+        made = [NaturalConfiguration(one, function, closed) for one in made]
     cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, measured_fibres(scene, domain))
     return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 
@@ -281,10 +305,8 @@ def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells
     return State(unknown, kinematics, cells, loading, FORMULATIONS[scene.mesh.formulation])
 
 
-def from_natural(
-    kinematics: Any, scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes
-) -> NaturalConfiguration:
-    """The kinematics of a body whose tissue is free of stress in another configuration than the mesh's."""
+def natural_gradient(scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes) -> tuple[Any, Any]:
+    """G (elements, points, 3, 3) of a body whose tissue is free of stress elsewhere; what closes to it, if anything."""
     from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing
 
@@ -306,10 +328,7 @@ def from_natural(
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
         stretches = prestretch(natural, local_axes, domain)
-    function = quadrature.function("natural_gradient", (3, 3))
-    values = gradient(stretches, local_axes.axes)
-    quadrature.values(function, (3, 3))[:] = values.reshape(*quadrature.shape, 3, 3)
-    return NaturalConfiguration(kinematics, function, found)
+    return gradient(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), found
 
 
 def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:

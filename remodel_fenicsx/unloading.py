@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from ufl.algorithms.map_integrands import map_integrands
 
+from remodel_fenicsx.body.domain import dof_of_node
 from remodel_fenicsx.body.mesh_domain import gmsh_text
 from remodel_fenicsx.body.mesh_faces import jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFile
@@ -26,7 +27,7 @@ from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, factorised, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
-from remodel_fenicsx.results.fields import NodalGather, dof_of_node
+from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
@@ -327,7 +328,7 @@ def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | 
     equilibrium, unknown = simulation.stepper.coupling.equilibrium, simulation.unknown
     loads = simulation.load_values(scene.end_of_ramps)
     state.loading.set({name: share * value for name, value in loads.items()})
-    dofs = dof_of_node(domain, unknown.function_space)
+    dofs = dof_of_node(domain.mesh, unknown.function_space)
     unknown.x.array.reshape(-1, 3)[dofs] = given[domain.node_number] - domain.mesh.geometry.x
     if not equilibrium.extension().admissible:
         return None

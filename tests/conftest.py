@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from remodel_fenicsx import cli
 from remodel_fenicsx.system import children
 from tests.forks import ForkedChild, end_forks, forked
 
 CASE = Path(__file__).with_name("run_case.py")
 Case = Callable[..., dict[str, Any]]
+Refused = Callable[..., str]
 Cases = Callable[[Sequence[dict[str, Any]], int], list[dict[str, Any]]]
 
 
@@ -41,6 +43,20 @@ def forked_children() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(children, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": ForkedChild}))
         yield
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+    """refused(words of a command) -> what it says: in one line, with exit code 2."""
+
+    def run(*words: str | Path) -> str:
+        capsys.readouterr()
+        assert cli.main([*map(str, words)]) == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.count("\n") == 1 and said.err.startswith("remodel-fenicsx: "), said
+        return said.err.removeprefix("remodel-fenicsx: ")
+
+    return run
 
 
 @pytest.fixture(scope="session", autouse=True)

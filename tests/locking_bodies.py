@@ -22,6 +22,7 @@ from remodel_fenicsx.body.shape import Column
 from remodel_fenicsx.body.domain import Domain, build_domain
 from remodel_fenicsx.model.energy import MATRICES, Matrix, logarithmic_dilatation
 from remodel_fenicsx.schema.units import FORCE, STRESS
+from tests.values import ramped
 
 EXACT_TUBE = 0.64144  # displacement of the inner face of the tube with J = 1, pressure 2, mu = 3.103, in plane strain
 
@@ -140,7 +141,7 @@ def elastic_scene(
         geometry={"shape": shape},
         mesh=mesh,
         material={"chain_density": 0.0, **material},
-        loads={load[0]: {"value": load[1], "ramp": [[0.0, 0.0], [float(steps), 1.0]]}},
+        loads=ramped(float(steps), **dict([load])),
         remodeling={"law": "none"},
         time={"end": float(steps)},
     )
@@ -165,10 +166,7 @@ def thick_tube(ratio: float, formulation: str, pressure: float = 2.0, **material
         mesh={"formulation": formulation},
         material={"lame_mu": 3.103, "lame_lambda": 3.103 * ratio, "chain_density": 0.0, **material},
         cells={"initial": "isotropic"},
-        loads={
-            "pressure": {"value": pressure, "ramp": [[0.0, 0.0], [4.0, 1.0]]},
-            "elongation": {"value": 0.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]},
-        },
+        loads=ramped(4.0, pressure=pressure, elongation=0.0),
         remodeling={"law": "none"},
         time={"end": 4.0},
         solver={"method": "direct"},

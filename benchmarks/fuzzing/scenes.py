@@ -8,6 +8,7 @@ from typing import Any
 
 from tests.reference.march import BOLTZMANN, STRESS_UNITS
 from tests.reference.radial import secant_stiffness
+from tests.values import ramped
 
 Values = dict[str, Any]
 COARSE = (8, 4, 2)  # elements of a tube around, through the wall and along, where it is meshed in full
@@ -83,10 +84,7 @@ def _stiff(random: Random) -> tuple[Values, Values]:
         "remodeling": {
             "law": law, "coupling": random.choice(couplings), "driver": random.choice(("cauchy", "cauchy", "pk2")),
         },
-        "loads": {
-            "pressure": {"value": rounded(pressure), "ramp": [[0.0, 0.0], [20.0, 1.0]]},
-            "elongation": {"value": rounded(random.uniform(0.0, 0.3)), "ramp": [[0.0, 0.0], [20.0, 1.0]]},
-        },
+        "loads": ramped(20.0, pressure=rounded(pressure), elongation=rounded(random.uniform(0.0, 0.3))),
         "time": {"end": 40.0, "step": 2.5}, "solver": {"method": "auto"}, "output": {"report": False},
     }  # fmt: skip
     if kinematics in ("radial", "axisymmetric") and random.random() < 0.4:

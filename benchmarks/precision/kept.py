@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import PROFILE
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies import trade as rungs
+from tests.runs import rows_of
 
 Array = NDArray[np.float64]
 Run = Mapping[str, Array]
@@ -91,9 +90,7 @@ def measured(scene: Scene, times: list[float]) -> Run:
     """Angles and lengths at the compared times, seconds of the processor, rows and Newton iterations of a run."""
     compared = rungs.as_run(rungs.Setting({}, scene, (1,)), 1, times)
     columns = [*compared.output.columns, "newton_iterations"]
-    simulation = Simulation(compared.with_values({"output.columns": columns}), MPI.COMM_SELF)
-    rows = [step.row for step in simulation.steps()]
-    simulation.close()
+    rows = rows_of(compared.with_values({"output.columns": columns}))
     asked = [next(row for row in rows if same_time(row["time"], time)) for time in times]
     lengths = [name for name in ("inner_radius", "outer_radius", "mean_stretch") if name in rows[0]]
     return {

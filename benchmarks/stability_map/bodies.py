@@ -12,28 +12,18 @@ from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, RAMP, el
 from benchmarks.stability_map.judging import SAME_MESH
 from tests.reference.march import Wall, load_at, march
 from tests.reference.radial import RadialMaterial, Tube
+from tests.values import ramped
 
-SOFT = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
-TUBE: dict[str, Any] = {
-    **CUBE,
-    "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 0.5},
-    "mesh": {"refinement": 1, "element": "hexahedron", "degree": 2},
-    "material": {**CUBE["material"], **SOFT},
-    "cells": {"initial": "isotropic", "axes": "cylindrical", "end_to_end_length": 1.0},
-    "loads": {
-        "pressure": {"value": 4.8, "ramp": [[0.0, 0.0], [20.0, 1.0]]},
-        "elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [20.0, 1.0]]},
-    },
-    "time": {"end": 40.0, "step": 2.0},
-}
-TENDON: dict[str, Any] = {
-    **CUBE,
-    "geometry": {"shape": "tendon", "length": 10.0, "area": 10.0},
-    "material": {**CUBE["material"], **SOFT},
-    "cells": {"initial": "random", "seed": 1, "axes": "global", "end_to_end_length": 1.0},
-    "loads": {"force": {"value": 300.0, "ramp": [[0.0, 0.0], [12.0, 1.0]]}},
-    "time": {"end": 40.0, "step": 1.0},
-}
+SOFT = {"material.chain_density": 2.0e21, "material.contour_length": 1.594, "material.persistence_length": 1.365}
+TUBE = with_values(CUBE, {
+    **SOFT, "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 0.5}, "mesh.degree": 2,
+    "cells.axes": "cylindrical", "loads": ramped(20.0, pressure=4.8, elongation=0.1), "time.end": 40.0,
+    "time.step": 2.0,
+})  # fmt: skip
+TENDON = with_values(CUBE, {
+    **SOFT, "geometry": {"shape": "tendon", "length": 10.0, "area": 10.0}, "cells.initial": "random", "cells.seed": 1,
+    "loads": ramped(12.0, force=300.0), "time.end": 40.0,
+})  # fmt: skip
 COARSE_TENDON = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 3}}
 RADIUS_TOLERANCE, STEP_TOLERANCE = 0.01, 0.01
 ANGLE_TOLERANCE = 1.5  # degrees, of the mean over a body
@@ -158,8 +148,7 @@ table(
 )  # fmt: skip
 
 ELASTIC = {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0}
-PRESSED = {**ELASTIC, "loads.pressure": {"value": 2.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}}
-PRESSED |= {"time.end": 4.0, "time.step": 1.0}
+PRESSED = {**ELASTIC, "loads.pressure": ramped(4.0, pressure=2.0)["pressure"], "time.end": 4.0, "time.step": 1.0}
 RATIOS = (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5)
 # the tolerance is the error that the mesh has where nothing locks, at most the 5 % from which a run warns, or 3.5 %
 MESHES = {

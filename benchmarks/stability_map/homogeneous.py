@@ -36,12 +36,7 @@ STRETCH_TOLERANCE, ANGLE_TOLERANCE, CELL_TOLERANCE = 1e-5, 1e-3, 1e-4  # relativ
 LAGGING = 1e3  # times that for a lag of a step: 1 % of a stretch, a degree, 0.1 of A
 FRAMES, DRIVERS = ("spatial", "material"), ("cauchy", "pk2", "finger")
 LAWS, COUPLINGS = ("explicit", "rate", "relaxation", "none"), ("staggered", "relaxed")
-ELEMENTS = {
-    "hex1": ("hexahedron", 1),
-    "hex2": ("hexahedron", 2),
-    "tet1": ("tetrahedron", 1),
-    "tet2": ("tetrahedron", 2),
-}
+ELEMENTS = {f"{kind[:3]}{degree}": (kind, degree) for kind in ("hexahedron", "tetrahedron") for degree in (1, 2)}
 REFERENCE = "material point"
 VARIANT = {"remodeling.law": "tensor", "remodeling.frame": "material", "material.repulsion": "log"}
 

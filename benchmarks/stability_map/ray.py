@@ -7,41 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.bodies import (
-    FACES,
-    OUTER_ANGLE_TOLERANCE,
-    RADIUS_TOLERANCE,
-    REFERENCE,
-    TUBE,
-    check_inner_displacement,
-    check_wall,
-    layer,
-)
-from benchmarks.stability_map.cases import (
-    MU,
-    Case,
-    Check,
-    Finding,
-    Place,
-    Run,
-    Values,
-    farthest,
-    named,
-    table,
-    with_values,
-)
+from benchmarks.stability_map import bodies
+from benchmarks.stability_map.bodies import MU
+from benchmarks.stability_map.cases import Case, Check, Finding, Place, Run, Values, farthest, named, table, with_values
 from benchmarks.stability_map.homogeneous import VARIANT
 from tests.reference.march import Wall, load_at, march, pressure_curve
 
 RAY: dict[str, Any] = with_values(
-    TUBE, {"geometry.length": 8.0, "model.kinematics": "radial", "loads": {}, "time": {"end": 8.0, "step": 1.0}}
+    bodies.TUBE, {"geometry.length": 8.0, "model.kinematics": "radial", "loads": {}, "time": {"end": 8.0, "step": 1.0}}
 )
-CURVE = f"{REFERENCE}, its inner radius prescribed"
+CURVE = f"{bodies.REFERENCE}, its inner radius prescribed"
 UNLOADED = {"material.chain_density": 0.0, "remodeling.law": "none"}
 AT_ALL_POINTS = {"mesh.formulation": "displacement"}
 
 
-def ray_case(family: str, changes: Values, place: Place, check: Check, reference: str = REFERENCE, **more: Any) -> Case:
+def ray_case(
+    family: str, changes: Values, place: Place, check: Check, reference: str = bodies.REFERENCE, **more: Any
+) -> Case:
     """A tube on a ray; a load is [value, end of its ramp] or a table."""
     changes = dict(changes)
     for name in ("pressure", "elongation"):
@@ -58,7 +40,7 @@ def ray_case(family: str, changes: Values, place: Place, check: Check, reference
 
 
 # ---------------------------------------------------------------- held against the march
-marched_case = partial(ray_case, check=check_wall)
+marched_case = partial(ray_case, check=bodies.check_wall)
 
 # walls of a fiftieth to a fifth of the radius, with and without remodeling, stiff in bulk and not. 0.5 of mu times the
 # thickness is beyond the limit of a tube without chains
@@ -91,7 +73,7 @@ table(
 # ---------------------------------------------------------------- locking below what is called stiff
 # soft enough not to be called incompressible, walls up to ten radii thick: 3.5 % of the inner displacement
 table(
-    "moderate lambda/mu", partial(ray_case, check=check_inner_displacement),
+    "moderate lambda/mu", partial(ray_case, check=bodies.check_inner_displacement),
     {
         "outer radius": (1.5, 3.0, 10.0), "degree": (1, 2), "refinement": (1, 2),
         "lambda/mu": (8.8, 20.0, 49.0, 100.0),
@@ -168,16 +150,16 @@ def check_equilibrium(case: Case, run: Run) -> Finding:
     if not len(rows) or run.code != 0:
         return Finding(0.0, "no row")
     off = {
-        name: abs(run.column(name)[-1] / radii[-1] - 1) / RADIUS_TOLERANCE
-        for name, radii in zip(FACES, expected.faces(), strict=True)
+        name: abs(run.column(name)[-1] / radii[-1] - 1) / bodies.RADIUS_TOLERANCE
+        for name, radii in zip(bodies.FACES, expected.faces(), strict=True)
     }
     turned = {
         f"fibre_angle_{place}": abs(
-            run.column(f"fibre_angle_{place}")[-1] - expected.mean_angle(wall.tube, *layer(case, place), -1)
+            run.column(f"fibre_angle_{place}")[-1] - expected.mean_angle(wall.tube, *bodies.layer(case, place), -1)
         )
         for place in ("inner", "outer")
     }
-    off |= {name: degrees / OUTER_ANGLE_TOLERANCE for name, degrees in turned.items()}
+    off |= {name: degrees / bodies.OUTER_ANGLE_TOLERANCE for name, degrees in turned.items()}
     mean = np.average(expected.squares[-1][:, 1], weights=wall.tube.areas)
     along = run.structure_tensor()[:, 2, 2]  # of the elements of a ray, from the inner face outwards
     volumes = np.diff(np.linspace(wall.tube.inner_radius, wall.tube.outer_radius, len(along) + 1) ** 2)
@@ -194,7 +176,7 @@ FALLS = {
 
 
 # large elongations, loads that fall and reverse: the state that remodeling comes to depends on the way there
-rest_case = partial(ray_case, check=check_equilibrium, reference=f"{REFERENCE}, marched")
+rest_case = partial(ray_case, check=check_equilibrium, reference=f"{bodies.REFERENCE}, marched")
 AT_REST = {"time": {"end": "equilibrium"}, "mesh.degree": 2}
 table(
     "equilibrium", rest_case,
@@ -235,9 +217,9 @@ def check_limit(case: Case, run: Run) -> Finding:
     off = float(np.max(np.abs(found[below] / expected - 1), initial=0.0))
     asked = load_at(case.scene, "pressure", 1e9)
     if asked < most:
-        return Finding(off / RADIUS_TOLERANCE, f"inner radius off by {100 * off:.3g} %", False)
+        return Finding(off / bodies.RADIUS_TOLERANCE, f"inner radius off by {100 * off:.3g} %", False)
     words = f"largest pressure {most:.4g}, asked {asked:.4g}; inner radius off by {100 * off:.3g} % below it"
-    return Finding(np.inf if run.code == 0 else off / RADIUS_TOLERANCE, words, solvable=False)
+    return Finding(np.inf if run.code == 0 else off / bodies.RADIUS_TOLERANCE, words, solvable=False)
 
 
 WEAK_HOOPS: dict[str, tuple[Any, dict[float, float]]] = {

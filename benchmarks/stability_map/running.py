@@ -26,6 +26,7 @@ from functools import lru_cache
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import tomlkit
@@ -116,17 +117,11 @@ def on_ranks(request: dict[str, Any], command: list[str], said: io.StringIO) -> 
 @contextlib.contextmanager
 def element_counts(counts: dict[str, dict[str, Any]]) -> Iterator[None]:
     """Numbers of elements other than the paper's, where meshes are made."""
-    before = []
-    for name, constants in counts.items():
-        module = importlib.import_module(f"remodel_fenicsx.body.{name}")
-        for key, value in constants.items():
-            before.append((module, key, getattr(module, key)))
-            setattr(module, key, tuple(value) if isinstance(value, list) else value)
-    try:
+    with contextlib.ExitStack() as stack:
+        for name, constants in counts.items():
+            values = {key: tuple(value) if isinstance(value, list) else value for key, value in constants.items()}
+            stack.enter_context(patch.multiple(f"remodel_fenicsx.body.{name}", **values))
         yield
-    finally:
-        for module, key, value in before:
-            setattr(module, key, value)
 
 
 def read_results(folder: Path) -> dict[str, Any]:

@@ -15,10 +15,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from docs.making.pages import EDGES, FIGURES, Columns, by_layer, drawn, rows_and_last, simulated
+from docs.making.pages import EDGES, FIGURES, Columns, by_layer, drawn
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
+from tests.runs import made
 
 END, KAPPA = 150.0, 0.025
 VARIANTS: dict[str, tuple[str, float, str, str]] = {
@@ -45,11 +46,12 @@ def run(variant: str, shape: str, kinematics: str, **values: Any) -> tuple[Colum
     kappa = factor * values.pop("remodeling.kappa", KAPPA)
     changes = {"model.kinematics": kinematics, "output.fields": False, "time.end": END, "remodeling.kappa": kappa}
     print(variant, shape, values, flush=True)
-    with simulated(preset_scene(preset, shape).with_values(changes | values)) as simulation:
-        columns, last = rows_and_last(simulation)
+    with made(preset_scene(preset, shape).with_values(changes | values)) as simulation:
+        steps = list(simulation.steps())
+        columns = {name: np.array([step.row[name] for step in steps]) for name in steps[0].row}
         if shape != "tube":
             return columns, np.zeros(0)
-        angle, volume = Measurement(simulation.observer, last).fibre_angle, simulation.quadrature.volumes
+        angle, volume = Measurement(simulation.observer, steps[-1]).fibre_angle, simulation.quadrature.volumes
         layer = np.digitize(simulation.quadrature.coordinates[..., 0], EDGES) - 1
     return columns, np.array([np.average(angle[layer == k], weights=volume[layer == k]) for k in range(8)])
 

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from docs.making.pages import DOCS, FIGURES, Columns, between_marks, by_column, drawn, markdown, simulated
+from docs.making.pages import DOCS, FIGURES, Columns, between_marks, by_column, drawn, markdown
 from remodel_fenicsx import Scene
 from remodel_fenicsx.body import Cube, LoadKind
 from remodel_fenicsx.body.domain import Domain
@@ -23,6 +23,7 @@ from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
+from tests.runs import made
 
 PAGE = DOCS / "laws.md"
 LATE = 10  # steps at the end of a run in which the cells should have come to rest
@@ -103,7 +104,7 @@ def history(case: Case, law: CompareLaw, **changes: Any) -> Iterator[dict[str, f
     values = {"preset": "kuhl-holzapfel-2007", "remodeling": {"frame": "material", **law.values}}
     scene = Scene(**values, **case.scene, output={"columns": ["pass_residual"]}).with_values(changes)
     names = ("time", case.angle, case.size, "pass_residual", "newton_iterations", "substeps")
-    with simulated(scene, case.domain() if case.domain else None) as simulation:
+    with made(scene, case.domain() if case.domain else None) as simulation:
         try:
             for step in simulation.steps():
                 yield {column: float(step.row[name]) for column, name in zip(COLUMNS, names, strict=True)}

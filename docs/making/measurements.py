@@ -12,9 +12,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import ive
 
-from docs.making.pages import DOCS, FIGURES, Columns, between_marks, drawn, markdown, rows_and_last, simulated
-from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict
+from docs.making.pages import DOCS, FIGURES, Columns, between_marks, drawn, markdown
+from remodel_fenicsx.scene.scene import preset_scene
 from remodel_fenicsx.studies.page import COLOURS, Page, read_table
+from tests.runs import last_row
 
 PAGE = DOCS / "against_measurements.md"
 BANDS = ("fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")
@@ -51,12 +52,6 @@ def normal_angle(mean: float, deviation: float) -> float:
     """The same of a wrapped normal distribution: cos 2a = exp(-2 s^2) cos 2 mean, in degrees."""
     cosine = np.exp(-2 * np.radians(deviation) ** 2) * np.cos(2 * np.radians(mean))
     return float(np.degrees(np.arccos(cosine)) / 2)
-
-
-def last_row(values: dict[str, Any]) -> dict[str, float]:
-    """Of a run."""
-    with simulated(scene_from_dict(values)) as simulation:
-        return dict(rows_and_last(simulation)[1].row)
 
 
 def wall(

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from mpi4py import MPI
 
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Simulation
 from remodel_fenicsx.studies.page import STYLE, Page, read_table
 from remodel_fenicsx.system.environment import versions
 
@@ -81,22 +79,6 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
 
 
 # ---------------------------------------------------------------- runs
-@contextmanager
-def simulated(scene: Scene, domain: Any = None) -> Iterator[Simulation]:
-    """A simulation in this process alone, which ends with the block."""
-    simulation = Simulation(scene, MPI.COMM_SELF, domain)
-    try:
-        yield simulation
-    finally:
-        simulation.close()
-
-
-def rows_and_last(simulation: Simulation) -> tuple[Columns, Any]:
-    """Columns of all steps, and the last step."""
-    steps = list(simulation.steps())
-    return {name: np.array([step.row[name] for step in steps]) for name in steps[0].row}, steps[-1]
-
-
 def through_the_wall(simulation: Simulation) -> Columns:
     """Radius without load, depth, hoop stress and fibre angle at the points of a tube as it is, by radius."""
     cells, local = simulation.cells, simulation.cells.local_axes

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 
 from demos.figures import scenes
-from docs.making.pages import by_column, simulated
+from docs.making.pages import by_column
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.spectral import positive_direction
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.studies.page import Page
 from remodel_fenicsx.system.children import cores
+from tests.runs import last_row, made
 
 Row = dict[str, Any]
 # ---------------------------------------------------------------- against the radial reference
@@ -114,7 +115,7 @@ def stopped_points(name: str, **changes: Any) -> list[Row]:
 
     `passes`: in how many passes the point did remodel before.
     """
-    with simulated(scenes()[name].with_values({"output.fields": False, **changes})) as simulation:
+    with made(scenes()[name].with_values({"output.fields": False, **changes})) as simulation:
         passes = Passes(simulation.stepper.remodeling)
         *_, last = simulation.steps([passes])
         x, angle = simulation.quadrature.coordinates, Measurement(simulation.observer, last).fibre_angle
@@ -128,9 +129,8 @@ def stopped_points(name: str, **changes: Any) -> list[Row]:
 def stiff_tendon(name: str, **changes: Any) -> list[Row]:
     """The tendon with four times the energy of its chains (erratum 1): its stretch at the end."""
     scene = scenes()[name].with_values({"output.fields": False, "material.energy_factor": 4, **changes})
-    with simulated(scene) as simulation:
-        *_, last = simulation.steps()
-    return [{"time": last.time, "mean_stretch": last.row["mean_stretch"]}]
+    row = last_row(scene)
+    return [{name: row[name] for name in ("time", "mean_stretch")}]
 
 
 # ---------------------------------------------------------------- all of them

@@ -14,13 +14,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from docs.making.pages import FIGURES, Columns, by_column, drawn, simulated, through_the_wall
+from docs.making.pages import FIGURES, Columns, by_column, drawn, through_the_wall
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body.shape import columns_on_request
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
+from tests.runs import made, simulated
 
 TIME, STEP, TOLERANCE, RAMP_END = 40.0, 4.0, 1.0, 24.0  # of turnover; the first step; degrees, of chosen steps
 END = 60 * TIME
@@ -82,7 +83,7 @@ def outcome(wall: Wall, stretch: float, gain: float) -> dict[str, Any]:
     """How a wall ends: as a row of the map's table."""
     least, rate = np.inf, np.inf
     found = {"time": 0.0, "outer_radius": wall.outer_radius, "opening_angle": np.nan}
-    with simulated(scene_of(wall, {"deposition_stretch": stretch, "gain": gain})) as simulation:
+    with made(scene_of(wall, {"deposition_stretch": stretch, "gain": gain})) as simulation:
         try:
             for step in simulation.steps():
                 found |= {"time": step.time, "outer_radius": step.row["outer_radius"]}
@@ -148,7 +149,7 @@ def opening() -> Iterator[dict[str, Any]]:
     """Opening angle over time, of both walls, with cells that turn and without."""
     for name, wall in WALLS.items():
         for cells, kappa in (("turn", {}), ("fixed", {"kappa": 0.0})):
-            with simulated(scene_of(wall, UNIT_GAIN, TO_REST, **kappa)) as simulation:
+            with made(scene_of(wall, UNIT_GAIN, TO_REST, **kappa)) as simulation:
                 for step in simulation.steps():
                     angle = opening_angle(simulation, step)
                     yield {"wall": name, "cells": cells, "time": step.time, "angle": angle}
@@ -159,9 +160,7 @@ def walls_at_rest() -> Columns:
     table: Columns = {}
     for name, wall in WALLS.items():
         for how, turnover in (("with", UNIT_GAIN), ("without", None)):
-            with simulated(scene_of(wall, turnover, TO_REST)) as simulation:
-                for _ in simulation.steps():
-                    pass
+            with simulated(scene_of(wall, turnover, TO_REST)) as (simulation, _):
                 found = through_the_wall(simulation)
             table["depth"] = found["depth"]
             table |= {f"{what}_{name}_{how}": found[what] for what in ("stress", "angle")}

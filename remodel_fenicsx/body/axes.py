@@ -21,7 +21,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.domain import Domain, cells_of, corners_of
+from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, dof_of_node
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import SolveStopped, of_all_ranks, over_ranks, solve_positive
 from remodel_fenicsx.fem.compat import geometry_dofmap
@@ -55,12 +55,18 @@ def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outle
 
 def _radial(mesh: Any, degree: int, dx: Any, inner: Facets, outer: Facets, thickness: float) -> Any:
     """Projected unit gradients of the harmonic function."""
-    phi, found = lagrange(mesh, degree, ()), lagrange(mesh, degree, (3,))
-    solve_positive(_stiffness(phi, dx), None, phi, [_held(phi, inner, 0.0), _held(phi, outer, 1.0)])
+    phi, found = harmonic(mesh, degree, dx, inner, outer), lagrange(mesh, degree, (3,))
     slope, least = ufl.grad(phi), dolfinx.fem.Constant(mesh, np.float64(LEAST_SLOPE / thickness))
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
     trial, test = _arguments(found)
     solve_positive(ufl.inner(trial, test) * dx, ufl.inner(direction, test) * dx, found)
+    return found
+
+
+def harmonic(mesh: Any, degree: int, dx: Any, low: Facets, high: Facets) -> Any:
+    """The harmonic function that is 0 on some facets and 1 on others. Collective."""
+    found = lagrange(mesh, degree, ())
+    solve_positive(_stiffness(found, dx), None, found, [_held(found, low, 0.0), _held(found, high, 1.0)])
     return found
 
 
@@ -208,7 +214,8 @@ def found_axes(
             log.info("the local axes are %s; those of the nearest point are used there", words)
         _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
-    nodal = _share(*(_at_nodes(length) for length in lengths[:2]))
+    dofs = dof_of_node(domain.mesh, lengths[0].function_space)
+    nodal = _share(*(np.real(length.x.array[dofs]) for length in lengths[:2]))
     makers = (lambda: axes), (lambda: depth), (lambda: station), (lambda: nodal)
     return LocalAxes(quadrature.coordinates, *makers, values[..., 6] + values[..., 7], ~known)
 
@@ -235,14 +242,6 @@ def _share(first: Array, second: Array) -> Array:
 def _at_points(fields: Sequence[Any], quadrature: Quadrature) -> Array:
     compiled = jit.expression(ufl.as_vector(fields), quadrature.points)
     return quadrature.evaluate(compiled, (len(fields),))
-
-
-def _at_nodes(function: Any) -> Array:
-    """Of a scalar of the mesh's degree, by local geometry node: node k of an element is dof k of it."""
-    space = function.function_space
-    found = np.zeros(len(space.mesh.geometry.x))
-    found[geometry_dofmap(space.mesh).reshape(-1)] = np.real(function.x.array[space.dofmap.list.reshape(-1)])
-    return found
 
 
 def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:

@@ -248,54 +248,7 @@ def _domain_from_gmsh(
     return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # ghosts too
 
 
-# ---------------------------------------------------------------- from arrays
-
-
-@dataclass(frozen=True, eq=False)
-class MeshArrays:
-    """A mesh on rank 0."""
-
-    kind: str
-    degree: int
-    points: Array
-    cells: npt.NDArray[np.int64]
-    facets: npt.NDArray[np.int64]
-    facet_values: npt.NDArray[np.int64]
-    cell_values: npt.NDArray[np.int64]
-    faces: dict[str, int]
-    regions: dict[str, int]
-
-
-def share_mesh(
-    arrays: MeshArrays | None, shape: str, dimensions: dict[str, float], comm: MPI.Intracomm | None = None
-) -> Domain:
-    """Share a mesh that rank 0 holds; elsewhere `arrays` is not looked at. Collective."""
-    comm = comm or MPI.COMM_WORLD
-    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as above
-    told = arrays and (arrays.kind, arrays.degree, arrays.cells.shape[1], arrays.faces, arrays.regions)
-    tagged = arrays and (np.sort(arrays.facets, axis=1), arrays.facet_values)
-    kind, degree, nodes, faces, regions = comm.bcast(told)
-    symbolic = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
-    cells = np.empty((0, nodes), dtype=np.int64) if arrays is None else arrays.cells
-    points = np.empty((0, 3)) if arrays is None else arrays.points
-    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
-    tags = _tags_of_facets(mesh, *comm.bcast(tagged))
-    domain = Domain(mesh, tags, faces, shape, dimensions, regions, np.empty(0, dtype=np.int32))
-    values = None if arrays is None else arrays.cell_values.astype(np.int32)
-    return replace(domain, element_region=domain.scatter_elements(values))
-
-
-def _tags_of_facets(mesh: Any, corners: npt.NDArray[np.int64], values: npt.NDArray[np.int64]) -> Any:
-    """Tags of the facets of the boundary with these corners, as rank 0 numbered them, each row ascending."""
-    dimension = mesh.topology.dim - 1
-    mesh.topology.create_connectivity(dimension, dimension + 1)
-    facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology)).astype(np.int32)
-    listed: Any = corners.tolist()
-    wanted = dict(zip(map(tuple, listed), values.astype(int), strict=True))
-    nodes = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[corners_of(mesh, facets)]
-    rows: Any = np.sort(nodes, axis=1).tolist()
-    found = np.array([wanted.get(tuple(row), 0) for row in rows], dtype=np.int32)
-    return dolfinx.mesh.meshtags(mesh, dimension, facets[found > 0], found[found > 0])
+# ---------------------------------------------------------------- facets
 
 
 def cells_of(mesh: Any, facets: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
@@ -320,6 +273,14 @@ def corners_of(mesh: Any, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.int64
 def _corners_of_facets(mesh: Any) -> npt.NDArray[np.int64]:
     """Of an element, (facets, corners of one)."""
     return np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[mesh.topology.dim - 1])
+
+
+def dof_of_node(mesh: Any, space: Any) -> npt.NDArray[np.int64]:
+    """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
+    # the element and the geometry have the same degree: node k of an element is dof k of that element
+    found = np.zeros(len(mesh.geometry.x), dtype=np.int64)
+    found[compat.geometry_dofmap(mesh).reshape(-1)] = space.dofmap.list.reshape(-1)
+    return found
 
 
 # ---------------------------------------------------------------- structured, without Gmsh

@@ -169,8 +169,9 @@ class Loading:
         """
         uniform = self.kinematics.uniform_unknown(self.space, component)
         if length is not None and uniform is not None:
-            force = self.magnitude(name, length / uniform[1] / self.volume())  # per number u, spread over the body
-            self.add_potential(lambda u: -force * u[component] * self.weight * ufl.dx(domain=self.domain.mesh))
+            dx = ufl.Measure("dx", domain=self.domain.mesh)
+            force = self.magnitude(name, length / uniform[1] / self._integral(dx))  # per number u, spread over the body
+            self.add_potential(lambda u: -force * u[component] * self.weight * dx)
             return
         traction, measure = self.magnitude(name, 1.0 / self.area(face)), self.surface_measure(face)
         self.add_term(lambda u, v: -traction * v[component] * self.weight * measure)
@@ -219,8 +220,10 @@ class Loading:
         change = getattr(self.kinematics, "change_of_length", None)
         if change is None:
             return
-        force = self.magnitude(name, 1.0 / self.volume())  # spread: the change of the length has no place
-        self.add_potential(lambda u: -force * change(u) * self.weight * ufl.dx(domain=self.domain.mesh))
+        dx = ufl.Measure("dx", domain=self.domain.mesh)
+        # spread over the body: the change of the length has no place
+        force = self.magnitude(name, 1.0 / self._integral(dx))
+        self.add_potential(lambda u: -force * change(u) * self.weight * dx)
 
     def add_prescribed_shear(self, name: str) -> None:
         """F_xy = magnitude of kinematics whose strain is the same everywhere.
@@ -384,17 +387,14 @@ class Loading:
 
     def area(self, face: str) -> float:
         """Reference area of a named face."""
-        one = dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(1.0))
-        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * self.measure_alone(face)))
-        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
-
-    def volume(self) -> float:
-        """Reference volume of the body. Collective."""
-        one, dx = self.constant(1.0), ufl.dx(domain=self.domain.mesh)
-        local = dolfinx.fem.assemble_scalar(jit.form(one * self.weight * dx))
-        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+        return self._integral(self.measure_alone(face))
 
     # ------------------------------------------------------------ inside
+    def _integral(self, measure: Any) -> float:
+        """Volume or area of the body."""
+        local = dolfinx.fem.assemble_scalar(jit.form(self.constant(1.0) * self.weight * measure))
+        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+
     def constant(self, value: float) -> Any:
         """A number as an argument of kernels, so that another one compiles nothing."""
         return dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(value))

@@ -14,18 +14,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gmsh_model
-from remodel_fenicsx.body.mesh_faces import (
-    Boundary,
-    FaceError,
-    GUIDE,
-    add_support,
-    again,
-    boundary_of,
-    check_supports,
-    groups_inside,
-    likely_exchange,
-    through_the_wall,
-)
+from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
     ENDINGS,
     TAGS,
@@ -247,7 +236,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
         return shared(partial(self.checked, mesh), comm or MPI.COMM_WORLD)
 
-    def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, Boundary, dict[str, int]]:
+    def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, mesh_faces.Boundary, dict[str, int]]:
         """The mesh, its boundary, and its regions' numbers by name; on rank 0."""
         file = self._with_regions(self._read())
         scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
@@ -257,12 +246,12 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             limits = f"allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, geometry.length_unit)"
             raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
         try:
-            boundary = boundary_of(file, self._groups(file), self.open_boundary)
-        except FaceError as error:
+            boundary = mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
+        except mesh_faces.FaceError as error:
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
         except MeshFileError as error:
             raise self._fault(str(error)) from None
-        if pair := likely_exchange(file.points, boundary):
+        if pair := mesh_faces.likely_exchange(file.points, boundary):
             words = f"inner and outer touch each other: are {pair[0]} and {pair[1]} swapped?"
             raise SceneError(f"geometry.faces.{pair[0]} = {shown(self._asked(pair[0]))}: {words}")
         inner, outer = boundary.area("inner"), boundary.area("outer")
@@ -274,7 +263,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             file, boundary = self._refined(file, mesh)
         return file, boundary, self._regions(file)
 
-    def _refined(self, file: MeshFile, mesh: Mesh) -> tuple[MeshFile, Boundary]:
+    def _refined(self, file: MeshFile, mesh: Mesh) -> tuple[MeshFile, mesh_faces.Boundary]:
         """With smaller elements, or those of degree 2."""
         if (number := len(file.cells) * mesh.refinement**3) > LARGEST_MESH:
             raise SceneError(f"mesh.refinement = {mesh.refinement}: {number} elements; at most {LARGEST_MESH} are made")
@@ -285,7 +274,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             raise SceneError(f"{asked}: {Path(self.file).name} {error}") from None
         words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
-        return file, boundary_of(file, self._groups(file), self.open_boundary)
+        return file, mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
 
     def _read(self) -> MeshFile:
         try:
@@ -311,11 +300,11 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         groups = {face: tuple(_numbers("face", face, entries, names, there)) for face, entries in asked.items()}
         taken = {number for numbers in groups.values() for number in numbers}
         others = {name: number for name, number in names.items() if number in there and number not in taken}
-        left = groups_inside(file) if others else set()
+        left = mesh_faces.groups_inside(file) if others else set()
         for name, number in others.items():
             if name in groups or number in left:
                 continue
-            if number in file.facet_groups[again(file.facets, file.facet_groups, taken)]:
+            if number in file.facet_groups[mesh_faces.again(file.facets, file.facet_groups, taken)]:
                 log.info(
                     "face %r of the file shares facets with others, and the scene does not name it: left out", name
                 )
@@ -344,17 +333,17 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             numbers = self._volumes(file, name, entries)
             groups[np.isin(groups, numbers)] = numbers[0]
             taken.add(numbers[0])
-        own = ~again(file.corners, groups, taken)
+        own = ~mesh_faces.again(file.corners, groups, taken)
         return replace(file, cells=file.cells[own], cell_numbers=file.cell_numbers[own], cell_groups=groups[own])
 
     def _volumes(self, file: MeshFile, region: str, entries: Names) -> list[int]:
         """Numbers of the volumes that a region has in the file."""
         return _numbers("region", region, entries, file.names[3], set(distinct(file.cell_groups)) - {0})
 
-    def _say(self, file: MeshFile, boundary: Boundary) -> None:
+    def _say(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
         counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
         log.info("%s: %s, SHA-256 %s", Path(self.file).name, counts, file.sha256)
-        if through_the_wall(boundary):
+        if mesh_faces.through_the_wall(boundary):
             log.warning(
                 "the wall is one element thick in places: bending, and how the fibre angle changes through it, are "
                 "lost there; try mesh.refinement = 2"
@@ -382,7 +371,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             if name not in domain.faces:
                 raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
         chosen = _with_ends(supports)
-        check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
+        mesh_faces.check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
         for name, face in faces_of(loads).items():
             key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
             if face not in domain.faces:
@@ -405,7 +394,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
         for name, support in _with_ends(supports).items():
             moves = ("elongation", length) if name == "outlet" and "elongation" in loads else None
-            add_support(loading, name, support, GUIDE * modulus / domain.thickness, moves)
+            mesh_faces.add_support(loading, name, support, mesh_faces.GUIDE * modulus / domain.thickness, moves)
         for name, face in faces_of(loads).items():
             loading.add_follower_pressure(name, face)
 

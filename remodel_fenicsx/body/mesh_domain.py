@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import basix.ufl
 import dolfinx.fem
+import dolfinx.mesh
 import numpy as np
 import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.axes import facets_of
-from remodel_fenicsx.body.domain import Domain, MeshArrays, cells_of, share_mesh
+from remodel_fenicsx.body.axes import facets_of, harmonic
+from remodel_fenicsx.body.domain import Domain, SymbolicMesh, cells_of, corners_of
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims
 from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import agreed, over_ranks, solve_positive
-from remodel_fenicsx.fem.kinematics import lagrange
+from remodel_fenicsx.fem.assembly import agreed, over_ranks
 
 
 # ---------------------------------------------------------------- a mesh as the text of a Gmsh file, format 2.2
@@ -90,15 +92,8 @@ class MeshDomain(Domain):
         if not {"inlet", "outlet"} <= set(self.faces):
             return 0.0
         mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
-        psi = lagrange(mesh, degree, ())
-        space, dx = psi.function_space, ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
-        conditions = []
-        for value, face in enumerate(("inlet", "outlet")):
-            dofs = dolfinx.fem.locate_dofs_topological(space, 2, facets_of(self, [face]))
-            held = dolfinx.fem.Constant(mesh, np.float64(value))
-            conditions.append(dolfinx.fem.dirichletbc(held, dofs, space))
-        trial, test = ufl.TrialFunction(space), ufl.TestFunction(space)
-        solve_positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx, None, psi, conditions)
+        dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
+        psi = harmonic(mesh, degree, dx, *(facets_of(self, [face]) for face in ("inlet", "outlet")))
         slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(mesh, np.float64(1.0))
         parts = [float(np.real(dolfinx.fem.assemble_scalar(jit.form(value * dx)))) for value in (one, slope)]
         volume, total = over_ranks(self.comm, np.array(parts), MPI.SUM)
@@ -108,30 +103,47 @@ class MeshDomain(Domain):
 def shared(read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm) -> MeshDomain:
     """What rank 0 reads, on all ranks. Collective."""
     found = agreed(comm, lambda: read() if comm.rank == 0 else None)
-    arrays = None if found is None else _arrays(*found)
-    extent = comm.bcast(arrays and float(np.ptp(arrays.points, axis=0).max()))
-    domain = share_mesh(arrays, "mesh", {"extent": extent}, comm)
-    boundary = None if found is None else found[1]
-    parts, volume = comm.bcast(boundary and (tuple(boundary.faces), boundary.volume))
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as in `domain`
+    told = None
+    if found is not None:
+        file, boundary, regions = found
+        extent = float(np.ptp(file.points, axis=0).max())
+        told = (
+            *(file.kind, file.degree, file.cells.shape[1], extent, regions),
+            *(boundary.facets, tuple(boundary.faces), boundary.volume, tuple(rims(file, boundary, "inner"))),
+        )
+    kind, degree, nodes, extent, regions, facets, parts, volume, lines = comm.bcast(told)
+    symbolic = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
+    cells = np.empty((0, nodes), dtype=np.int64) if found is None else file.cells[:, node_order(file)]
+    points = np.empty((0, 3)) if found is None else file.points
+    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
+    faces = {name: number for number, name in enumerate(dict.fromkeys(part.name for part in parts), start=1)}
+    values = np.repeat([faces[part.name] for part in parts], [len(part.facets) for part in parts])
+    tags = _tags_of_facets(mesh, np.sort(facets[np.concatenate([part.facets for part in parts])], axis=1), values)
+    domain = MeshDomain(
+        mesh, tags, faces, "mesh", {"extent": extent}, regions, np.empty(0, np.int32), parts, {}, lines, volume
+    )
     touched = {}
-    for name in domain.faces:
-        values = None
-        if boundary is not None:
-            values = np.full(domain.number_of_elements, -1, dtype=np.int64)
-            for number, part in enumerate(boundary.faces):
+    for name in faces:
+        numbers = None
+        if found is not None:
+            numbers = np.full(len(cells), -1, dtype=np.int64)
+            for number, part in enumerate(parts):
                 if part.name == name:
-                    values[boundary.cell[part.facets]] = number
-        touched[name] = domain.scatter_elements(values)
-    lines = () if found is None else tuple(rims(found[0], found[1], "inner"))
-    fields = domain.mesh, domain.facet_tags, domain.faces, domain.shape, domain.dimensions, domain.regions
-    return MeshDomain(*fields, domain.element_region, parts, touched, lines, volume)
+                    numbers[boundary.cell[part.facets]] = number
+        touched[name] = domain.scatter_elements(numbers)
+    own = domain.scatter_elements(None if found is None else file.cell_groups.astype(np.int32))
+    return replace(domain, element_region=own, part_of_element=touched)
 
 
-def _arrays(file: MeshFile, boundary: Boundary, regions: dict[str, int]) -> MeshArrays:
-    names = list(dict.fromkeys(part.name for part in boundary.faces))
-    faces = {name: number for number, name in enumerate(names, start=1)}
-    rows = [part.facets for part in boundary.faces]
-    values = [np.full(len(part.facets), faces[part.name]) for part in boundary.faces]
-    cells = file.cells[:, node_order(file)]
-    tagged = boundary.facets[np.concatenate(rows)], np.concatenate(values)
-    return MeshArrays(file.kind, file.degree, file.points, cells, *tagged, file.cell_groups, faces, regions)
+def _tags_of_facets(mesh: Any, corners: Integers, values: Integers) -> Any:
+    """Tags of the facets of the boundary with these corners, as rank 0 numbered them, each row ascending."""
+    dimension = mesh.topology.dim - 1
+    mesh.topology.create_connectivity(dimension, dimension + 1)
+    facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology)).astype(np.int32)
+    listed: Any = corners.tolist()
+    wanted = dict(zip(map(tuple, listed), values.astype(int), strict=True))
+    nodes = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[corners_of(mesh, facets)]
+    rows: Any = np.sort(nodes, axis=1).tolist()
+    found = np.array([wanted.get(tuple(row), 0) for row in rows], dtype=np.int32)
+    return dolfinx.mesh.meshtags(mesh, dimension, facets[found > 0], found[found > 0])

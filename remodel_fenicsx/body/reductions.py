@@ -57,17 +57,22 @@ def revolved(points: Array, quadrilaterals: Corners) -> Body:
 def mirrored_twice(points: Array, elements: Corners) -> Body:
     """The quarter x > 0, y > 0 and its images in the planes x = 0 and y = 0; nodes on the planes are shared."""
     signs = np.array([(1.0, 1.0, 1.0), (-1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, 1.0)])
-    copies = (signs[:, None] * points).reshape(-1, 3)
-    places = np.rint(copies / (1e-7 * np.abs(points).max())).astype(np.int64)
-    _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
     every = (np.arange(4)[:, None, None] * len(points) + elements).reshape(-1, elements.shape[1])
-    return copies[first], _oriented(copies[first], np.ravel(number)[every])
+    points, elements = _shared((signs[:, None] * points).reshape(-1, 3), every)
+    return points, _oriented(points, elements)
 
 
-# corners of one side and of the side across from it, for each of three directions, and the order of the mirror image
+def _shared(points: Array, elements: Corners) -> Body:
+    """Nodes at one place become one."""
+    places = np.rint(points / (1e-7 * np.abs(points).max())).astype(np.int64)
+    _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    return points[first], np.ravel(number)[elements]
+
+
+# corners on the far (1) and near (-1) side in each of three directions, and the order of the mirror image
 _SIDES = {
-    8: (((0, 3, 4, 7), (1, 2, 5, 6)), ((0, 1, 4, 5), (2, 3, 6, 7)), ((0, 1, 2, 3), (4, 5, 6, 7))),
-    4: (((0,), (1,)), ((0,), (2,)), ((0,), (3,))),
+    8: ((-1, 1, 1, -1, -1, 1, 1, -1), (-1, -1, 1, 1, -1, -1, 1, 1), (-1, -1, -1, -1, 1, 1, 1, 1)),
+    4: ((-1, 1, 0, 0), (-1, 0, 1, 0), (-1, 0, 0, 1)),
 }
 _MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}
 
@@ -75,8 +80,7 @@ _MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}
 def _oriented(points: Array, elements: Corners) -> Corners:
     """The same hexahedra or tetrahedra, all of positive volume as VTK has them."""
     size = elements.shape[1]
-    along = [points[elements[:, b]].mean(axis=1) - points[elements[:, a]].mean(axis=1) for a, b in _SIDES[size]]
-    is_mirrored = np.linalg.det(np.stack(along, axis=1)) < 0
+    is_mirrored = np.linalg.det(np.array(_SIDES[size], dtype=np.float64) @ points[elements]) < 0
     return np.where(is_mirrored[:, None], elements[:, _MIRRORED[size]], elements)
 
 
@@ -86,10 +90,7 @@ def divided_along(points: Array, hexahedra: Corners) -> Body:
     share = np.linspace(0.0, 1.0, LONG + 1)[:, None, None, None]
     levels = (1.0 - share) * low + share * high  # (levels, elements, 4, 3)
     nodes = np.arange((LONG + 1) * len(hexahedra) * 4).reshape(LONG + 1, -1, 4)
-    corners = np.concatenate([nodes[:-1], nodes[1:]], axis=-1).reshape(-1, 8)
-    places = np.rint(levels.reshape(-1, 3) / (1e-7 * np.abs(points).max())).astype(np.int64)
-    _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
-    return levels.reshape(-1, 3)[first], np.ravel(number)[corners]
+    return _shared(levels.reshape(-1, 3), np.concatenate([nodes[:-1], nodes[1:]], axis=-1).reshape(-1, 8))
 
 
 def box(*sides: float) -> Body:

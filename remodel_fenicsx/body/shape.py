@@ -14,16 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, create_model
 
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.reductions import (
-    Body,
-    Reduction,
-    Strut,
-    homogeneous,
-    known_loads,
-    same_cells,
-    symmetric_law,
-    unturned,
-)
+from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.settings import TURNOVER_POWER, Load, Mesh, Region, Support, faces_of, in_region
@@ -114,14 +105,9 @@ def profile_weights(depth: Array) -> Array:
     )
 
 
-def _profile_value(number: int, measurement: Any) -> float:
-    return float(measurement.tool_of_step("angle profile", lambda: _profile(measurement))[number])
-
-
-def _profile(measurement: Any) -> Array:
-    quadrature, local_axes = measurement.quadrature, measurement.state.cells.local_axes
-    hats = measurement.tool("hats", lambda: profile_weights(local_axes.depth))
-    return np.array([quadrature.mean_of_known(measurement.fibre_angle, hats[..., k]) for k in range(PROFILE_PLACES)])
+def _profile(number: int, m: Any) -> float:
+    hats = m.tool("hats", lambda: profile_weights(m.state.cells.local_axes.depth))
+    return float(m.quadrature.mean_of_known(m.fibre_angle, hats[..., number]))
 
 
 _PROFILE_COLUMNS = tuple(
@@ -130,7 +116,7 @@ _PROFILE_COLUMNS = tuple(
         "degrees",
         f"mean reference fibre angle near {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, or "
         "along z in a cube or tendon; the weight is a hat function as wide as a quarter of the way",
-        partial(_profile_value, number),
+        partial(_profile, number),
         by_case=False,
     )
     for number, name in enumerate(PROFILE)
@@ -520,7 +506,7 @@ class Shape(_Is):  # type: ignore[misc]
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
     face_names: ClassVar[tuple[str, ...]] = ()
-    reductions: ClassVar[dict[str, Reduction]] = {}
+    reductions: ClassVar[dict[str, reduced.Reduction]] = {}
     buckles: ClassVar[bool] = True
     ends: ClassVar[dict[str, End]] = {"free": End(lambda shape, loading: shape.hold(loading))}
     depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
@@ -563,7 +549,7 @@ class Shape(_Is):  # type: ignore[misc]
         """Ratios of lengths, which tell numbers in different units: key, words, ratio, decades where bodies have it."""
         return ()
 
-    def strut(self, ends: str) -> Strut | None:
+    def strut(self, ends: str) -> reduced.Strut | None:
         """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""
         return None
 
@@ -924,8 +910,8 @@ def cauchy_columns(*names: str) -> tuple[Column, ...]:
 
 
 def homogeneous_bar(
-    bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]], whole: Callable[[Any], Body]
-) -> Reduction:
+    bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]], whole: Callable[[Any], reduced.Body]
+) -> reduced.Reduction:
     """The reduction "point" of a body between two faces across z, the same strain everywhere."""
 
     def build(scene: Any, comm: Any = None) -> Domain:
@@ -938,5 +924,7 @@ def homogeneous_bar(
         points = (1.0 - share) * np.array([length, 0.0, 0.0]) + share * np.array([length, 0.0, length])
         return lattice_domain(points, [1], degree, faces, shape.name, dimensions(shape), comm)
 
-    rules = (same_cells, symmetric_law, homogeneous, known_loads("point"))
-    return Reduction(build, lambda scene: 1, rules, unturned, lambda shape, points, corners: whole(shape))
+    rules = (reduced.same_cells, reduced.symmetric_law, reduced.homogeneous, reduced.known_loads("point"))
+    return reduced.Reduction(
+        build, lambda scene: 1, rules, reduced.unturned, lambda shape, points, corners: whole(shape)
+    )

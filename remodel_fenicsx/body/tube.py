@@ -14,26 +14,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.mesh_faces import add_support, warn_of_twist
-from remodel_fenicsx.body.reductions import (
-    Body,
-    Corners,
-    Reduction,
-    Strut,
-    about_z,
-    divided_along,
-    drawn_once,
-    extended,
-    free_ends,
-    known_loads,
-    mirrored,
-    mirrored_twice,
-    revolved,
-    round_about_z,
-    same_cells,
-    symmetric_law,
-    symmetric_planes,
-    unmeasured_cells,
-)
+from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.body.shape import Array, Column, End, LoadKind, check_lengths
 from remodel_fenicsx.body.wall import (
     AngleOf,
@@ -102,7 +83,7 @@ def build_quarter(scene: Any, comm: Any = None) -> Domain:
 
 def layers(scene: Any) -> int:
     """Elements of a quarter along z: one where nothing but u_z depends on z, which is linear in it."""
-    alike = free_ends(scene) is None and same_cells(scene) is None
+    alike = reduced.free_ends(scene) is None and reduced.same_cells(scene) is None
     return 1 if alike else PAPER[2] * scene.mesh.refinement
 
 
@@ -127,10 +108,10 @@ def _dimensions(shape: Any) -> dict[str, float]:
     return {name: float(getattr(shape, name)) for name in ("inner_radius", "outer_radius", "length")}
 
 
-def _in_layers(points: Array, elements: Corners) -> Body:
+def _in_layers(points: Array, elements: reduced.Corners) -> reduced.Body:
     """Hexahedra of a quarter as long as the body, which pictures show in layers; all others as they are."""
     as_long = np.isclose(np.ptp(points[elements, 2], axis=1), np.ptp(points[:, 2])).all()
-    return divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
+    return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
 
 
 def springs_across(scene: Any) -> str | None:
@@ -143,7 +124,7 @@ def springs_across(scene: Any) -> str | None:
 
 def mirrored_draws(scene: Any) -> str | None:
     """Random cells of the quarter stand for those of the whole tube in the mean alone, and nearly."""
-    if drawn_once(scene) is None:
+    if reduced.drawn_once(scene) is None:
         return None
     return (
         "random cells are drawn for a quarter, and the other three mirror them: means over seeds are nearly those of "
@@ -151,28 +132,34 @@ def mirrored_draws(scene: Any) -> str | None:
     )
 
 
-_EVERYWHERE = (same_cells, symmetric_law)
+_EVERYWHERE = (reduced.same_cells, reduced.symmetric_law)
 REDUCTIONS = {
-    "radial": Reduction(
+    "radial": reduced.Reduction(
         build_ray,
         lambda scene: PAPER[1] * scene.mesh.refinement,
-        (*_EVERYWHERE, round_about_z, free_ends, springs_across, known_loads("radial")),
-        about_z,
-        lambda shape, points, lines: revolved(*extended(points, lines, shape.length)),
+        (*_EVERYWHERE, reduced.round_about_z, reduced.free_ends, springs_across, reduced.known_loads("radial")),
+        reduced.about_z,
+        lambda shape, points, lines: reduced.revolved(*reduced.extended(points, lines, shape.length)),
     ),
-    "axisymmetric": Reduction(
+    "axisymmetric": reduced.Reduction(
         build_half_plane,
         lambda scene: PAPER[1] * PAPER[2] * scene.mesh.refinement**2,
-        (*_EVERYWHERE, round_about_z, known_loads("axisymmetric")),
-        about_z,
-        lambda shape, points, quadrilaterals: revolved(points, quadrilaterals),
+        (*_EVERYWHERE, reduced.round_about_z, reduced.known_loads("axisymmetric")),
+        reduced.about_z,
+        lambda shape, points, quadrilaterals: reduced.revolved(points, quadrilaterals),
     ),
-    "sector": Reduction(
+    "sector": reduced.Reduction(
         build_quarter,
         lambda scene: PAPER[0] * PAPER[1] * scene.mesh.refinement**2 * layers(scene) // 4,
-        (unmeasured_cells, symmetric_law, symmetric_planes, springs_across, known_loads("sector")),
-        mirrored,
-        lambda shape, points, elements: mirrored_twice(*_in_layers(points, elements)),
+        (
+            reduced.unmeasured_cells,
+            reduced.symmetric_law,
+            reduced.symmetric_planes,
+            springs_across,
+            reduced.known_loads("sector"),
+        ),
+        reduced.mirrored,
+        lambda shape, points, elements: reduced.mirrored_twice(*_in_layers(points, elements)),
         in_the_mean=(mirrored_draws,),
     ),
 }
@@ -347,7 +334,7 @@ class Tube(RoundWall):
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
     number_of_elements: ClassVar[int] = 1536
     face_names: ClassVar[tuple[str, ...]] = ("bottom", "top", "inner", "outer")
-    reductions: ClassVar[dict[str, Reduction]] = REDUCTIONS
+    reductions: ClassVar[dict[str, reduced.Reduction]] = REDUCTIONS
     ends: ClassVar[dict[str, End]] = {
         "free": End(lambda shape, loading: shape.hold(loading)),
         "clamped": End(lambda shape, loading: shape.clamp(loading)),
@@ -452,14 +439,14 @@ class Tube(RoundWall):
             ("length", "length / outer_radius", self.length / outer, (-2, 3)),
         )
 
-    def strut(self, ends: str) -> Strut:
+    def strut(self, ends: str) -> reduced.Strut:
         """Its ends keep their planes; one of them moves sideways unless they are clamped."""
 
         def squared_distances(places: Array) -> Array:
             return np.asarray(np.square(places[:, :2]).sum(axis=1) / 2, dtype=np.float64)
 
         radii, factor = (self.inner_radius, self.outer_radius), 0.5 if ends == "clamped" else 1.0
-        return Strut(self.length, factor, about_z, squared_distances, radii, capped=ends == "closed")
+        return reduced.Strut(self.length, factor, reduced.about_z, squared_distances, radii, capped=ends == "closed")
 
     def depth(self, coordinates: Array) -> Array:
         """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""

@@ -21,10 +21,9 @@ from remodel_fenicsx.model import implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.implicit import StepOfCells
-from remodel_fenicsx.model.laws import relaxed
+from remodel_fenicsx.model.laws import TurnoverRule, relaxed
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
 from remodel_fenicsx.model.tensors import det
-from remodel_fenicsx.model.turnover import TurnoverRule
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import cached_property
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -63,7 +64,7 @@ class RemodelingPass:
         self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
         self.parameters = Parameters(self.tissue, self.quadrature)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
-        self._set_kappa(settings.kappa if kappa is None else kappa)
+        self.set_kappa(settings.kappa if kappa is None else kappa)
         if self.fastest == 0.0 and self.law.asks_kappa:  # cells that never move need no pass
             self.law = LAWS["none"]
         if not self.law.remodels:
@@ -87,7 +88,8 @@ class RemodelingPass:
         if self.turnover is not None:
             self.turnover.weights = self.weights
 
-    def _set_kappa(self, kappa: Any) -> None:
+    def set_kappa(self, kappa: Any) -> None:
+        """A number, or a DG0 Function."""
         self.kappa: Any = kappa
         self.slowest = self.fastest = kappa
         if isinstance(kappa, Real):
@@ -218,10 +220,13 @@ class RemodelingPass:
         assert target is not None
         if target is not tensor_target or self.settings.has_set_point:  # C knows the paper's alone
             return target(drive)
+        return target(drive) if self._tensor_kernels is None else self._tensor_kernels.target(drive)
+
+    @cached_property
+    def _tensor_kernels(self) -> Any:
         from remodel_fenicsx.kernels.tensor import tensor_kernels
 
-        kernels = tensor_kernels(self.state.comm)
-        return target(drive) if kernels is None else kernels.target(drive)
+        return tensor_kernels(self.state.comm)
 
     def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
         """Of all points in one row: those without tension, or with hardly any beside compression. Cells there stay."""

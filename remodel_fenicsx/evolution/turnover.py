@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
-from remodel_fenicsx.model.turnover import TurnoverRates, rates
+from remodel_fenicsx.model.laws import TurnoverRates, turnover_rates
 from remodel_fenicsx.schema.settings import Turnover
 from remodel_fenicsx.state import Earlier, Numbers, Parameters, State, on_mesh
 
@@ -138,7 +138,7 @@ class TurnoverPass:
         cells = state.cells if present else state.equilibrium_cells
         squared = cells.kernels.squared_length(state.elastic_gradient(), cells.point_cells)
         given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
-        return rates(self._parameters.at_points(), np.sqrt(squared), *given)
+        return turnover_rates(self._parameters.at_points(), np.sqrt(squared), *given)
 
     def power(self) -> float:
         """Stored energy per time that turnover releases in the solved state, at its F and cells."""

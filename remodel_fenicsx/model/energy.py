@@ -368,7 +368,7 @@ class Tissue:
     repulsion
         Form of the repulsive energy (`REPULSIONS`).
     content, natural_length
-        m, density of the chains, and rho, their natural length, each over those at the start (`model.turnover`):
+        m, density of the chains, and rho, their natural length, each over those at the start (`model.laws`):
         W_net = m c (w(r/rho) - g(r0) M / 2). None where they stay 1.
 
     Examples

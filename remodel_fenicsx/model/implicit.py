@@ -14,8 +14,8 @@ from remodel_fenicsx.model import spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, Derivatives, Driver, FRAMES, Frame, carried_axes
 from remodel_fenicsx.model.energy import Matrix, REPULSIONS, Repulsion, Tissue
-from remodel_fenicsx.model.laws import Drive, LAWS, Law, Ranked, by_rank
-from remodel_fenicsx.model.turnover import TurnedOver, TurnoverRule, at_the_end
+from remodel_fenicsx.model.laws import Drive, LAWS, Law, Ranked, TurnedOver, TurnoverRule
+from remodel_fenicsx.model.laws import by_rank, turned_over_at_the_end
 
 
 # ---------------------------------------------------------------- the laws, for Newton's method
@@ -44,7 +44,7 @@ class StepOfCells(NamedTuple):
     def turned_over(self) -> Callable[[Tissue, Array], TurnedOver] | None:
         """Content and natural length at its end from the tissue and r there."""
         rule, duration = self.turnover, self.time_new - self.time_old
-        return None if rule is None else lambda tissue, length: at_the_end(rule, tissue, length, duration)
+        return None if rule is None else lambda tissue, length: turned_over_at_the_end(rule, tissue, length, duration)
 
     @property
     def is_spatial(self) -> bool:
@@ -429,7 +429,7 @@ def stress(
 # numbers:
 #     D(C, S(C, y)) - D = 0,    y = y(F, D)                                        (i1)
 # with six numbers y of the cells. With turnover, S has in it content and natural length at the end of the
-# step, which are functions of r(C, y) (`model.turnover.at_the_end`). A change of F at a solution, with indices for
+# step, which are functions of r(C, y) (`laws.turned_over_at_the_end`). A change of F at a solution, with indices for
 # derivatives, has
 #     (1 - D_S S_y y_D) dD = D_C dC + D_S dS|_D,    dS|_D = S_C dC + S_y y_F dF    (i2)
 #     dP = dF S + F dS,    dS = dS|_D + S_y y_D dD                                 (i3)

@@ -412,14 +412,8 @@ class Sight:
             first.append(f"{self.viewing.layers} of {count} layers, from the {scene.geometry.depth_in_words[1]}")
         if self.viewing.cut:
             first.append(CUT_IN_WORDS[self.viewing.cut])
-        found = ["; ".join(first)]
-        if self.whole.is_turned:
-            found.append(f"Solved with the kinematics {scene.model.kinematics!r}, shown as the whole body.")
-        if self.has_chains:
-            found.append("Black: the four chains of each element's mean cell, deformed, projected on its face.")
-        if not self.is_deformed:
-            found.append("Displacements were not recorded: this is the reference body.")
-        return found
+        chains = "Black: the four chains of each element's mean cell, deformed, projected on its face."
+        return ["; ".join(first), *self.whole.notes(self.is_deformed), *([chains] if self.has_chains else [])]
 
 
 if __name__ == "__main__":

@@ -127,7 +127,8 @@ class Leaf:
         row = PANEL_TITLE + self.panel[1] + loads + 0.06
         self.height = HEAD + rows * row + FOOT + NOTE_LINE * len(notes) + EDGE
         self.figure = Figure(figsize=(self.width, self.height), dpi=dots)
-        self._head()
+        head = textwrap.shorten(sight.recording.scene.name, max(8, int(self.width / LETTER)), placeholder=" …")
+        self._write(self.width / 2, self.height - 0.22, head, 10, fontweight="bold")
         margin = (self.width - columns * cell) / 2
         self.panels = [
             self._panel(image, margin + (number % columns + 0.5) * cell, HEAD + number // columns * row)
@@ -135,16 +136,25 @@ class Leaf:
         ]
         for number, time in enumerate(times):
             self._label(number, time)
-        self._foot(view, NOTE_LINE * len(notes) + EDGE)
+        bottom = EDGE + NOTE_LINE * len(notes)
+        self._foot(view, bottom)
         for number, note in enumerate(notes):
-            y = (EDGE + NOTE_LINE * (len(notes) - number - 0.8)) / self.height
-            self.figure.text(0.5, y, note, fontsize=6.5, color="0.35", ha="center", parse_math=False)
-        self.clock = self._clock(NOTE_LINE * len(notes) + EDGE + FOOT) if has_clock else None
+            self._write(self.width / 2, bottom - NOTE_LINE * (number + 0.8), note, 6.5, color="0.35")
+        self.clock: Line2D | None = None
+        if has_clock:
+            start, end, y = 0.24 * self.width, 0.80 * self.width, bottom + FOOT
+            self._line((start, end), (y, y), "0.85", 1.5)
+            self.clock = self._line((start, start), (y, y), "0.2", 1.5)
 
-    def _head(self) -> None:
-        title = textwrap.shorten(self.sight.recording.scene.name, max(8, int(self.width / LETTER)), placeholder=" …")
-        self.figure.text(0.5, 1 - 0.22 / self.height, title, fontsize=10, fontweight="bold", ha="center",
-                         parse_math=False)  # fmt: skip
+    def _write(self, x: float, y: float, text: str, size: float, **how: Any) -> Text:
+        """Letters with their middle at a place in inches from the left and from the bottom."""
+        how = {"ha": "center", "parse_math": False, **how}
+        return self.figure.text(x / self.width, y / self.height, text, fontsize=size, **how)
+
+    def _line(self, x: Sequence[float], y: Sequence[float], colour: str, wide: float, **how: Any) -> Line2D:
+        line = Line2D(np.divide(x, self.width), np.divide(y, self.height), color=colour, lw=wide, **how)
+        self.figure.add_artist(line)
+        return line
 
     def _panel(self, image: Pixels, middle: float, top: float) -> tuple[AxesImage, Text, Text]:
         """A body with its middle at, and its title below, places in inches from the left and from the top."""
@@ -154,10 +164,8 @@ class Leaf:
         axes: Axes = self.figure.add_axes(place)
         axes.set_axis_off()
         shown = axes.imshow(image, interpolation="nearest", aspect="auto")
-        title = self.figure.text(middle / self.width, (bottom + tall + 0.06) / self.height, "", fontsize=9, ha="center")
-        loads = self.figure.text(middle / self.width, (bottom - 0.03) / self.height, "", fontsize=7.5, color="0.25",
-                                 ha="center", va="top", parse_math=False)  # fmt: skip
-        return shown, title, loads
+        title = self._write(middle, bottom + tall + 0.06, "", 9, parse_math=True)
+        return shown, title, self._write(middle, bottom - 0.03, "", 7.5, color="0.25", va="top")
 
     def _label(self, number: int, time: float) -> None:
         _, title, loads = self.panels[number]
@@ -166,35 +174,24 @@ class Leaf:
 
     def _foot(self, view: View, bottom: float) -> None:
         """Scale of the angles in the middle, a length to its left, the axes to its right."""
-        along, across = self.sight.recording.scene.geometry.angle_in_words
+        geometry = self.sight.recording.scene.geometry
+        along, across = geometry.angle_in_words
         place = (0.24, (bottom + 0.42) / self.height, 0.56, 0.1 / self.height)
         angle_scale(self.figure, place, f"angle of the collagen, deformed: 0° {along}, 90° {across}")
         inches = view.pixels[1] / self.figure.dpi / view.height  # of a unit of length
-        length = _round_length(0.13 * self.width / inches)
-        start, y = 0.035, (bottom + 0.47) / self.height
-        end = start + length * inches / self.width
-        self.figure.add_artist(Line2D((start, end), (y, y), color="0.2", lw=1.6, solid_capstyle="butt"))
-        unit = self.sight.recording.scene.geometry.length_unit
-        label = f"{length:g} {unit}" if unit else f"length {length:g}"
-        self.figure.text((start + end) / 2, y - 0.06 / self.height, label, fontsize=7.5, ha="center", va="top")
-        self._triad(0.895 * self.width, bottom + 0.38)
-
-    def _triad(self, x: float, y: float) -> None:
-        right, up, _ = self.sight.axes()
-        for name, across, along in zip("xyz", right, up, strict=True):
-            ends = (x, x + TRIAD * across), (y, y + TRIAD * along)
-            line = np.array(ends) / np.array([[self.width], [self.height]])
-            self.figure.add_artist(Line2D(*line, color="0.2", lw=1.0))
-            if math.hypot(across, along) > 0.15:
-                tip = (x + 1.55 * TRIAD * across) / self.width, (y + 1.55 * TRIAD * along) / self.height
-                self.figure.text(*tip, name, fontsize=7.5, ha="center", va="center")
-
-    def _clock(self, bottom: float) -> Line2D:
-        y = bottom / self.height
-        self.figure.add_artist(Line2D((0.24, 0.80), (y, y), color="0.85", lw=1.5))
-        line = Line2D((0.24, 0.24), (y, y), color="0.2", lw=1.5)
-        self.figure.add_artist(line)
-        return line
+        most = 0.13 * self.width / inches
+        power = 10.0 ** math.floor(math.log10(most))
+        length = power * next(factor for factor in (5, 2, 1) if factor * power <= most * (1 + 1e-9))
+        start, y = 0.035 * self.width, bottom + 0.47
+        end = start + length * inches
+        self._line((start, end), (y, y), "0.2", 1.6, solid_capstyle="butt")
+        label = f"{length:g} {geometry.length_unit}" if geometry.length_unit else f"length {length:g}"
+        self._write((start + end) / 2, y - 0.06, label, 7.5, va="top")
+        x, y, (right, up, _) = 0.895 * self.width, bottom + 0.38, TRIAD * self.sight.axes()
+        for name, wide, tall in zip("xyz", right, up, strict=True):
+            self._line((x, x + wide), (y, y + tall), "0.2", 1.0)
+            if math.hypot(wide, tall) > 0.15 * TRIAD:
+                self._write(x + 1.55 * wide, y + 1.55 * tall, name, 7.5, va="center")
 
     def show(self, time: float, image: Pixels, share: float) -> None:
         """Another time in the first panel; `share` is how far it is through the animation."""
@@ -202,12 +199,6 @@ class Leaf:
         self._label(0, time)
         if self.clock is not None:
             self.clock.set_xdata((0.24, 0.24 + 0.56 * share))
-
-
-def _round_length(most: float) -> float:
-    """The largest of 1, 2, 5, 10, ... that is not longer."""
-    power = 10.0 ** math.floor(math.log10(most))
-    return power * next(factor for factor in (5, 2, 1) if factor * power <= most * (1 + 1e-9))
 
 
 # ---------------------------------------------------------------- kinds of animations

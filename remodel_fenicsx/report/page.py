@@ -31,7 +31,6 @@ from remodel_fenicsx.results.recording import (
     ANGLE_COLOURS,
     CHAIN_LOOK,
     HISTORY,
-    HistoryColumns,
     LARGEST_HISTORY,
     RecordedRun,
     SCENE,
@@ -266,31 +265,6 @@ class Warned:
     time: str
 
 
-@dataclass(frozen=True)
-class Story:
-    """How a run went."""
-
-    state: str
-    words: str
-    history: HistoryColumns
-    began: str
-    ended: str
-    ranks: str
-    warnings: list[Warned]
-    unloaded: str = ""
-
-    @classmethod
-    def of(cls, recording: RecordedRun) -> Story:
-        """The story of a run's folder."""
-        history = recording.history
-        lines = log_entries(recording.path)
-        stamps = [stamp for stamp, _, _ in lines] or [""]
-        ranks = [found[1] for _, _, text in lines if (found := _RANKS.match(text))] or [""]
-        unloaded = [text for _, _, text in lines if text.startswith(SAID_UNLOADED)] or [""]
-        state, words = _story(recording, history)
-        return cls(state, words, history, stamps[0], stamps[-1], ranks[-1], _warnings(lines), unloaded[-1])
-
-
 def _warnings(lines: list[tuple[str, str, str]]) -> list[Warned]:
     found: dict[str, Warned] = {}
     time = ""
@@ -305,24 +279,10 @@ def _warnings(lines: list[tuple[str, str, str]]) -> list[Warned]:
     return list(found.values())
 
 
-def _story(recording: RecordedRun, history: HistoryColumns) -> tuple[str, str]:
-    """A word, and why or where."""
-    scene, times = recording.scene, history["time"]
-    state, reason = state_of(recording)
-    if state in ("finished", "failed"):
-        return state, reason
-    at = f"at t = {float(times[-1]) if len(times) else 0.0:g} of {scene.last_time:g}"
-    if state == "running":
-        of = f" of {scene.time.number_of_steps}" if scene.time.tolerance is None else ""
-        return state, f"step {max(0, len(times) - 1)}{of}, {at}"
-    return state, f"{at}: {reason}" if reason else f"{at}, without a word: it was killed"
-
-
 ASSETS = Path(__file__).with_name("assets")
 MOST_TILES = 8
 MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
 LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
-LAST = ("min_jacobian", "newton_iterations", "linear_iterations", "substeps", "seconds", "processor_seconds")
 
 
 @dataclass(frozen=True)
@@ -330,13 +290,35 @@ class ReportedRun:
     """All that a part may ask of a run."""
 
     recording: RecordedRun
-    story: Story
-    body: ShownBody | None
+    body: ShownBody | None = None
+
+    @cached_property
+    def log(self) -> list[tuple[str, str, str]]:
+        """Entries of run.log."""
+        return log_entries(self.recording.path)
+
+    @cached_property
+    def warnings(self) -> list[Warned]:
+        """Those of run.log."""
+        return _warnings(self.log)
+
+    @cached_property
+    def state(self) -> tuple[str, str]:
+        """A word, and why or where."""
+        scene, times = self.recording.scene, self.recording.history["time"]
+        state, reason = state_of(self.recording)
+        if state in ("finished", "failed"):
+            return state, reason
+        at = f"at t = {float(times[-1]) if len(times) else 0.0:g} of {scene.last_time:g}"
+        if state == "running":
+            of = f" of {scene.time.number_of_steps}" if scene.time.tolerance is None else ""
+            return state, f"step {max(0, len(times) - 1)}{of}, {at}"
+        return state, f"{at}: {reason}" if reason else f"{at}, without a word: it was killed"
 
     @cached_property
     def columns(self) -> list[Column]:
         """Of the history, those of the shape first; none without a number."""
-        scene, history = self.recording.scene, self.story.history
+        scene, history = self.recording.scene, self.recording.history
         known = {column.name: column for column in scene.columns()}
         own = {
             column.name
@@ -345,7 +327,7 @@ class ReportedRun:
         names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
         if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
             names.remove("substeps")
-        names.sort(key=lambda name: (name not in own, name in LAST))
+        names.sort(key=lambda name: name not in own)
         return [known.get(name) or Column(name, "", "", lambda m: np.nan) for name in names]
 
     def unit(self, column: Column) -> str:
@@ -359,19 +341,19 @@ Part = Callable[[ReportedRun], Card | None]
 # ---------------------------------------------------------------- top
 def head(run: ReportedRun) -> Card:
     """Name, how the run ended, when."""
-    story, name = run.story, run.recording.scene.name
-    dates = " to ".join(dict.fromkeys(filter(None, (story.began, story.ended))))
-    reason = f'<p class="reason">{escape(story.words)}</p>' if story.words else ""
+    (state, why), name = run.state, run.recording.scene.name
+    dates = " to ".join(dict.fromkeys(stamp for stamp, _, _ in (*run.log[:1], *run.log[-1:])))
+    reason = f'<p class="reason">{escape(why)}</p>' if why else ""
     html = (
-        f'<header class="whole"><h1>{escape(name)}</h1><span class="badge {story.state}">{story.state}</span>'
+        f'<header class="whole"><h1>{escape(name)}</h1><span class="badge {state}">{state}</span>'
         f'<span class="note">{escape(dates)}</span>{reason}</header>'
     )
-    return Card("head", html, {"name": name, "state": story.state})
+    return Card("head", html, {"name": name, "state": state})
 
 
 def tiles(run: ReportedRun) -> Card | None:
     """The shape's own columns and r/L: the last value and the first."""
-    history = run.story.history
+    history = run.recording.history
     found: list[str] = []
     own = [column.name for column in run.recording.scene.geometry.columns]
     for column in run.columns:
@@ -405,7 +387,10 @@ def view(run: ReportedRun) -> Card | None:
     }  # fmt: skip
     html = (ASSETS / "view.html").read_text(encoding="utf-8")
     html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.whole.depth) - 1))
-    html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in _notes(run, body)))
+    notes, kept, all_times = body.whole.notes(body.is_deformed), len(body.times), len(run.recording.times)
+    if kept < all_times:
+        notes.append(f"{kept} of {all_times} recorded times are kept here, to save room.")
+    html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in notes))
     return Card("view", html, data, arrays)
 
 
@@ -420,25 +405,13 @@ def _ways_to_show(arrays: Mapping[str, Array]) -> str:
     return "".join(f'<option value="{name}">{text}</option>' for name, text in there.items())
 
 
-def _notes(run: ReportedRun, body: ShownBody) -> list[str]:
-    """What is to be known of the view."""
-    found = []
-    if body.whole.is_turned:
-        found.append(f"Solved with the kinematics {run.recording.scene.model.kinematics!r}, shown as the whole body.")
-    if not body.is_deformed:
-        found.append("Displacements were not recorded: this is the reference body.")
-    if len(body.times) < len(run.recording.times):
-        found.append(f"{len(body.times)} of {len(run.recording.times)} recorded times are kept here, to save room.")
-    return found
-
-
 def angles(run: ReportedRun) -> Card | None:
     """The fibre angle through the body, and where the collagen points."""
     body, shape, regions = run.body, run.recording.scene.geometry, run.recording.scene.regions
     if body is None or body.angle is None:
         return None
     through, start, end = shape.depth_in_words
-    if not np.isfinite(run.story.history.get("lumen_volume", np.zeros(1))).any():
+    if not np.isfinite(run.recording.history.get("lumen_volume", np.zeros(1))).any():
         through = "through the body"  # its inner face encloses nothing
     along, across = shape.angle_in_words
     legend = '<p class="note">Red: now, mean and 10 to 90 % of the volume. Grey: other times.</p>'
@@ -453,7 +426,7 @@ def angles(run: ReportedRun) -> Card | None:
 
 def stress(run: ReportedRun) -> Card | None:
     """Stress through the wall, and what the law of Laplace says of its mean around."""
-    body, history = run.body, run.story.history
+    body, history = run.body, run.history
     if body is None or body.wall_stress is None or len(body.whole.depth) < 2:
         return None
     through, start, end = run.recording.scene.geometry.depth_in_words
@@ -476,7 +449,7 @@ def stress(run: ReportedRun) -> Card | None:
 # ---------------------------------------------------------------- curves
 def curves(run: ReportedRun) -> Card | None:
     """The history, columns of one kind together."""
-    history = run.story.history
+    history = run.recording.history
     if len(history["time"]) < 2 or not run.columns:
         return None
     rows = np.unique(np.linspace(0, len(history["time"]) - 1, MOST_ROWS).round().astype(int))
@@ -523,15 +496,18 @@ def _finite(value: float) -> float | None:
 # ---------------------------------------------------------------- in words
 def facts(run: ReportedRun) -> Card:
     """What was run."""
-    scene, story = run.recording.scene, run.story
+    scene, history = run.recording.scene, run.recording.history
     kinematics = KINEMATICS[scene.model.kinematics]
     count = f"{len(run.recording.elements):,} " if run.body else ""
-    seconds = story.history.get("seconds", np.zeros(0))
+    seconds = history.get("seconds", np.zeros(0))
     solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
-    steps = f"{max(0, len(story.history['time']) - 1)}{'' if scene.time.chooses else ' of'}"
-    ranks = f", {story.ranks} ranks" if story.ranks not in ("", "1") else ""
+    steps = f"{max(0, len(history['time']) - 1)}{'' if scene.time.chooses else ' of'}"
+    said = [text for _, _, text in run.log]
+    ranks = [found[1] for text in said if (found := _RANKS.match(text))][-1:]
+    on_ranks = "".join(f", {number} ranks" for number in ranks if number != "1")
+    unloaded = [text for text in said if text.startswith(SAID_UNLOADED)][-1:]
     rows = [
-        ("Body", "; ".join(filter(None, (_keys(scene.geometry, "file", "sha256"), story.unloaded)))),
+        ("Body", "; ".join([_keys(scene.geometry, "file", "sha256"), *unloaded])),
         ("Free of stress", "" if scene.natural.is_of_the_mesh else _keys(scene.natural)),
         ("Mesh", f"{count}{kinematics.element(scene.mesh.element)}: {_keys(scene.mesh)}"),
         ("Kinematics", f"{scene.model.kinematics}: {kinematics.meaning}"),
@@ -543,7 +519,7 @@ def facts(run: ReportedRun) -> Card:
         ("Material", scene.summary()),
         ("Remodeling", _keys(scene.remodeling, "turnover")),
         ("Turnover", _keys(scene.remodeling.turnover) if scene.remodeling.turnover.is_on else ""),
-        ("Time", f"{steps} {scene.time.in_words()}{solving}{ranks}"),
+        ("Time", f"{steps} {scene.time.in_words()}{solving}{on_ranks}"),
     ]
     return Card("facts", section("What was run", table(row for row in rows if row[1])))
 
@@ -564,7 +540,7 @@ def _as_text(value: Any) -> str:
 
 def warnings(run: ReportedRun) -> Card:
     """What the run warned of, and how to run it again."""
-    found = run.story.warnings
+    found = run.warnings
     items = "".join(
         f"<li>{escape(one.text)} "
         f'<span class="note">({"once" if one.count == 1 else f"{one.count} times"}'
@@ -652,13 +628,12 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None, size:
 
 def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     """The page as text; parameters and errors as of `write_report`."""
-    story = Story.of(recording)
     if not has_a_body(recording):
-        return page_with(cards(ReportedRun(recording, story, None)))
+        return page_with(cards(ReportedRun(recording)))
     whole, most = WholeBody(recording), _times_at_most(recording, size)
     for _ in range(TRIES):
-        body = ShownBody.of(whole, kept_times(story.history, recording.times, most))
-        found = cards(ReportedRun(recording, story, body))
+        body = ShownBody.of(whole, kept_times(recording.history, recording.times, most))
+        found = cards(ReportedRun(recording, body))
         page = page_with(found)
         if len(page) <= 1e6 * size or len(body.times) <= FEWEST_TIMES:
             break

@@ -91,6 +91,11 @@ class Fibres:
         """Of the elements."""
         return ELEMENTS[self.elements.shape[1]]
 
+    @property
+    def reduced(self) -> NDArray[np.int64]:
+        """The elements with those of their nodes that other programs take."""
+        return self.elements[:, : self.names.nodes]
+
 
 def export(folder: Path | str, kind: str, path: Path | None = None, time: float | None = None) -> Path:
     """Write the mean structure tensor of each element with its axes and dimensions into a new file."""
@@ -143,7 +148,7 @@ def _csv(path: Path, fibres: Fibres) -> None:
 
 
 def _febio(path: Path, fibres: Fibres) -> None:
-    nodes, elements = _used(fibres)
+    nodes, elements = np.unique(fibres.reduced), fibres.reduced
     axes = fibres.axes[:, :2].reshape(-1, 6)
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<febio_spec version="4.0">', "<Mesh>", '<Nodes name="nodes">']
     lines += _rows('<node id="{number}">{values}</node>', fibres.points[nodes], nodes + 1)
@@ -161,7 +166,7 @@ def _febio(path: Path, fibres: Fibres) -> None:
 
 
 def _abaqus(path: Path, fibres: Fibres) -> None:
-    nodes, elements = _used(fibres)
+    nodes, elements = np.unique(fibres.reduced), fibres.reduced
     lines = [
         "** mean cells of a run of remodel_fenicsx: local directions 1, 2 and 3 are the axes, longest first",
         "*NODE",
@@ -189,12 +194,6 @@ FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
     "abaqus": (".inp", _abaqus),
     "csv": (".csv", _csv),
 }
-
-
-def _used(fibres: Fibres) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes that the elements of other programs have, ascending, and those elements."""
-    elements = fibres.elements[:, : fibres.names.nodes]
-    return np.unique(elements), elements
 
 
 def _rows(pattern: str, values: NDArray[Any], numbers: Iterable[int] | None = None) -> list[str]:

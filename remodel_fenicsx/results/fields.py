@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,10 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.domain import Domain, dof_of_node
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.fem import compat, jit
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.axes import LocalAxes
@@ -75,37 +76,39 @@ class ElementFields:
     def __call__(self) -> dict[str, Array]:
         """By name, one row per local element."""
         values = self._values()
-        F = values[..., :9].reshape(*values.shape[:2], 3, 3)
-        elastic = self.state.elastic(F)
-        cells = self.state.cells
-        dimensions, axes = cells.dimension_values, cells.axis_values
-        mean, fibre_angle, wanted = self.quadrature.element_mean, self.shape.fibre_angle, set(self.names)
-        mean_of_known = self.quadrature.element_mean_of_known
-        found: dict[str, Array] = {}
-        if "deformation_gradient" in wanted:
-            found["deformation_gradient"] = mean(values[..., :9])
-        if self._stresses is not None:
-            found["cauchy_stress"] = mean(values[..., 9:18])
-        if wanted & {"cell_dimensions", *AXIS_FIELDS}:
-            found["cell_dimensions"], mean_axes = self.mean_cells()
-            found |= {name: mean_axes[:, i] for i, name in enumerate(AXIS_FIELDS)}
-        if "fibre_angle" in wanted:
-            found["fibre_angle"] = mean_of_known(fibre_angle(dimensions, axes, cells.local_axes.axes))
-        if UNLOADED in wanted:
-            unloaded_axes = self.state.elastic_axes(axes)
-            found[UNLOADED] = mean_of_known(fibre_angle(dimensions, unloaded_axes, cells.local_axes.axes))
-        if "fibre_angle_deformed" in wanted:
-            deformed_axes, local = self.state.elastic_axes(axes, F), cells.local_axes.deformed(F)
-            found["fibre_angle_deformed"] = mean_of_known(fibre_angle(dimensions, deformed_axes, local))
-        if "chain_extension" in wanted:
-            squared = cells.kernels.squared_length(elastic.reshape(-1, 3, 3), cells.point_cells).reshape(F.shape[:2])
-            found["chain_extension"] = np.max(np.sqrt(squared) / self._locking_length(), axis=1)
-        for name in TURNED_OVER:
-            if name in wanted and getattr(self.tissue, name) is not None:
-                found[name] = mean(self.quadrature.values(getattr(self.tissue, name), ()))
-        if REGION in wanted:
-            found[REGION] = self.state.loading.domain.element_region.astype(np.float64)
-        return {name: found[name] for name in OF_ELEMENTS if name in wanted and name in found}
+        state, local, mean = self.state, self.state.cells.local_axes, self.quadrature.element_mean
+        cells, F = state.cells, values[..., :9].reshape(*values.shape[:2], 3, 3)
+        axes, mean_cells = cells.axis_values, cache(self.mean_cells)
+
+        def angle(axes: Array, local: Array) -> Array:
+            found = self.shape.fibre_angle(cells.dimension_values, axes, local)
+            return self.quadrature.element_mean_of_known(found)
+
+        def mean_axis(i: int) -> Array:
+            return np.asarray(mean_cells()[1][:, i])
+
+        def mean_number(number: Any) -> Array:
+            return mean(self.quadrature.values(number, ()))
+
+        def extension() -> Array:
+            gradient = state.elastic(F).reshape(-1, 3, 3)
+            squared = cells.kernels.squared_length(gradient, cells.point_cells).reshape(F.shape[:2])
+            return np.asarray(np.max(np.sqrt(squared) / self._parameters.locking_length(), axis=1))
+
+        makers: dict[str, Callable[[], Array]] = {
+            "deformation_gradient": lambda: mean(values[..., :9]),
+            "cauchy_stress": lambda: mean(values[..., 9:18]),
+            "cell_dimensions": lambda: mean_cells()[0],
+            "fibre_angle": lambda: angle(axes, local.axes),
+            UNLOADED: lambda: angle(state.elastic_axes(axes), local.axes),
+            "fibre_angle_deformed": lambda: angle(state.elastic_axes(axes, F), local.deformed(F)),
+            "chain_extension": extension,
+            REGION: lambda: state.loading.domain.element_region.astype(np.float64),
+        }
+        makers |= {name: partial(mean_axis, i) for i, name in enumerate(AXIS_FIELDS)}
+        turned = {name: getattr(self.tissue, name) for name in TURNED_OVER}
+        makers |= {name: partial(mean_number, number) for name, number in turned.items() if number is not None}
+        return {name: makers[name]() for name in OF_ELEMENTS if name in self.names and name in makers}
 
     def _values(self) -> Array:
         """F, and Cauchy stress where it is wanted, row by row, (elements, points, 9 or 18)."""
@@ -122,9 +125,6 @@ class ElementFields:
             self.quadrature.element_mean(cells.structure_tensor()), cells.axis_values[:, 0]
         )
         return np.sqrt(np.maximum(squared, 0.0)), axes
-
-    def _locking_length(self) -> Array:
-        return self._parameters.locking_length()
 
 
 class Fields(Watcher, ClosedAtEnd):
@@ -263,18 +263,8 @@ class NodalGather:
 
     def __init__(self, domain: Domain, state: State):
         self.domain, self.state = domain, state
-        self._dof_of_node = dof_of_node(domain, state.kinematics.nodal_space(state.unknown))
+        self._dof_of_node = dof_of_node(domain.mesh, state.kinematics.nodal_space(state.unknown))
 
     def __call__(self) -> Array | None:
         values = self.state.kinematics.nodal_displacement(self.state.unknown)[self._dof_of_node]
         return self.domain.gather_nodes(values)
-
-
-def dof_of_node(domain: Domain, space: Any) -> NDArray[np.int64]:
-    """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
-    dofs = space.dofmap.list.reshape(-1)
-    nodes = compat.geometry_dofmap(domain.mesh).reshape(-1)
-    # the element and the geometry have the same degree: node k of an element is dof k of that element
-    found = np.zeros(len(domain.node_number), dtype=np.int64)
-    found[nodes] = dofs
-    return found

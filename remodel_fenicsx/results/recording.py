@@ -447,24 +447,19 @@ class RunLock(ClosedAtEnd):
     def __init__(self, folder: Path, ranks: int = 1):
         self._path = folder / LOCK
         folder.mkdir(parents=True, exist_ok=True)
-        self._descriptor = open_own(self._path, os.O_RDWR | os.O_CREAT)
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            while not self._is_at_its_place():  # the writer before has taken the file away meanwhile
-                os.close(self._descriptor)
-                self._descriptor = open_own(self._path, os.O_RDWR | os.O_CREAT)
+        while True:
+            self._descriptor = open_own(self._path, os.O_RDWR | os.O_CREAT)
+            try:
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(self._descriptor)
-            if isinstance(error, BlockingIOError):
+            except BlockingIOError:
+                os.close(self._descriptor)
                 raise FolderTaken(f"{folder}: {writer(folder)[0] or 'another process'} writes in it") from None
-            raise
+            if self._path.exists() and os.path.samestat(os.fstat(self._descriptor), os.stat(self._path)):
+                break
+            os.close(self._descriptor)  # the writer before has taken the file away meanwhile
         others = f" ({ranks} ranks)" if ranks > 1 else ""
         os.ftruncate(self._descriptor, 0)
         os.write(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}{others}\n".encode())
-
-    def _is_at_its_place(self) -> bool:
-        return self._path.exists() and os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
 
     def close(self) -> None:
         """Let others in."""

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.body.shape import Shape
@@ -39,6 +38,8 @@ class TurnedFields:
     def __init__(
         self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
     ):
+        from scipy.spatial import cKDTree  # a run that draws nothing needs none
+
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
         self.nodes = cKDTree(own_points).query(back)[1]
@@ -140,6 +141,12 @@ class WholeBody:
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
         self.layer, self.depth = _layers(self._depths(shape), self.elements)
+
+    def notes(self, is_deformed: bool) -> list[str]:
+        """What is to be known of pictures of it."""
+        turned = f"Solved with the kinematics {self.recording.scene.model.kinematics!r}, shown as the whole body."
+        reference = "Displacements were not recorded: this is the reference body."
+        return [*([turned] if self.is_turned else []), *([] if is_deformed else [reference])]
 
     def _depths(self, shape: Shape) -> Array:
         """Of the elements, (m,): as recorded, or by their places."""

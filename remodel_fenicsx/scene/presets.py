@@ -8,27 +8,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS, Chain
+from remodel_fenicsx.model.laws import COMPLEX_STEP
 from remodel_fenicsx.schema.settings import Cells, Material, Remodeling, STRESS_UNITS, in_region
 from remodel_fenicsx.schema.tables import fault, is_number, quoted
-from remodel_fenicsx.schema.toml import put
+from remodel_fenicsx.schema.toml import merged, put
 
 # ---------------------------------------------------------------- without a preset
 
 DEFAULT_LAW = "tensor"
-_METHODS: dict[str, dict[str, dict[str, Any]]] = {
-    DEFAULT_LAW: {"material": {"repulsion": "log"}, "remodeling": {"law": DEFAULT_LAW, "coupling": "extrapolated"}},
-}
 
 
 def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has."""
     remodeling = values.get("remodeling")
     law = remodeling.get("law", DEFAULT_LAW) if isinstance(remodeling, Mapping) else DEFAULT_LAW
-    return _METHODS.get(law, {}) if isinstance(law, str) else {}
+    if law != DEFAULT_LAW:
+        return {}
+    return {"material": {"repulsion": "log"}, "remodeling": {"law": DEFAULT_LAW, "coupling": "extrapolated"}}
 
 
 # ---------------------------------------------------------------- presets
@@ -108,29 +109,23 @@ _PAPER = {
 # Lengths in nm. r0 is the root mean square end-to-end length of the free chain,
 # sqrt(2 A_p L (1 - A_p/L (1 - e^(-L/A_p)))), and the density makes c g(r0) r0^2, the stress of the chains
 # at rest, that of the paper's tendon and artery.
-_MEASURED_COLLAGEN = {"chain_density": 9.0e20, "contour_length": 309.0, "persistence_length": 14.5}
-_FREE_CHAIN = 92.4
-
-
-def _with_measured_collagen(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    return scene | {
-        "material": scene["material"] | _MEASURED_COLLAGEN,
-        "cells": scene["cells"] | {"end_to_end_length": _FREE_CHAIN},
-    }
+_MEASURED_COLLAGEN = {
+    "material": {"chain_density": 9.0e20, "contour_length": 309.0, "persistence_length": 14.5},
+    "cells": {"end_to_end_length": 92.4},
+}
 
 
 def _consistent(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     changes = {"law": "tensor", "frame": "material", "coupling": "extrapolated"}
-    return scene | {
-        "material": scene["material"] | {"repulsion": "log"},
-        "remodeling": {name: value for name, value in (scene["remodeling"] | changes).items() if name != "pairing"},
-    }
+    found = merged(scene, {"material": {"repulsion": "log"}, "remodeling": changes})
+    del found["remodeling"]["pairing"]
+    return found
 
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "kuhl-holzapfel-2007": _PAPER,
     "consistent": {shape: _consistent(scene) for shape, scene in _PAPER.items()},
-    "sun-2002": {shape: _with_measured_collagen(scene) for shape, scene in _PAPER.items()},
+    "sun-2002": {shape: merged(scene, _MEASURED_COLLAGEN) for shape, scene in _PAPER.items()},
 }
 """Preset name -> shape -> scene keys; they lie under the keys of the scene that names the preset."""
 
@@ -234,7 +229,6 @@ def profile_for(name: str, scene: Any) -> Profile:
 Values = Mapping[str, Any]
 Others = Callable[..., Any]  # value of a table's key (or a default), where it is one that can be counted with
 _TABLES = {"material": Material, "cells": Cells, "remodeling": Remodeling}
-_COMPLEX_STEP = 1e-30  # its square vanishes beside 1: the derivative is exact to rounding
 
 
 class _NotThere(Exception):
@@ -244,31 +238,21 @@ class _NotThere(Exception):
 def aligned_stiffness(chain: Chain, end_to_end_length: float, contour_length: float) -> float:
     """Stiffness of the network along aligned chains at stretch 1, over the network modulus c."""
     r0 = end_to_end_length
-    ahead = complex(r0, _COMPLEX_STEP)
-    slope = (chain.stiffness(ahead, contour_length) * ahead).imag / _COMPLEX_STEP
+    ahead = complex(r0, COMPLEX_STEP)
+    slope = (chain.stiffness(ahead, contour_length) * ahead).imag / COMPLEX_STEP
     return float(r0**2 * (slope + chain.stiffness(r0, contour_length)))
 
 
-def _contour_length(locking_stretch: float, others: Others) -> float:
-    return locking_stretch * float(others("cells", "end_to_end_length"))
-
-
 def _chain_density(initial_stiffness: float, others: Others) -> float:
-    def number(key: str, table: str = "material") -> float:
-        return float(others(table, key))
-
-    name, unit = others("material", "chain"), others("material", "stress_unit")
-    r0, contour_length = number("end_to_end_length", "cells"), number("contour_length")
+    number = partial(others, "material")
+    name, unit = number("chain"), number("stress_unit")
+    r0, contour_length = others("cells", "end_to_end_length"), number("contour_length")
     if name not in CHAINS or unit not in STRESS_UNITS or r0 >= contour_length:
         raise _NotThere
-    chain = CHAINS[name].of({key: others("material", key, own.default) for key, own in CHAINS[name].parameters.items()})
+    chain = CHAINS[name].of({key: number(key, own.default) for key, own in CHAINS[name].parameters.items()})
     modulus = initial_stiffness * STRESS_UNITS[unit] / aligned_stiffness(chain, r0, contour_length)
     k_theta = BOLTZMANN_CONSTANT * number("temperature")
     return 4 * number("persistence_length") * modulus / (number("energy_factor") * k_theta)
-
-
-def _kappa(half_life: float, others: Others) -> float:
-    return math.log(2) / half_life
 
 
 class Experiment(NamedTuple):
@@ -280,15 +264,13 @@ class Experiment(NamedTuple):
     lowest: float
     own: Callable[[float, Others], float]
 
-    def said(self, part: Values) -> Any:
-        """Its value in what is said of a body or region."""
-        return _of(part, self.table, self.key)
-
 
 EXPERIMENTS = (  # in this order: the density asks for the contour length
-    Experiment("material", "locking_stretch", "contour_length", 1.0, _contour_length),
+    Experiment(
+        "material", "locking_stretch", "contour_length", 1.0, lambda v, of: v * of("cells", "end_to_end_length")
+    ),
     Experiment("material", "initial_stiffness", "chain_density", 0.0, _chain_density),
-    Experiment("remodeling", "half_life", "kappa", 0.0, _kappa),
+    Experiment("remodeling", "half_life", "kappa", 0.0, lambda value, of: math.log(2) / value),
 )
 
 
@@ -310,7 +292,7 @@ def check_exclusive(own: Values) -> None:
     """Refuse a number of an experiment beside what it replaces."""
     for name, part in parts_of(own):
         for experiment in EXPERIMENTS:
-            value, key = experiment.said(part), f"{place_of(name)}{experiment.table}"
+            value, key = _of(part, experiment.table, experiment.key), f"{place_of(name)}{experiment.table}"
             if value is not None and _of(part, experiment.table, experiment.replaces) is not None:
                 rule = f"{key}.{experiment.replaces} is there too; one of them is enough"
                 raise fault(rule, f"{key}.{experiment.key}", value)
@@ -346,7 +328,7 @@ def _of(part: Values, table: str, key: str) -> Any:
 
 
 def _with_own_number(experiment: Experiment, part: Values, body: Values) -> Values:
-    value = experiment.said(part)
+    value = _of(part, experiment.table, experiment.key)
     if not is_number(value) or value <= experiment.lowest:
         return part
 

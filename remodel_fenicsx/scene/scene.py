@@ -1,7 +1,7 @@
 """A scene: what to simulate, as TOML or as Python objects, validated before any solve.
 
 `read_scene` reads a file, `Scene(...)` and `scene_from_dict` take the same keys from Python. docs/scene.md lists all
-keys (`scene.reference`).
+keys.
 """
 
 from __future__ import annotations
@@ -78,13 +78,35 @@ TEMPERATURES = (250.0, 400.0)  # K: of what is neither ice nor cooked
 
 def doubts(
     material: Material, geometry: Shape, loads: Mapping[str, Load], end_to_end_length: float, end: float
-) -> list[str]:
+) -> Iterator[str]:
     """Lines on what is hardly meant; none on bodies of plausible tissue."""
+    unit, pascal, density = material.stress_unit, STRESS_UNITS[material.stress_unit], material.chain_density
     network = chain_stress(material, end_to_end_length)
-    found, kinds = [*_of_material(material, network), *_of_lengths(geometry)], geometry.loads_on(faces_of(loads))
+    ratio, stiffness = network / material.lame_mu, material.lame_mu + network
+    if network and (way := _beyond(ratio, NETWORK)):
+        of_pascal = f": {density:g} of a scene in Pa is {density * pascal:g} in {unit}" if pascal > 1 else ""
+        yield (
+            f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} {unit}) is "
+            f"{_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
+            f"{material.lame_mu:.4g} {unit}); the density is in 1/m^3 in every scene{of_pascal}"
+        )
+    if not TEMPERATURES[0] <= material.temperature <= TEMPERATURES[1]:
+        yield f"material.temperature = {material.temperature:g}: an absolute temperature in K; 37 degC are 310.15"
+    for key, words, ratio, decades in geometry.proportions:
+        if _beyond(ratio, decades):
+            one = "all lengths are in one unit, geometry.length_unit"
+            yield f"geometry.{key} = {getattr(geometry, key):g}: {words} is {ratio:.3g}; {one}"
     for name, load in loads.items():
-        found += _of_load(name, kinds[name], load.largest(end), material, geometry, network)
-    return found
+        key, kind, value = f"loads.{name}.value", geometry.loads_on(faces_of(loads))[name], load.largest(end)
+        if kind.doubtful is not None and abs(value) >= kind.doubtful[0]:
+            yield f"{key}: {value:g} at its largest; {kind.doubtful[1]}"
+        stress = abs(largest_stress(kind, value, geometry) or 0.0)
+        if stress and (way := _beyond(stress / stiffness, LOAD)):
+            yield (
+                f"{key}: a stress of {stress:.3g} {unit} at its largest, {_times(stress / stiffness)} "
+                f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network (lame_mu + c g(r0) r0^2 = "
+                f"{stiffness:.3g} {unit}); all are in one unit, material.stress_unit"
+            )
 
 
 def chain_stress(material: Material, end_to_end_length: float) -> float:
@@ -98,47 +120,6 @@ def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | Non
     if kind.dimension == FORCE and kind.area is not None:
         return value / kind.area(geometry)
     return value if kind.dimension == STRESS else None
-
-
-def _of_material(material: Material, network: float) -> Iterator[str]:
-    unit, lowest, highest = material.stress_unit, *TEMPERATURES
-    ratio = network / material.lame_mu
-    if network and (way := _beyond(ratio, NETWORK)):
-        pascal = STRESS_UNITS[unit]
-        density = f": {material.chain_density:g} of a scene in Pa is {material.chain_density * pascal:g} in {unit}"
-        yield (
-            f"material.chain_density = {material.chain_density:g}: the network (c g(r0) r0^2 = {network:.3g} {unit}) "
-            f"is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
-            f"{material.lame_mu:.4g} {unit}); the density is in 1/m^3 in every scene{density if pascal > 1 else ''}"
-        )
-    if not lowest <= material.temperature <= highest:
-        yield f"material.temperature = {material.temperature:g}: an absolute temperature in K; 37 degC are 310.15"
-
-
-def _of_lengths(geometry: Shape) -> Iterator[str]:
-    for key, words, ratio, decades in geometry.proportions:
-        if _beyond(ratio, decades):
-            value = getattr(geometry, key)
-            unit = "all lengths are in one unit, geometry.length_unit"
-            yield f"geometry.{key} = {value:g}: {words} is {ratio:.3g}; {unit}"
-
-
-def _of_load(
-    name: str, kind: LoadKind, value: float, material: Material, geometry: Shape, network: float
-) -> Iterator[str]:
-    key = f"loads.{name}.value"
-    if kind.doubtful is not None and abs(value) >= kind.doubtful[0]:
-        yield f"{key}: {value:g} at its largest; {kind.doubtful[1]}"
-    stress = largest_stress(kind, value, geometry)
-    if not stress:
-        return
-    ratio = abs(stress) / (material.lame_mu + network)
-    if way := _beyond(ratio, LOAD):
-        yield (
-            f"{key}: a stress of {abs(stress):.3g} {material.stress_unit} at its largest, {_times(ratio)} "
-            f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network (lame_mu + c g(r0) r0^2 = "
-            f"{material.lame_mu + network:.3g} {material.stress_unit}); all are in one unit, material.stress_unit"
-        )
 
 
 def _beyond(ratio: float, decades: tuple[int, int]) -> int:

@@ -51,6 +51,11 @@ NAME = r"[A-Za-z][A-Za-z0-9_]{0,39}"  # of a region or a further load: part of t
 LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB for them
 
 
+def meanings(registry: Mapping[str, Any]) -> str:
+    """Of all that it has, for a description."""
+    return ". ".join(f"{name!r}: {part.meaning}" for name, part in registry.items())
+
+
 # ---------------------------------------------------------------- body and mesh
 
 
@@ -87,9 +92,7 @@ class Mesh(Table):
         default=AUTO,
         description=f"How elements treat the change of volume. 'auto' takes {NOT_LOCKING!r} where lambda/mu is above "
         f"{STIFF_BULK['hexahedron']:g} (tetrahedra of degree 2: {STIFF_BULK['tetrahedron']:g}) and nothing of the "
-        "scene needs 'displacement'; the scene as run has its name. "
-        + ". ".join(f"{name!r}: {formulation.meaning}" for name, formulation in FORMULATIONS.items())
-        + ".",
+        f"scene needs 'displacement'; the scene as run has its name. {meanings(FORMULATIONS)}.",
     )
 
     @model_validator(mode="after")
@@ -115,8 +118,7 @@ class Model(Table):
     kinematics: Annotated[str, OneOf(KINEMATICS, (AUTO,))] = Field(
         default=AUTO,
         description="'auto' takes the cheapest one that is exact for the scene; the scene as run has its name. "
-        + ". ".join(f"{name!r}: {kinematics.meaning}" for name, kinematics in KINEMATICS.items())
-        + ". One that would be wrong for the scene is refused with the reason (docs/kinematics.md).",
+        f"{meanings(KINEMATICS)}. One that would be wrong is refused with the reason (docs/kinematics.md).",
     )
 
     def check_with(self, scene: Scene, key: str) -> None:
@@ -719,9 +721,8 @@ class Remodeling(Table):
     overlaps most. The law 'rotation' does not use it."""
     coupling: Annotated[str, OneOf(COUPLINGS)] = Field(
         default="staggered",
-        description="In which order a step solves and remodels. "
-        + ". ".join(f"{name!r}: {kind.meaning}" for name, kind in COUPLINGS.items())
-        + ". Where neither scene nor preset names one, the law 'tensor' has 'extrapolated'.",
+        description=f"In which order a step solves and remodels. {meanings(COUPLINGS)}. Where neither scene nor preset "
+        "names one, the law 'tensor' has 'extrapolated'.",
     )
     relaxation_factor: float = Field(default=0.5, gt=0, le=1)
     """For the coupling 'relaxed': the share theta of a pass's change of the structure tensor that is made. With 1 it is
@@ -741,8 +742,7 @@ class Remodeling(Table):
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="What the cells follow where there are several load cases ([[cases]]). "
-        + ". ".join(f"{name!r}: {mean.meaning}" for name, mean in MEANS_OF_CASES.items())
-        + " (docs/cycles.md).",
+        f"{meanings(MEANS_OF_CASES)} (docs/cycles.md).",
     )
     rotation_time: float = Field(default=40.0, gt=0)
     """For the law 'rotation': a small angle between fibre and tension fades like exp(-t / rotation_time)."""
@@ -854,16 +854,12 @@ class Properties(NamedTuple):
         plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
         if self.kappa != plain and law.remodels and not law.asks_kappa:
             raise fault(f"the law {scene.remodeling.law!r} has no kappa", f"{region}remodeling.kappa", self.kappa)
-        self._check_turnover(scene.remodeling.turnover, region)
-
-    def _check_turnover(self, turnover: Turnover, region: str) -> None:
-        material, key = self.material, "remodeling.turnover"
+        turnover, longest = scene.remodeling.turnover, material.contour_length / cells.end_to_end_length
         if turnover.is_on and not material.chain_density:
-            raise fault("needs chains: material.chain_density above 0", key, None)
-        longest = material.contour_length / self.cells.end_to_end_length
+            raise fault("needs chains: material.chain_density above 0", "remodeling.turnover", None)
         if turnover.is_on and CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
             rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
-            raise fault(rule, f"{key}.deposition_stretch", turnover.deposition_stretch)
+            raise fault(rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch)
 
 
 def _as_in(table: type[Table], name: str, key: str) -> Any:
@@ -1206,9 +1202,7 @@ class Solver(Table):
         default=AUTO,
         description=f"How the equations of each step are solved. 'auto' takes 'direct' up to {SMALL_BODY} "
         f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} (on several "
-        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. "
-        + ". ".join(f"{name!r}: {method.meaning}" for name, method in SOLVER_METHODS.items())
-        + " (docs/speed.md).",
+        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} (docs/speed.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
     """Where Newton's method starts a step. 'none': at the displacement of the step before. 'autoregressive': at what
@@ -1314,19 +1308,13 @@ class Output(Table):
 
     def _check_column(self, name: str, scene: Scene, key: str) -> None:
         shape, known = scene.geometry, dict.fromkeys(scene.column_names)
-        turns_over = scene.remodeling.turnover.is_on
-        reasons = {
-            "is an error of steps; must be left out with time.end = 'equilibrium'": (
-                name == "time_error" and scene.time.is_equilibrium
-            ),
-            "is for bodies of one tissue; the scene has regions": scene.regions
-            and any(column.of_one_tissue for column in shape.columns_on_request if column.name == name),
-            "changes only with remodeling.turnover, which is not set": (
-                name in (*TURNED_OVER, TURNOVER_POWER) and not turns_over
-            ),
-        }
-        refuse(key, name, {f"{name!r} {reason}": holds for reason, holds in reasons.items()})
-        allowed = ", ".join(map(repr, known))
-        refuse(
-            key, name, {f"no such column on request; allowed for shape {shape.name!r} are {allowed}": name not in known}
-        )
+        of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
+        if name == "time_error" and scene.time.is_equilibrium:
+            raise fault(f"{name!r} is an error of steps; must be left out with time.end = 'equilibrium'", key, name)
+        if name in of_one_tissue and scene.regions:
+            raise fault(f"{name!r} is for bodies of one tissue; the scene has regions", key, name)
+        if name in (*TURNED_OVER, TURNOVER_POWER) and not scene.remodeling.turnover.is_on:
+            raise fault(f"{name!r} changes only with remodeling.turnover, which is not set", key, name)
+        if name not in known:
+            names = ", ".join(map(repr, known))
+            raise fault(f"no such column on request; allowed for shape {shape.name!r} are {names}", key, name)

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem import assembly, jit
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import (
     Remembered,
     assemble_matrix,
@@ -44,6 +44,7 @@ class PointwiseRepulsion:
         self.state, self.shares = state, shares
         self.tissue = with_kernels(tissue, state.comm)
         self.quadrature = state.cells.quadrature
+        self._parameters = Parameters(self.tissue, self.quadrature)
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         self._known: list[Array] = []  # F, A and c g(r0) of the values that are there
@@ -80,7 +81,7 @@ class PointwiseRepulsion:
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""
         F = self.state.elastic_gradient()
-        r0 = assembly.point_values(self.tissue.end_to_end_length, self.quadrature).reshape(-1)
+        r0 = self._parameters.at_points().end_to_end_length
         values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
         return self.quadrature.integral(self.state.per_mesh_volume(values))
 
@@ -98,8 +99,7 @@ class PointwiseRepulsion:
         return geometric + ufl.inner(ufl.dot(self.stiffness, along), across)
 
     def _modulus(self) -> Array:
-        points = self.tissue.map(lambda name, value: assembly.point_values(value, self.quadrature).reshape(-1))
-        return points.repulsion_modulus
+        return self._parameters.at_points().repulsion_modulus
 
 
 class PointStresses:

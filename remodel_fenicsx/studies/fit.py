@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import base64
+import ctypes
 import hashlib
 import io
 import json
 import logging
+import re
+import signal
+import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from html import escape
+from itertools import product
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -36,6 +44,7 @@ from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STR
 from remodel_fenicsx.simulation import Simulation, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.page import COLOURS, DOTS_PER_INCH, STYLE, Answer, Page, label, made_with, panels
+from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
 from remodel_fenicsx.system.terminal import Line, hold_log, open_log, unsaid
 from remodel_fenicsx.unloading import PASSIVE
@@ -292,38 +301,34 @@ def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], 
 
 
 # ---------------------------------------------------------------- what a scene says where a table has measurements
+# keys whose numbers a simulation takes that is built already (`Simulation.begin_again`)
+TISSUE, OTHERS = r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))", r"loads\.\w+\.value|natural\.\w+"
+CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
 # what differences of runs divide by a small change is rounding alone
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
 
-def model_of(scene: Scene, table: Measured, scales: Mapping[str, float]) -> dict[str, Array]:
+def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], kept: Kept | None = None) -> dict[str, Array]:
     """What a scene says where a table has measurements, by column, (rows,)."""
-    scene = _with_columns(scene.with_values(PRECISE), table)
+    scene = scene.with_values(PRECISE | {"output.columns": [*table.sd], "output.times": [], "output.fields": False})
+    if kept is not None or table.state == "after":
+        scene = with_choices(scene)
     if table.state == "history":
         measured, step = table.columns["time"], scene.time.step
         end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
-        found, _ = _run(scene.with_values({"time.end": end}), table)
+        found, _ = _run(scene.with_values({"time.end": end}), table, kept)
         return {name: np.interp(measured, found["time"], found[name]) for name in table.sd}
     start = None
     if table.state == "after":
-        scene = with_choices(scene)
-        _, start = _run(scene.with_values({"time.end": table.time}), table)
-    found, _ = _run(_passive(scene, table, scales), table, start)
+        _, start = _run(scene.with_values({"time.end": table.time}), table, kept)
+    found, _ = _run(_passive(scene, table, scales), table, kept, start)
     return {name: found[name][found["time"] > 0] for name in table.sd}
-
-
-def _with_columns(scene: Scene, table: Measured) -> Scene:
-    """That has the table's columns."""
-    there = {column.name for column in scene.columns()}
-    more = [name for name in table.sd if name not in there]
-    return scene.with_values({"output.columns": [*scene.output.columns, *more]}) if more else scene
 
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
     scene = _with_loads_of(table, scene)
     changes = PASSIVE | {"time.step": 1.0, "time.end": float(table.rows)}
-    changes |= {"output.times": [], "output.fields": False, "output.columns": [*table.sd]}  # some need turnover
     for name, load in scene.loads.items():
         values: Array = np.full(table.rows, load.value * load.factor(scene.last_time))
         if name in table.loads:
@@ -342,14 +347,33 @@ def _with_loads_of(table: Measured, scene: Scene) -> Scene:
     return scene.model_copy(update={"loads": loads | new})
 
 
+class Kept:
+    """Simulations on the way, which nobody hears: they stay, and get other numbers where a scene differs in no more."""
+
+    def __init__(self, keys: Sequence[str]):
+        self._may_stay = all(re.fullmatch(CAN_BE_SET, key) for key in keys)
+        self._known: dict[Any, Simulation] = {}
+
+    def simulation(self, scene: Scene, table: Measured, is_passive: bool) -> Simulation:
+        """At t = 0."""
+        use = id(table), is_passive, scene.model.kinematics, scene.mesh.formulation
+        known = self._known.pop(use, None)
+        if known is None or not (self._may_stay and known.begin_again(scene)):
+            if known is not None:
+                known.close()
+            known = Simulation(scene, MPI.COMM_SELF)
+            known.watchers = [one for one in known.watchers if not isinstance(one, WarnsOnce)]
+            known.observer.columns = tuple(one for one in known.observer.columns if one.name in ("time", *table.sd))
+        self._known[use] = known
+        return known
+
+
 def _run(
-    scene: Scene, table: Measured, start: tuple[Array, Array] | None = None
+    scene: Scene, table: Measured, kept: Kept | None = None, start: tuple[Array, Array] | None = None
 ) -> tuple[dict[str, Array], tuple[Array, Array]]:
     """Columns and `time` of all steps; dimensions and axes of the cells at the end."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
+    simulation = Simulation(scene, MPI.COMM_SELF) if kept is None else kept.simulation(scene, table, start is None)
     cells = simulation.cells
-    if not log.isEnabledFor(logging.WARNING):  # `unsaid`: nobody hears those who warn
-        simulation.watchers = [one for one in simulation.watchers if not isinstance(one, WarnsOnce)]
     try:
         if start is not None:
             cells.set(*start)
@@ -357,7 +381,8 @@ def _run(
         rows = [step.row for step in simulation.steps()]
         end = cells.dimension_values.copy(), cells.axis_values.copy()
     finally:
-        simulation.close()
+        if kept is None:
+            simulation.close()
     return {name: np.array([row[name] for row in rows]) for name in ("time", *table.sd)}, end
 
 
@@ -372,39 +397,30 @@ class Journal:
     """The file in the folder of a fit, from which the same fit goes on; its first line says which fit it is."""
 
     def __init__(self, folder: Path):
-        self._path = folder / JOURNAL
-        self._lines: list[dict[str, Any]] = []
-        self._begun = False
-        text = read_regular(self._path, LARGEST_JOURNAL).decode(errors="replace") if self._path.exists() else ""
+        self.path, self._begun = folder / JOURNAL, False
+        self.mark: str | None = None  # of the fit in the folder
+        self.known: dict[Point, Array] = {}  # residuals (n,) of all points
+        text = read_regular(self.path, LARGEST_JOURNAL).decode(errors="replace") if self.path.exists() else ""
         with suppress(ValueError):  # the last line may have been cut off
-            for line in text.splitlines():
-                self._lines.append(json.loads(line))
-
-    @property
-    def mark(self) -> str | None:
-        """Of the fit in the folder; None where there is none."""
-        return str(self._lines[0].get("fit")) if self._lines else None
-
-    def known(self) -> dict[Point, Array]:
-        """Residuals (n,) of all points."""
-        return {
-            tuple(map(float, line["at"])): np.array(line["residuals"], np.float64)
-            for line in self._lines
-            if "at" in line
-        }
+            for line in map(json.loads, text.splitlines()):
+                if "at" in line:
+                    self.known[tuple(map(float, line["at"]))] = np.array(line["residuals"], np.float64)
+                else:
+                    self.mark = str(line.get("fit"))
 
     def begin(self, mark: str) -> None:
         """Open the file for more, without a line that was cut off; what was evaluated before is there too."""
-        self._lines, self._begun = [{"fit": mark}, *(line for line in self._lines if "at" in line)], True
-        check_no_link(self._path)
-        self._path.write_text("".join(json.dumps(line) + "\n" for line in self._lines), encoding="utf-8")
+        check_no_link(self.path)
+        self.path.write_text(json.dumps({"fit": mark}) + "\n", encoding="utf-8")
+        self._begun = True
+        for point, residuals in self.known.items():
+            self.add(point, residuals)
 
     def add(self, point: Point, residuals: Array) -> None:
         """One line more; once the file is open it is on the disk when this returns."""
-        self._lines.append({"at": list(point), "residuals": residuals.tolist()})
         if self._begun:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(self._lines[-1]) + "\n")
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"at": list(point), "residuals": residuals.tolist()}) + "\n")
 
 
 def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]) -> str:
@@ -423,9 +439,10 @@ UNSOLVED = 1e3  # standard deviations, of all rows of a state that has no equili
 START_SPREAD = np.log(2.0)  # of further starts, to both sides
 SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
 ENOUGH = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
+TELLING = 0.5  # of a change of the residuals: where a Jacobian misses more, the next is made by differences
 CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
 PROFILE_STEP, PROFILE_REACH = 1.0, 4.0  # standard deviations of the straight line
-ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits: they start where a straight line has their end
+ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
 _MODULI = ("lame_lambda", "lame_mu", "chain_density", "initial_stiffness", "persistence_length", "temperature")
@@ -459,7 +476,9 @@ class Problem:
         journal: Journal | None = None,
     ):
         self.scene, self.unknowns, self.tables, self._journal = scene, list(unknowns), list(tables), journal
-        self._known = {} if journal is None else journal.known()
+        self.known = {} if journal is None else journal.known
+        self.differences = 0  # Jacobians that were made
+        self.kept = Kept([unknown.key for unknown in unknowns])
 
     def scene_of(self, logarithms: Array) -> Scene:
         """The scene with these numbers."""
@@ -471,27 +490,27 @@ class Problem:
         pairs = zip(self.unknowns, logarithms, strict=True)
         return {u.key.removeprefix(SCALE): float(np.exp(x)) for u, x in pairs if u.key.startswith(SCALE)}
 
-    def models(self, logarithms: Array) -> list[dict[str, Array]]:
+    def models(self, logarithms: Array, kept: Kept | None = None) -> list[dict[str, Array]]:
         """What the model says of each table."""
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
-        return [model_of(scene, table, scales) for table in self.tables]
+        return [model_of(scene, table, scales, kept) for table in self.tables]
 
     def residuals(self, logarithms: Array) -> Array:
         """Model less measurement over standard deviation, table by table; then the priors."""
         key = tuple(map(float, logarithms))
-        if key not in self._known:
+        if key not in self.known:
             with unsaid():
-                self._known[key] = self._evaluated(np.array(logarithms))
+                self.known[key] = self._evaluated(np.array(logarithms))
             if self._journal is not None:
-                self._journal.add(key, self._known[key])
-        return self._known[key]
+                self._journal.add(key, self.known[key])
+        return self.known[key]
 
     def _evaluated(self, x: Array) -> Array:
         scales = self.scales_of(x)
         parts: list[Array] = []
         models: list[dict[str, Array]] | None = None
         with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
-            models = self.models(x)
+            models = self.models(x, self.kept)
         for number, table in enumerate(self.tables):
             for name, sd in table.sd.items():
                 off = models[number][name] - scales.get(name, 1.0) * table.columns[name] if models else UNSOLVED * sd
@@ -503,6 +522,7 @@ class Problem:
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
         """Derivatives, (residuals, unknowns), by differences of runs."""
+        self.differences += 1
         ends = [np.log([getattr(unknown, end) for unknown in self.unknowns]) for end in ("lower", "upper")]
         columns = []
         for k, way in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
@@ -546,6 +566,7 @@ def fit(
     starts: int = 3,
     quiet: bool = True,
     profiles: bool = True,
+    jobs: int | None = None,
 ) -> tuple[Path, Fit]:
     """Fit numbers of a scene to measurements."""
     if scene.cases:
@@ -561,28 +582,71 @@ def fit(
             raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
         for doubt in doubts(tables, at_start, scene):
             log.warning("%s", doubt)
-        problem.check_tells_apart(problem.jacobian(first, central=True))
-    random, found = np.random.default_rng(1), []
+        near = first, problem.jacobian(first, central=True)
+        problem.check_tells_apart(near[1])
+    random = np.random.default_rng(1)
+    points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
     with ExitStack() as stack:
         stack.enter_context(RunLock(place))
         journal.begin(mark)
         stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
         line = stack.enter_context(Line(f"{scene.name} fit", quiet))
-        for number in range(1, starts + 1):
-            start = first + (random.uniform(-START_SPREAD, START_SPREAD, len(first)) if number > 1 else 0.0)
 
-            def said(misfit: float, words: str = f"start {number} of {starts}, misfit") -> None:
-                line.show(f"{words} {misfit:.4g}")
+        pool = ProcessPoolExecutor(jobs or cores(), get_context("fork"), _begin_with, (problem,))
+        stack.callback(_end, pool)
 
-            found.append(minimised(problem, start, said))
-            log.info("start %d: sum of squares %.6g, %d evaluations", number, 2 * found[-1].cost, found[-1].nfev)
+        def on_cores(tasks: Mapping[str, Callable[[Problem], Any]]) -> list[Any]:
+            asked = [pool.submit(_told, *task) for task in tasks.items()]
+            left = set(asked)
+            while left:
+                left = wait(left, 0.5).not_done
+                words = f"{len(left)} of {len(asked)} left: {', '.join(tasks)}"
+                line.show(f"{words}; {journal.path.read_bytes().count(10) - 1} runs so far")
+            answers = [one.result() for one in asked]
+            for _, known in answers:
+                problem.known |= known
+            return [answer for answer, _ in answers]
+
+        rough = partial(minimised, near=near, enough=ROUGHLY)
+        found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
+        best = int(np.argmin([one.cost for one in found]))
+        found[best] = on_cores({f"from the end of start {best + 1}": partial(minimised, start=found[best].x)})[0]
+        log.info("sums of squares: %s", ", ".join(f"{2 * one.cost:.6g}" for one in found))
         result = result_of(problem, found)
         if profiles:
-            result = with_profiles(problem, result, lambda key: line.show(f"profile of {key}"))
+            result = with_profiles(problem, result, on_cores)
         log.info("%s", result.verdict())
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
         result.write(place)
     return place, result
+
+
+_problem: Problem  # of a process
+
+
+def _begin_with(problem: Problem) -> None:
+    """A process of a fit, which has all that the fit knows, begins."""
+    global _problem
+    _problem = problem
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # it ends with its parent, which minds the other signals
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _told(words: str, task: Callable[[Problem], Any]) -> tuple[Any, dict[Point, Array]]:
+    """What a task returns, and all that was evaluated for it, which the log counts."""
+    before, differences, begun = set(_problem.known), _problem.differences, clock.monotonic()
+    answer = task(_problem)
+    new = {point: found for point, found in _problem.known.items() if point not in before}
+    numbers = len(new), clock.monotonic() - begun, _problem.differences - differences
+    log.info("%s: %d runs in %.1f s; derivatives by differences at %d points", words, *numbers)
+    return answer, new
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """At once, whatever they do."""
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in active_children():
+        process.kill()
 
 
 def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, Journal]:
@@ -615,11 +679,13 @@ class LikelihoodProfile:
 def minimised(
     problem: Problem,
     start: Array,
-    said: Callable[[float], object] = lambda misfit: None,
     held: int | None = None,
+    near: tuple[Array, Array] | None = None,
     enough: float = ENOUGH,
 ) -> Any:
-    """SciPy's least squares from a start, logarithms; `said` gets each misfit."""
+    """SciPy's least squares from a start, logarithms."""
+    # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells how
+    # residuals change: differences are made only where they pay.
     from scipy.optimize import least_squares
 
     free = np.array([number != held for number in range(len(start))])
@@ -630,46 +696,42 @@ def minimised(
         found[free] = x
         return found
 
-    def residuals(x: Array) -> Array:
-        off = problem.residuals(whole(x))
-        said(float(np.sqrt(np.mean(off**2))))
-        return off
+    def jacobian(x: Array) -> Array:
+        nonlocal near
+        point, updated = whole(x), None
+        if near is not None:
+            step, change = point - near[0], problem.residuals(point) - problem.residuals(near[0])
+            missed = change - near[1] @ step
+            if np.linalg.norm(missed) <= TELLING * np.linalg.norm(change):
+                updated = near[1] + np.outer(missed, step) / max(float(step @ step), 1e-300)
+        near = point, problem.jacobian(point) if updated is None else updated
+        return near[1][:, free]
 
     inside = np.clip(start[free], bounds[0] + 1e-6, bounds[1] - 1e-6)
     return least_squares(
-        residuals,
-        inside,
-        lambda x: problem.jacobian(whole(x))[:, free],
-        bounds,
-        x_scale="jac",
-        xtol=enough,
-        ftol=enough,
+        lambda x: problem.residuals(whole(x)), inside, jacobian, bounds, x_scale="jac", xtol=enough, ftol=enough
     )
 
 
-def profile(problem: Problem, best: Array, covariance: Array, number: int) -> LikelihoodProfile:
-    """Of an unknown, from the minimum outwards until the band ends: the others are fitted again at each value."""
-    least, deviation = float(np.sum(problem.residuals(best) ** 2)), float(np.sqrt(covariance[number, number]))
-    unknown, points, ends = problem.unknowns[number], [(float(best[number]), 0.0)], []
-    for side in (-1.0, 1.0):
-        x, last, end = best.copy(), (float(best[number]), 0.0), float("nan")
-        way = side * PROFILE_STEP * deviation * covariance[:, number] / covariance[number, number]
-        for _ in range(round(PROFILE_REACH / PROFILE_STEP)):
-            x = x + way
-            if not np.log(unknown.lower) < x[number] < np.log(unknown.upper):
-                break
-            if len(x) > 1:
-                x[np.arange(len(x)) != number] = minimised(problem, x, held=number, enough=ROUGHLY).x
-            point = float(x[number]), float(np.sum(problem.residuals(x) ** 2)) - least
-            points.append(point)
-            if point[1] > NORMAL_95**2:  # the root is nearly a straight line
-                roots = [float(np.sqrt(max(increase, 0.0))) for _, increase in (last, point)]
-                end = float(np.exp(np.interp(NORMAL_95, roots, [last[0], point[0]])))
-                break
-            last = point
-        ends.append(end)
-    values, increases = np.array(sorted(points)).T
-    return LikelihoodProfile(np.exp(values), increases, *ends)
+def _half_profile(
+    problem: Problem, best: Array, jacobian: Array, way: Array, number: int
+) -> tuple[list[tuple[float, float]], float]:
+    """Of an unknown, from the minimum one way until the band ends: points, and the end."""
+    least, unknown = float(np.sum(problem.residuals(best) ** 2)), problem.unknowns[number]
+    x, points = best, [(float(best[number]), 0.0)]
+    for _ in range(round(PROFILE_REACH / PROFILE_STEP)):
+        x = x + way
+        if not np.log(unknown.lower) < x[number] < np.log(unknown.upper):
+            break
+        if len(x) > 1:
+            others = np.arange(len(x)) != number
+            x[others] = minimised(problem, x, held=number, near=(best, jacobian), enough=ROUGHLY).x
+        points.append((float(x[number]), float(np.sum(problem.residuals(x) ** 2)) - least))
+        if points[-1][1] > NORMAL_95**2:  # the root is nearly a straight line
+            (inner, low), (outer, high) = points[-2:]
+            roots = np.sqrt([max(low, 0.0), high])
+            return points, float(np.exp(np.interp(NORMAL_95, roots, [inner, outer])))
+    return points, float("nan")
 
 
 def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
@@ -688,20 +750,27 @@ def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
         correlations,
         float(np.sqrt(np.mean(off**2))),
         [2 * float(one.cost) for one in found],
-        [int(one.nfev) for one in found],
+        len(problem.known),
         problem.models(logarithms),
         problem.scene_of(logarithms),
         problem.tables,
     )
 
 
-def with_profiles(problem: Problem, found: Fit, said: Callable[[str], object] = lambda key: None) -> Fit:
-    """The fit with profiles of what goes together; `said` gets the key of each unknown whose profile is made."""
-    deviations, profiles = np.log(found.upper / found.lower) / (2 * NORMAL_95), {}
+def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Any]], list[Any]]) -> Fit:
+    """The fit with profiles of what goes together: the others are fitted again at each value."""
+    deviations, best = np.log(found.upper / found.lower) / (2 * NORMAL_95), np.log(found.values)
     covariance = found.correlations * np.outer(deviations, deviations)
-    for number in np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1):
-        said(found.unknowns[number].key)
-        profiles[found.unknowns[number].key] = profile(problem, np.log(found.values), covariance, int(number))
+    numbers = np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1)
+    tasks, jacobian = {}, problem.jacobian(best, central=True)
+    for number, side in product(numbers, (-1, 1)):
+        way = side * PROFILE_STEP * covariance[:, number] / deviations[number]
+        half = partial(_half_profile, best=best, jacobian=jacobian, way=way, number=int(number))
+        tasks[f"profile of {found.unknowns[number].key}, {'down' if side < 0 else 'up'}wards"] = half
+    halves, profiles = on_cores(tasks), {}
+    for number, (down, lower), (up, upper) in zip(numbers, halves[::2], halves[1::2], strict=True):
+        values, increases = np.array(sorted([*down, *up[1:]])).T
+        profiles[found.unknowns[number].key] = LikelihoodProfile(np.exp(values), increases, lower, upper)
     return replace(found, profiles=profiles)
 
 
@@ -717,7 +786,7 @@ class Fit(Answer):
     correlations: Array
     misfit: float
     minima: list[float]
-    evaluations: list[int]
+    runs: int
     modelled: list[dict[str, Array]]
     scene: Scene
     tables: list[Measured]

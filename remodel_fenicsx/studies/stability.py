@@ -48,10 +48,6 @@ ENDS = {"reversing": SLEPc.EPS.Which.SMALLEST_REAL, "growing": SLEPc.EPS.Which.L
 SHARE_NAMES = ("turn_12", "turn_13", "turn_23", "lengths")
 
 
-class NotFound(RuntimeError):
-    """The eigenvalues have not converged."""
-
-
 @dataclass(frozen=True)
 class PassMode:
     """A change of the cells that a pass multiplies by a factor."""
@@ -152,8 +148,8 @@ class LinearPass:
         y.array[:] = self.vector(self(self.tensors(x.array_r)))
 
     # ------------------------------------------------------------ its eigenvalues
-    def extreme(self, end: str) -> PassMode:
-        """The mode with the most negative factor ("reversing") or with the largest ("growing")."""
+    def extreme(self, end: str) -> PassMode | None:
+        """The mode with the most negative factor ("reversing") or with the largest ("growing"), where it converges."""
         rows = 6 * self.owned
         total = self.equilibrium.comm.allreduce(rows, MPI.SUM)
         operator = PETSc.Mat().createPython(((rows, total), (rows, total)), self, self.equilibrium.comm)
@@ -169,11 +165,9 @@ class LinearPass:
         start.array[:] = np.random.default_rng(1).standard_normal(rows)
         solver.setInitialSpace(start)
         solver.solve()
-        if not solver.getConverged():
-            raise NotFound(
-                f"no factor of the pass was found to {FACTOR_ERROR:g} after {solver.getIterationNumber()} restarts"
-            )
-        found = self._mode(float(np.real(solver.getEigenpair(0, start))), self.tensors(start.array_r))
+        found = None
+        if solver.getConverged():
+            found = self._mode(float(np.real(solver.getEigenpair(0, start))), self.tensors(start.array_r))
         for thing in (solver, operator, start):
             thing.destroy()
         return found
@@ -232,16 +226,11 @@ class AmplificationWatcher(Watcher):
         if not self.chosen(step):
             return
         with closing(LinearPass(self.stepper, step.time, step.work.residual)) as linear:
-            ends = [self._first_mode(linear, end, step) for end in ENDS]
-        self.found.append(Amplification(step.time, *ends))
-
-    def _first_mode(self, linear: LinearPass, end: str, step: Step) -> PassMode | None:
-        try:
-            return linear.extreme(end)
-        except NotFound as reason:
-            if linear.equilibrium.comm.rank == 0:
-                log.warning("time %g, %s modes: %s", step.time, end, reason)
-            return None
+            modes = [linear.extreme(end) for end in ENDS]
+            if None in modes and linear.equilibrium.comm.rank == 0:
+                words = f"not found to {FACTOR_ERROR:g} after {RESTARTS} restarts"
+                log.warning("time %g: a factor of the pass was %s", step.time, words)
+        self.found.append(Amplification(step.time, *modes))
 
     def undone(self, step: Step) -> None:
         """What was found of the step goes."""

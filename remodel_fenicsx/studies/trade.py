@@ -435,10 +435,7 @@ def _in_words(sweep: _Sweep, found: SweepLimit) -> str:
         return f"{start}no error ({sweep.words}): {last}"
     if found.trusted:
         return f"{start}order {found.order:.2g} ({sweep.words}); the finest is {typical(found.beyond):.2g} degrees off"
-    text = (
-        f"no order seen ({sweep.words}), {last}: the estimates are differences to the finest, and no better than that"
-    )
-    return start + text
+    return f"{start}no order seen ({sweep.words}), {last}: the estimates are differences to the finest, no better"
 
 
 def _about_steps_on_the_same_cells(results: Sequence[Result]) -> list[str]:
@@ -601,8 +598,6 @@ def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Resul
 # ---------------------------------------------------------------- the answer: words, a table, a picture, scenes
 ROWS = "rows"  # folder of the scenes
 WANTED = 1.0  # degrees of error, which the verdict asks for: less than what random cells scatter
-SIZE = 8.0  # of a point with a number in it
-APART = 0.05  # of the axes: such points that are closer would cover each other
 
 
 @dataclass(frozen=True)
@@ -686,36 +681,19 @@ class Trade(Answer):
         for way, colour in kinds.items():
             same = [row for row in shown if row.result.setting.way == way]
             axes.plot(*_places(same), "o", color=colour, markerfacecolor="white", markersize=4, label=", ".join(way))
-            axes.plot(*_places([row for row in same if row.on_front]), "o", color=colour, markersize=4)
-        numbered = _apart(front, shown)
-        for number, row in enumerate(numbered, start=1):
-            at = (row.result.seconds, row.angle_error)
-            axes.plot(*at, "o", color=kinds[row.result.setting.way], markersize=SIZE)
-            axes.annotate(str(number), at, ha="center", va="center_baseline", fontsize=6, color="white")
-        axes.margins(0.06)  # a point of the front is half as wide
+            axes.plot(*_places([row for row in same if row.on_front]), "o", color=colour, markersize=5)
         if kinds:
             figure.legend(loc="outside lower left", ncols=3)
-            names = [f"{number}  {row.words}" for number, row in enumerate(numbered, start=1)]
+            names = [row.words for row in front]
             names += [f"no error: {row.words}" for row in self.rows if row.on_front and row not in front]
             place: dict[str, Any] = {"loc": "outside right center", "handlelength": 0, "fontsize": 6.5}
-            place |= {"title": "filled: no other one\nis as good for less", "title_fontsize": 7.5}
+            place |= {"title": "filled, from left to right: no\nother one is as good for less", "title_fontsize": 7.5}
             figure.legend([Line2D([], [], linestyle="")] * len(names), names, **place)
         return figure
 
 
 def _scene_file(row: Row) -> str:
     return f"{ROWS}/{row.result.setting.name}.toml"
-
-
-def _apart(front: list[Row], shown: list[Row]) -> list[Row]:
-    """Those of the front whose points do not cover each other."""
-    spread = np.maximum(np.ptp(np.log(_places(shown)), axis=1), 1e-9) if shown else np.ones(2)
-    found: list[Row] = []
-    for row in front:
-        ways = [np.ptp(np.log(_places([row, other])), axis=1) / spread for other in found]
-        if all(np.hypot(*way) > APART for way in ways):
-            found.append(row)
-    return found
 
 
 def _places(rows: list[Row]) -> tuple[list[float], list[float]]:

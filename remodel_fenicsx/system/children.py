@@ -258,36 +258,28 @@ def _guard(file: str) -> None:
 def tree_by_rule(data: bytes) -> Any:
     """The root of XML in UTF-8 that has no entities of its own and nothing outside of itself."""
     from xml.etree import ElementTree
-    from xml.parsers import expat
-
-    def refuse(*_: Any) -> Any:
-        raise UnreadableFile("has a document type or entities; allowed is plain XML")
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag.rpartition(":")[2] == "include" or attributes.get("Format", "XML") != "XML":
-            raise UnreadableFile(ELSEWHERE)
-        for name, value in attributes.items():
-            if _COUNTS.match(name) and "-" in value:
-                raise UnreadableFile(f"has a number that is negative: {name} = {value!r}")
-        if attributes.get("header_type", "UInt32") not in ("UInt32", "UInt64"):
-            raise UnreadableFile(f"header_type = {attributes['header_type']!r}; allowed are 'UInt32' and 'UInt64'")
-        pieces.extend([tag] if tag == "Piece" else [])
-        if len(pieces) > 1:
-            raise UnreadableFile("has several pieces; allowed is one: read it in ParaView, Merge Blocks, save it again")
-        builder.start(tag, attributes)
 
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):  # which expat would follow, whatever it is told
         raise UnreadableFile("is no XML in UTF-8")
-    builder, pieces, parser = ElementTree.TreeBuilder(), [], expat.ParserCreate("utf-8")  # type: ignore[var-annotated]
-    parser.buffer_text, parser.buffer_size = True, 2**20
-    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
-    parser.CharacterDataHandler = builder.data
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise UnreadableFile("has a document type or entities; allowed is plain XML")
+    parser = ElementTree.XMLParser(encoding="utf-8")
     try:
-        parser.Parse(data, True)
-    except expat.ExpatError as error:
+        parser.feed(data)
+        root = parser.close()
+    except ElementTree.ParseError as error:
         raise ElementTree.ParseError(f"is no XML in UTF-8: {error}") from None
-    return builder.close()
+    for element in root.iter():
+        if element.tag.rpartition("}")[2] == "include" or element.get("Format", "XML") != "XML":
+            raise UnreadableFile(ELSEWHERE)
+        for name, value in element.items():
+            if _COUNTS.match(name) and "-" in value:
+                raise UnreadableFile(f"has a number that is negative: {name} = {value!r}")
+        if (kind := element.get("header_type", "UInt32")) not in ("UInt32", "UInt64"):
+            raise UnreadableFile(f"header_type = {kind!r}; allowed are 'UInt32' and 'UInt64'")
+    if len(list(root.iter("Piece"))) > 1:
+        raise UnreadableFile("has several pieces; allowed is one: read it in ParaView, Merge Blocks, save it again")
+    return root
 
 
 if __name__ == "__main__":

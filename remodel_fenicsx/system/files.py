@@ -58,15 +58,10 @@ def refusal_in_words(error: OSError) -> str:
 
 def read_regular(path: Path, most: int) -> bytes:
     """All of a regular file; links to one are followed."""
-    descriptor = _opened(path, os.O_RDONLY)
-    try:
-        size = _check_regular(descriptor, path).st_size
-    except OSError:
-        os.close(descriptor)
-        raise
+    descriptor, found = _regular(path, os.O_RDONLY)
     with open(descriptor, "rb") as file:
-        data = file.read(size + 1) if size <= most else b""
-    if max(size, len(data)) > most:
+        data = file.read(found.st_size + 1) if found.st_size <= most else b""
+    if max(found.st_size, len(data)) > most:
         raise ForeignFileError(errno.EFBIG, f"is larger than {most / 1e6:g} MB", str(path))
     return data
 
@@ -79,13 +74,10 @@ def check_regular(path: Path) -> None:
 
 def open_own(path: Path, flags: int) -> int:
     """Descriptor of a file that is written in place: a regular one of this name alone."""
-    descriptor = _opened(path, flags | os.O_NOFOLLOW)
-    try:
-        if _check_regular(descriptor, path).st_nlink > 1:
-            raise ForeignFileError(errno.EMLINK, "has a second name (a hard link); nothing is written to it", str(path))
-    except OSError:
+    descriptor, found = _regular(path, flags | os.O_NOFOLLOW)
+    if found.st_nlink > 1:
         os.close(descriptor)
-        raise
+        raise ForeignFileError(errno.EMLINK, "has a second name (a hard link); nothing is written to it", str(path))
     return descriptor
 
 
@@ -143,22 +135,20 @@ def _written_beside(path: Path, data: bytes) -> Iterator[Path]:
         os.close(folder)
 
 
-def _opened(path: Path, flags: int) -> int:
+def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
+    """Descriptor of a regular file, and what the system knows of it."""
     try:
-        return os.open(path, flags | NEVER_WAITING, 0o666)
+        descriptor = os.open(path, flags | NEVER_WAITING, 0o666)
     except OSError as error:
         if error.errno in FOREIGN and (error.errno != errno.EEXIST or path.is_symlink()):
             raise ForeignFileError(error.errno, FOREIGN[error.errno], str(path)) from None
         raise
-
-
-def _check_regular(descriptor: int, path: Path) -> os.stat_result:
     found = os.fstat(descriptor)
-    if stat.S_ISDIR(found.st_mode):
-        raise ForeignFileError(errno.EISDIR, FOREIGN[errno.EISDIR], str(path))
     if not stat.S_ISREG(found.st_mode):
-        raise ForeignFileError(errno.EINVAL, NO_FILE, str(path))
-    return found
+        os.close(descriptor)
+        number = errno.EISDIR if stat.S_ISDIR(found.st_mode) else errno.EINVAL
+        raise ForeignFileError(number, FOREIGN.get(number, NO_FILE), str(path))
+    return descriptor, found
 
 
 class ClosedAtEnd:

@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.state import Earlier
-from remodel_fenicsx.watch.warnings import WarnsOnce
+from remodel_fenicsx.watch.warnings import WarnsOnce, largest_at
 
 Array = NDArray[np.float64]
 
@@ -187,13 +187,13 @@ class OverCorrection(WarnsOnce):
     # ------------------------------------------------------------ words
     def _in_words(self, swing: Swing, cells: list[Array], times: list[float]) -> str:
         change = np.linalg.norm(self._at_points(_difference(cells, times)), axis=-1)
-        place = ", ".join(f"{coordinate:.4g}" for coordinate in self.quadrature.place_of_largest(change))
         return (
             "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
-            f"changes by {swing.cells:.2g} r0^2 (root mean square; most at {place}), the displacement by "
-            f"{swing.body:.2g} of its size; each pass multiplies this by about {swing.cells_factor:.2g}. Results may "
-            "be wrong from here on; set "
-            f"{self._advice(swing.cells_factor)} (docs/theory.md, Stability of the pass)"
+            f"changes by {swing.cells:.2g} r0^2 (root mean square; most at "
+            f"{largest_at(self.quadrature, change)}), the displacement by {swing.body:.2g} of its size; each pass "
+            f"multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
+            f"{self._advice(swing.cells_factor)} "
+            "(docs/theory.md, Stability of the pass)"
         )
 
     def _advice(self, factor: float) -> str:
@@ -246,11 +246,11 @@ class RestedCells(WarnsOnce):
         change = np.sqrt(self.quadrature.mean(squares)) / r0**2
         if change < RESUMED_CHANGE:
             return
-        share, place = self.quadrature.mean((squares > 0).astype(float)), self.quadrature.place_of_largest(squares)
+        share = self.quadrature.mean((squares > 0).astype(float))
         self.find(
             "cells that had rested without tension remodel again, and the law catches up in one pass. In "
             f"{100 * share:.2g} % of the body the structure tensor A changes by {change:.2g} r0^2 (root mean square "
-            f"over the body; most at {', '.join(f'{coordinate:.4g}' for coordinate in place)}). When cells rest "
+            f"over the body; most at {largest_at(self.quadrature, squares)}). When cells rest "
             'depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a remodeling.law '
             "that is a rate (docs/theory.md, Stability of the pass)"
         )

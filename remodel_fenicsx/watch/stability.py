@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -229,8 +229,7 @@ class BucklingWarning(WarnsOnce):
 
     def thrust(self) -> float:
         """Of the wall and of what fills the cavity, along z."""
-        stress = self._derivatives([(ALONG,)])[0]
-        force = self._integral(stress) / self._length()
+        force = self._integral(self._derivative(ALONG)) / self._length()
         if self.strut.radii is None:
             return -force
         return self._pressure * np.pi * self._radii()[0] ** 2 - force
@@ -287,28 +286,20 @@ class BucklingWarning(WarnsOnce):
 
     def _moduli(self) -> Array:
         """Second derivatives of W by logarithmic strains, (3, 3, n)."""
-        pairs = [(i, j) for i in range(3) for j in range(i + 1)]
         H = np.empty((3, 3, len(self._places)))
-        for (i, j), values in zip(pairs, self._derivatives(pairs), strict=True):
-            H[i, j] = H[j, i] = values
+        for i, j in itertools.combinations_with_replacement(range(3), 2):
+            H[i, j] = H[j, i] = self._derivative(j, i)
         return H
 
-    def _derivatives(self, wanted: Sequence[tuple[int, ...]]) -> list[Array]:
-        """Of W at the points, by one or two logarithmic strains of the present body each: central differences."""
+    def _derivative(self, *axes: int) -> Array:
+        """Of W at the points, by one or two logarithmic strains of the present body: central differences."""
         room = 1 - max(0.0, self.stepper.coupling.equilibrium.extension().max_chain_extension)  # no chain reaches L
-        steps = [STRAINS[len(key)] * room for key in wanted]
-        strains = []
-        for key, h in zip(wanted, steps, strict=True):
-            for signs in _SIGNS[len(key)]:
-                strain = np.zeros(3)
-                np.add.at(strain, list(key), h * signs)
-                strains.append(strain)
-        energies, found = self._energies(np.array(strains)), []
-        for key, h in zip(wanted, steps, strict=True):
-            weights = _SIGNS[len(key)].prod(axis=1) / (2 * h) ** len(key)
-            found.append(weights @ energies[: len(weights)])
-            energies = energies[len(weights) :]
-        return found
+        h, signs = STRAINS[len(axes)] * room, _SIGNS[len(axes)]
+        strains = np.zeros((len(signs), 3))
+        for axis, way in zip(axes, signs.T, strict=True):
+            strains[:, axis] += h * way
+        weights: Array = signs.prod(axis=1) / (2 * h) ** len(axes)
+        return weights @ self._energies(strains)
 
     def _energies(self, strains: Array) -> Array:
         """W at the points (k, n) after further stretches exp(strains), (k, 3), along the directions."""

@@ -267,13 +267,12 @@ def test_a_region_has_a_file_of_its_own(tmp_path: Path) -> None:
     rows = [{"element": n, "angle": 30.0} for n in range(1, 33)]
     path = table(tmp_path / "angle.csv", rows)
     regions = {"media": {"outer_radius": 2.0, "cells": {"fibres": str(path)}}, "adventitia": {}}
-    simulation = Simulation(Scene(**TUBE | {"cells": {"initial": "isotropic"}, "regions": regions}), SELF)
-    inside = simulation.domain.element_region == simulation.domain.regions["media"]
-    lengths, axes = simulation.cells.dimension_values, simulation.cells.axis_values
-    np.testing.assert_allclose(lengths[inside] - [1.0, 0.0, 0.0], 0.0, atol=1e-7)
-    np.testing.assert_allclose(np.abs(axes[inside][..., 0, 2]), 0.5, atol=1e-12)
-    np.testing.assert_allclose(lengths[~inside], np.sqrt(1 / 3), atol=1e-12)
-    simulation.close()
+    with made(Scene(**TUBE | {"cells": {"initial": "isotropic"}, "regions": regions})) as simulation:
+        inside = simulation.domain.element_region == simulation.domain.regions["media"]
+        lengths, axes = simulation.cells.dimension_values, simulation.cells.axis_values
+        np.testing.assert_allclose(lengths[inside] - [1.0, 0.0, 0.0], 0.0, atol=1e-7)
+        np.testing.assert_allclose(np.abs(axes[inside][..., 0, 2]), 0.5, atol=1e-12)
+        np.testing.assert_allclose(lengths[~inside], np.sqrt(1 / 3), atol=1e-12)
 
 
 # ---------------------------------------------------------------- what is refused

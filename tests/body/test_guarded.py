@@ -101,7 +101,7 @@ def pieces(path: Path) -> None:
 
 
 def included(path: Path) -> None:
-    changed(path, "<Domain>", '<Domain><xi:include href="/etc/passwd"/>')
+    changed(path, "<Domain>", '<Domain><xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>')
 
 
 def far_below(path: Path) -> None:

@@ -18,11 +18,11 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.reference.radial import RadialHistory, RadialMaterial, Tube, solve_radial
-from tests.runs import rows_of
+from tests.runs import last_row, rows_of
+from tests.values import isotropic, ramped
 
 SELF = MPI.COMM_SELF
 INTERFACE, END = 1.5, 12.0
-RAMP = [[0.0, 0.0], [8.0, 1.0]]
 MEDIA = {"chain_density": 1.5e21, "lame_mu": 2.0, "contour_length": 1.7}
 ADVENTITIA = {"chain_density": 4.0e21, "lame_lambda": 40.0, "temperature": 320.0, "persistence_length": 1.2}
 # pressure and elongation; those of laws whose cells jump where principal values cross let none cross
@@ -38,15 +38,14 @@ LAYERS: dict[str, Any] = {
 
 def scene(regions: Any = LAYERS, law: str = "explicit", **changes: Any) -> Scene:
     """The artery, short, with fast loads; on one radius where that is allowed."""
-    loads = LOADS[law]
-    made = Scene(
-        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 0.5}, regions=regions,
-        cells={"initial": "isotropic"}, output={"fields": False},
-        loads={"pressure": {"value": loads[0], "ramp": RAMP}, "elongation": {"value": loads[1], "ramp": RAMP}},
-        remodeling={"law": law, "coupling": "staggered"}, material={"repulsion": "axes"},
-        mesh={"degree": 2}, model={"kinematics": "auto"}, time={"end": END}, solver={"method": "direct"},
+    pressure, elongation = LOADS[law]
+    values = isotropic(
+        None, "auto", geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 0.5},
+        regions=regions, loads=ramped(8.0, pressure=pressure, elongation=elongation), material={"repulsion": "axes"},
+        remodeling={"law": law, "coupling": "staggered"}, mesh={"degree": 2}, time={"end": END},
+        solver={"method": "direct"},
     )  # fmt: skip
-    return made.with_values(changes)
+    return Scene(**values).with_values(changes)
 
 
 @lru_cache
@@ -99,9 +98,7 @@ def test_couplings_come_to_the_limit_of_short_steps(coupling: str, step: float, 
         known.append([exact.mean_fibre_angle(1.0, INTERFACE, -2), exact.mean_fibre_angle(INTERFACE, 3.0, -2)])
     limit = 2 * np.array(known[1]) - np.array(known[0])
     changes = {"remodeling.coupling": coupling, "time.step": step, "material.repulsion": "log", "mesh.refinement": 2}
-    simulation = Simulation(scene(law="tensor", **changes), SELF)
-    row = list(simulation.steps())[-1].row
-    simulation.close()
+    row = last_row(scene(law="tensor", **changes))
     found = [row["fibre_angle_media"], row["fibre_angle_adventitia"]]
     np.testing.assert_allclose(found, limit, rtol=0, atol=error)
     assert np.abs(limit - known[1]).min() > 0.02  # more than the errors that are left

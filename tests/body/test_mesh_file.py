@@ -14,7 +14,7 @@ from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_file import read_mesh
 from remodel_fenicsx.scene import read_scene, scene_from_dict
 from tests.mesh_files import TUBE, changed, write_tube
-from tests.tables import rows, unescaped
+from tests.tables import rows, unescaped, values
 
 SCENE = '[geometry]\nshape = "mesh"\nfile = "{}"\n[time]\nend = 1.0\nstep = 1.0\n'
 
@@ -74,24 +74,9 @@ def test_no_script_runs_under_the_name_of_a_mesh(tmp_path: Path) -> None:
         assert not mark.exists()
 
 
-SWAPPED = "geometry.faces.inner = 'outer': its area is 36.74, that of outer 18.37: are inner and outer swapped?"
-
-
-@pytest.mark.parametrize(
-    ("geometry", "words"),
-    [
-        (
-            {"faces": {"inner": "lumen"}},
-            "geometry.faces.inner = 'lumen': the file has no such face; it has 'inlet', 'outlet', 'inner', 'outer'",
-        ),
-        ({"faces": {"inlet": 12}}, "geometry.faces.inlet = 12: the file has no such face"),
-        ({"faces": {"inner": "outer", "outer": "inner"}}, SWAPPED),
-        ({"faces": {"inlet": 1.5}}, "geometry.faces.inlet = 1.5: must be a name or a number"),
-        ({"file_unit": "m"}, "geometry.file_unit = 'm': needs geometry.length_unit"),
-    ],
-)
-def test_faces_that_the_file_has_not(geometry: dict[str, Any], words: str) -> None:
-    assert words in refusal(TUBE, **geometry)
+@pytest.mark.parametrize(("geometry", "words"), rows(__file__, "bad_faces.txt"))
+def test_faces_that_the_file_has_not(geometry: str, words: str) -> None:
+    assert words in refusal(TUBE, **values(geometry))
 
 
 def bent(x: Any) -> Any:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, Simulation, preset_scene
+from remodel_fenicsx import Scene, preset_scene
 from remodel_fenicsx.model.residual_stress import Closing, Layer, closing
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.studies.page import read_table
-from tests.runs import last_row, made, rows_of
+from tests.runs import last_row, made, rows_of, simulated
 
 RADII = (1.0, 1.3)
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
@@ -127,9 +127,7 @@ def test_reduced_kinematics_agree_with_residual_stress() -> None:
     """One radius and a half-plane have the same elements through the wall: the same rows."""
     rows = []
     for kinematics in ("radial", "axisymmetric"):
-        simulation = Simulation(scene(kinematics, **{"time.end": 12.0}))
-        rows.append([step.row for step in simulation.steps()][-1])
-        simulation.close()
+        rows.append(last_row(scene(kinematics, **{"time.end": 12.0})))
     for column in ("inner_radius", "outer_radius", "fibre_angle_outer"):
         assert rows[0][column] == pytest.approx(rows[1][column], rel=2e-3), column
 
@@ -183,8 +181,7 @@ def test_a_rotation_of_the_natural_state_changes_nothing() -> None:
     With the repulsion `log`: that of the paper knows the cells' axes, however long they are.
     """
     changes = {"remodeling.law": "none", "time.end": 25.0, "material.repulsion": "log"}
-    with made(scene("radial", **changes)) as simulation:
-        list(simulation.steps())
+    with simulated(scene("radial", **changes)) as (simulation, _):
         equilibrium, function = simulation.stepper.coupling.equilibrium, simulation.state.kinematics.gradient
         before = equilibrium.stored_energy()
         values = simulation.quadrature.values(function, (3, 3))
@@ -225,13 +222,12 @@ def ends_of_layers(axial: float) -> tuple[float, float]:
     """Angles where the inner two thirds of a thin wall end and where its outer third begins, t = 150."""
     changes = {"natural.opening_angle": 0.0, "natural.layers": layers((2 / 3, {"axial": axial})), "time.end": 150.0}
     thin = {"geometry.outer_radius": 1.3, "loads.pressure.value": 1.2, "mesh.refinement": 3}
-    simulation = Simulation(
+    with made(
         scene("radial", **changes, **thin, **{"remodeling.law": "tensor", "material.repulsion": "log"})
-    )
-    last = list(simulation.steps())[-1]
-    angle = Measurement(simulation.observer, last).fibre_angle.ravel()
-    radius = simulation.cells.local_axes.coordinates[..., 0].ravel()
-    simulation.close()
+    ) as simulation:
+        last = list(simulation.steps())[-1]
+        angle = Measurement(simulation.observer, last).fibre_angle.ravel()
+        radius = simulation.cells.local_axes.coordinates[..., 0].ravel()
     order = np.argsort(radius)
     inside = radius[order] < 1.2
     return float(angle[order][inside][-1]), float(angle[order][~inside][0])

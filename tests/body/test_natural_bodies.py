@@ -16,6 +16,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_layers import write_layers
 from tests.body.test_natural import layers, scene
 from tests.runs import goes_on, last_row
+from tests.tables import rows, values
 
 SELF = MPI.COMM_SELF
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
@@ -29,9 +30,7 @@ def test_a_quarter_and_the_whole_tube_agree_with_one_radius() -> None:
     for kinematics in ("radial", "sector", "full"):
         of = scene(kinematics, **few)
         domain = whole_tube(of.geometry, (16, 8, 1), "hexahedron", 2, SELF) if kinematics == "full" else None
-        simulation = Simulation(of, SELF, domain)
-        ends[kinematics] = [step.row for step in simulation.steps()][-1]
-        simulation.close()
+        ends[kinematics] = last_row(of, domain)
     for kinematics in ("sector", "full"):
         for column, error in (("inner_radius", 2e-3), ("outer_radius", 1e-3), ("fibre_angle_outer", 0.1)):
             assert ends[kinematics][column] == pytest.approx(ends["radial"][column], abs=error), (kinematics, column)
@@ -98,26 +97,11 @@ def test_a_prestretch_that_is_given_back_leaves_no_stress(tmp_path: Path) -> Non
     assert np.sqrt(row["lumen_volume"] / (np.pi * 0.5 / 1.1)) == pytest.approx(np.sqrt(1.1), abs=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"layers": [{"prestretch": {}}]}, "natural.layers[0].prestretch = {}: needs one of circumferential, axial"),
-        ({"layers": [{"region": "intima", "prestretch": {"axial": 1.1}}]}, "no such region; there are 'media'"),
-        ({"layers": [{"from": 0.5, "to": 0.4, "prestretch": {"axial": 1.1}}]}, "must be smaller than to = 0.4"),
-        ({"layers": {"prestretch": {"axial": 1.1}}}, "must be a list of tables"),
-        (
-            {"layers": [{"prestretch": {"axial": 1.1}}, {"from": 0.5, "prestretch": {"axial": 1.2}}]},
-            "natural.layers[1] = [0.5, 1.0]: lies in another layer",
-        ),
-        ({"opening_angle": 90.0}, "natural.opening_angle = 90.0: must be 0 unless geometry.shape is 'tube'"),
-        ({"layers": [{"prestretch": {"axial": -1.0}}]}, "prestretch.axial = -1.0: must be a finite number greater"),
-        ({"layers": [{"prestretch": {"axial": 1.1}, "depth": 1}]}, "natural.layers[0].depth = 1: unknown key"),
-    ],
-)
-def test_bad_layers_get_one_line(table: dict[str, Any], words: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("table", "words"), rows(__file__, "bad_layers.txt"))
+def test_bad_layers_get_one_line(table: str, words: str, tmp_path: Path) -> None:
     file = write_layers(tmp_path / "layers.msh")
     with pytest.raises(ValueError) as refused:
-        Simulation(own_body(file, 0.0, natural=table), SELF)
+        Simulation(own_body(file, 0.0, natural=values(table)), SELF)
     assert words in str(refused.value) and "\n" not in str(refused.value)
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError, Simulation
+from remodel_fenicsx import Scene, SceneError
 from remodel_fenicsx.body.reductions import choice
 from remodel_fenicsx.body.tube import whole_tube
 from tests.body.test_natural import scene
-from tests.runs import last_row
+from tests.runs import last_row, made
 
 SELF = MPI.COMM_SELF
 
@@ -29,15 +29,14 @@ def test_a_stiffer_surrounding_turns_the_outside_further() -> None:
     law = {"remodeling.law": "tensor", "remodeling.coupling": "extrapolated", "material.repulsion": "log"}
     law |= {"time.end": "equilibrium", "mesh.refinement": 2, "output.columns": []}
     for stiffness, angle, radius in ((0.0, 75.2, 1.413), (0.5, 75.8, None), (2.0, 77.2, 1.409)):
-        simulation = Simulation(surrounded(stiffness, **law), SELF)
-        row = [step.row for step in simulation.steps()][-1]
-        cells = simulation.cells
-        found = simulation.observer.shape.fibre_angle(
-            cells.dimension_values, cells.axis_values, cells.local_axes.axes
-        )  # fmt: skip
-        outside = cells.local_axes.coordinates[..., 0] > 2.75
-        mean = float(np.average(found[outside], weights=simulation.quadrature.volumes[outside]))
-        simulation.close()
+        with made(surrounded(stiffness, **law)) as simulation:
+            row = [step.row for step in simulation.steps()][-1]
+            cells = simulation.cells
+            found = simulation.observer.shape.fibre_angle(
+                cells.dimension_values, cells.axis_values, cells.local_axes.axes
+            )  # fmt: skip
+            outside = cells.local_axes.coordinates[..., 0] > 2.75
+            mean = float(np.average(found[outside], weights=simulation.quadrature.volumes[outside]))
         assert mean == pytest.approx(angle, abs=0.3)
         if radius is not None:
             assert row["inner_radius"] == pytest.approx(radius, abs=1.5e-3)

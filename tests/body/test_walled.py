@@ -21,6 +21,7 @@ from remodel_fenicsx.results.whole_body import WholeBody
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
+from tests.values import isotropic, ramped
 
 ANGLES = [f"fibre_angle_{place}" for place in ("inner", "middle", "outer")]
 COUNTS = (16, 8, 4)
@@ -66,15 +67,10 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def scene(shape: str, end: float = 3.0, **tables: Any) -> Scene:
     """Pressed and pulled, with isotropic cells."""
-    ramp = [[0.0, 0.0], [2.0, 1.0]]
-    loads = {"pressure": {"value": 2.0, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}}
-    values: dict[str, Any] = {
-        "geometry": {"shape": shape, "length": 2.0}, "model": {"kinematics": "full"}, "time": {"end": end},
-        "cells": {"initial": "isotropic"}, "solver": {"method": "direct"}, "loads": loads,
-    }  # fmt: skip
-    if shape == "tube":
-        values["geometry"] |= {"inner_radius": 1.0, "outer_radius": 3.0}
-    return Scene(**values | tables)
+    radii = {"inner_radius": 1.0, "outer_radius": 3.0} if shape == "tube" else {}
+    values = {"geometry": {"shape": shape, "length": 2.0, **radii}, "loads": ramped(2.0, pressure=2.0, elongation=0.1)}
+    values |= {"time": {"end": end}, "solver": {"method": "direct"}}
+    return Scene(**isotropic(None, "full", **values | tables))
 
 
 def test_rows_are_those_of_the_tube() -> None:

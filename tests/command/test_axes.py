@@ -14,23 +14,17 @@ from remodel_fenicsx import Recording, Scene, cli, run
 from remodel_fenicsx.results.whole_body import BODY, revolve
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS
+from tests.conftest import Refused
+from tests.values import isotropic, ramped
 
 AXES = ("axis_c", "axis_a", "axis_r")
 
 
 def scene(kinematics: str = "full", **output: object) -> Scene:
     """A short tube, hardly loaded."""
-    ramp = [[0.0, 0.0], [2.0, 1.0]]
-    return Scene(
-        preset="kuhl-holzapfel-2007",
-        name="short",
-        geometry={"shape": "tube", "length": 2.0},
-        model={"kinematics": kinematics},
-        cells={"initial": "isotropic"},
-        loads={"pressure": {"value": 0.5, "ramp": ramp}, "elongation": {"value": 0.02, "ramp": ramp}},
-        time={"end": 2.0},
-        output=output,
-    )
+    loads, shape = ramped(2.0, pressure=0.5, elongation=0.02), {"shape": "tube", "length": 2.0}
+    own = {"name": "short", "geometry": shape, "loads": loads, "time": {"end": 2.0}, "output": output}
+    return Scene(**isotropic(kinematics=kinematics, **own))
 
 
 def check_cylindrical(fields: dict[str, np.ndarray], centres: np.ndarray, atol: float) -> None:
@@ -42,7 +36,7 @@ def check_cylindrical(fields: dict[str, np.ndarray], centres: np.ndarray, atol: 
 
 
 def test_the_file_of_the_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, refused: Refused
 ) -> None:
     """Read by meshio; a file that is there stays, and the default name is the scene's."""
     monkeypatch.chdir(tmp_path)
@@ -57,8 +51,7 @@ def test_the_file_of_the_command(
     np.testing.assert_allclose(fields["station"], centres[:, 2] / 2.0, atol=1e-12)
     assert np.unique(np.round(fields["depth"], 9)).size == 8 and 0.0 < fields["depth"].min()
     before = Path("found.vtu").read_bytes()
-    assert cli.main(["axes", "short.toml", "-o", "found.vtu"]) == 2
-    assert "-o found.vtu: is there already; allowed is a new file" in capsys.readouterr().err
+    assert "-o found.vtu: is there already; allowed is a new file" in refused("axes", "short.toml", "-o", "found.vtu")
     assert Path("found.vtu").read_bytes() == before
     assert cli.main(["axes", "short.toml"]) == 0 and Path("short-axes.vtu").read_bytes() == before
 

@@ -34,10 +34,11 @@ from remodel_fenicsx.running import resume, run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
 from remodel_fenicsx.studies.study import Run
-from tests.command.test_run import demo, run
+from tests.command.test_run import demo, refusal_of, run
 from tests.conftest import slowly
 from tests.forks import forked
 from tests.parts import pulled_cube
+from tests.runs import made
 
 PROJECT = Path(__file__).parents[2]
 SELF = MPI.COMM_SELF
@@ -72,14 +73,6 @@ def content(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-def refused(*words: str | Path, **options: Any) -> str:
-    """The one line of a command that ends with exit code 2."""
-    done = run(*words, **options)
-    assert done.returncode == 2, (done.returncode, done.stdout, done.stderr)
-    assert done.stderr.count("\n") == 1 and done.stderr.startswith("remodel-fenicsx: "), done.stderr
-    return done.stderr
-
-
 # ---------------------------------------------------------------- PETSc's options
 OPTIONS = tomllib.loads((Path(__file__).parent / "petsc_options.toml").read_text())
 TAKEN = OPTIONS.pop("taken")
@@ -103,7 +96,7 @@ def test_a_scene_that_is_a_program_too_does_not_run(tmp_path: Path) -> None:
     text = demo("cube").read_text() + '\n[solver.petsc_options]\nsnes_type = "python"\nsnes_python_type = "mine.py"\n'
     scene.write_text(text)
     (tmp_path / "sitecustomize.py").write_text("open('ran', 'w').close()\n")
-    line = refused("run", scene, "-o", tmp_path / "out", cwd=tmp_path)
+    line = refusal_of("run", scene, "-o", tmp_path / "out", cwd=tmp_path)
     assert "solver.petsc_options.snes_type = 'python': would run code" in line
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.py", "sitecustomize.py"]
 
@@ -129,7 +122,7 @@ def test_nothing_is_written_through_a_link(name: str, kind: str, folder: Path, v
         resume(folder, LONGER, SELF)
         assert Recording(folder).history["time"][-1] == 4.0
     else:
-        assert name in refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+        assert name in refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
         assert {other: data for other, data in content(folder).items() if other != name} == others
     assert victim.read_bytes() == before
 
@@ -303,14 +296,14 @@ def headed(head: bytes) -> bytes:
 def test_another_archive_is_refused(change: Callable[[Path], None], folder: Path) -> None:
     change(folder)
     before = content(folder)
-    refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+    refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
     assert content(folder) == before
 
 
 def test_a_field_without_end_in_a_history_is_refused(folder: Path) -> None:
     text = (folder / "history.csv").read_text()
     (folder / "history.csv").write_text(text.replace("\n", '\n"' + "a" * 200_000 + '",', 1))
-    assert "history.csv: field larger than" in refused("status", folder)
+    assert "history.csv: field larger than" in refusal_of("status", folder)
 
 
 @pytest.mark.parametrize(
@@ -387,7 +380,7 @@ def linked(kind: str) -> Callable[[Path, Path], None]:
 def test_fields_that_are_kept_elsewhere_are_refused(kind: str, folder: Path, victim: Path) -> None:
     linked(kind)(folder / "fields.vtkhdf", victim)
     before = content(folder)
-    assert "fields.vtkhdf" in refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+    assert "fields.vtkhdf" in refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
     assert content(folder) == before and victim.read_bytes() == MINE
     with contextlib.suppress(RecordingError):  # whoever reads them meets one line at most
         Recording(folder).fields(1.0)
@@ -483,7 +476,7 @@ def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> Non
 def test_a_foreign_study_names_runs_of_its_own_folder(study: Any, tmp_path: Path) -> None:
     """Before, 200,000 runs took the square of that."""
     (tmp_path / "study.json").write_text(json.dumps(study))
-    assert "study.json: is damaged" in refused("status", tmp_path)
+    assert "study.json: is damaged" in refusal_of("status", tmp_path)
 
 
 def test_a_column_named_often_is_one_column() -> None:
@@ -496,7 +489,7 @@ def test_a_column_named_often_is_one_column() -> None:
 @pytest.mark.parametrize("device", ["/dev/full", "/dev/zero", "/dev/stdin", "pipe"])
 def test_a_device_or_a_pipe_is_no_scene(device: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    said = refused("validate", tmp_path / device)
+    said = refusal_of("validate", tmp_path / device)
     assert "not a file" in said or device != "pipe" and "cannot be read" in said
 
 
@@ -505,7 +498,7 @@ def test_a_device_or_a_pipe_is_no_scene(device: str, tmp_path: Path) -> None:
 def test_a_pipe_in_a_folder_keeps_nobody_waiting(name: str, folder: Path) -> None:
     (folder / name).unlink(missing_ok=True)
     os.mkfifo(folder / name)
-    refused("run", "--resume", folder, "--set", LONGER[0], "-q")
+    refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
     assert "Traceback" not in run("status", folder).stderr
 
 
@@ -629,12 +622,9 @@ def test_a_simulation_says_what_it_needs(scene: Any) -> None:
 
 
 def test_no_step_after_the_end() -> None:
-    simulation = Simulation(pulled_cube(3.0), SELF)
-    steps = simulation.steps()
-    next(steps)
-    simulation.close()
-    with pytest.raises(RuntimeError, match="has been closed"):
+    with made(pulled_cube(3.0)) as simulation:
+        steps = simulation.steps()
         next(steps)
-    with pytest.raises(RuntimeError, match="has been closed"):
-        next(simulation.steps())
-    simulation.close()
+    for after in (steps, simulation.steps()):
+        with pytest.raises(RuntimeError, match="has been closed"):
+            next(after)

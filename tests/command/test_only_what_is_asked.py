@@ -25,7 +25,7 @@ from remodel_fenicsx.solver.continuation import Blend, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.watch.warnings import LockingWarning
 from tests.parts import pulled_cube
-from tests.runs import rows_of
+from tests.runs import made, rows_of
 
 SELF = MPI.COMM_SELF
 
@@ -52,45 +52,42 @@ class Calls:
 def test_a_state_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """How far it is from its limits: at the start of a step, of its solve, and for each Newton iteration."""
     calls = Calls(monkeypatch, Equilibrium, "_look")
-    simulation = Simulation(scene(), SELF)
-    iterations = sum(step.work.newton_iterations for step in simulation.stepper.march([1.0, 2.0, 3.0]))
-    assert iterations >= 6 and calls.number <= iterations + 2 * 3 + 1
-    simulation.close()
+    with made(scene()) as simulation:
+        iterations = sum(step.work.newton_iterations for step in simulation.stepper.march([1.0, 2.0, 3.0]))
+        assert iterations >= 6 and calls.number <= iterations + 2 * 3 + 1
 
 
 def test_a_state_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """r, J and F together where it is looked at, F and the driver in the pass; parameters only where they change."""
-    simulation = Simulation(scene(), SELF)
-    march = simulation.stepper.march([1.0, 2.0, 3.0])
-    next(march)
-    evaluations, parameters = Calls(monkeypatch, Quadrature, "evaluate"), Calls(monkeypatch, assembly, "point_values")
-    iterations = sum(step.work.newton_iterations for step in march)
-    assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
-    simulation.close()
+    with made(scene()) as simulation:
+        march = simulation.stepper.march([1.0, 2.0, 3.0])
+        next(march)
+        evaluations = Calls(monkeypatch, Quadrature, "evaluate")
+        parameters = Calls(monkeypatch, assembly, "point_values")
+        iterations = sum(step.work.newton_iterations for step in march)
+        assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
 
 
 def test_energies_of_elements_are_summed_up_once_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """They tell whether to look for elements that lock, and what such a look begins with."""
     calls, looks = (Calls(monkeypatch, LockingWarning, name) for name in ("energies", "work"))
-    simulation = Simulation(pulled_cube(3.0), SELF)
-    assert len(list(simulation.steps())) == 3 == calls.number
-    assert looks.number
-    simulation.close()
+    with made(pulled_cube(3.0)) as simulation:
+        assert len(list(simulation.steps())) == 3 == calls.number
+        assert looks.number
 
 
 def test_what_is_remembered_follows_every_change() -> None:
     """Of cells, unknowns and live parameters."""
-    simulation = Simulation(scene(), SELF)
-    equilibrium, cells = simulation.stepper.coupling.equilibrium, simulation.cells
-    seen = [equilibrium.extension().max_chain_extension]
-    simulation.unknown.x.array[:] = 0.05
-    seen.append(equilibrium.extension().max_chain_extension)
-    cells.dimension_values[:] *= 1.1
-    seen.append(equilibrium.extension().max_chain_extension)
-    equilibrium.tissue.contour_length.value *= 2
-    seen.append(equilibrium.extension().max_chain_extension)
-    np.testing.assert_allclose(np.array(seen[1:]) / seen[:-1], [1.05, 1.1, 0.5], rtol=1e-12)
-    simulation.close()
+    with made(scene()) as simulation:
+        equilibrium, cells = simulation.stepper.coupling.equilibrium, simulation.cells
+        seen = [equilibrium.extension().max_chain_extension]
+        simulation.unknown.x.array[:] = 0.05
+        seen.append(equilibrium.extension().max_chain_extension)
+        cells.dimension_values[:] *= 1.1
+        seen.append(equilibrium.extension().max_chain_extension)
+        equilibrium.tissue.contour_length.value *= 2
+        seen.append(equilibrium.extension().max_chain_extension)
+        np.testing.assert_allclose(np.array(seen[1:]) / seen[:-1], [1.05, 1.1, 0.5], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -111,13 +108,12 @@ def test_cells_that_never_move_have_no_pass(
     calls, kernels = Calls(monkeypatch, RemodelingPass, "apply"), Calls(monkeypatch, jit, "expression")
     cells = {"initial": [0.6, 0.0, 0.8]}
     model = {"kinematics": "full" if "rotation" in remodeling.values() else "point"}
-    simulation = Simulation(scene(remodeling=remodeling, cells=cells, model=model), SELF)
-    needed, before = kernels.number, simulation.cells.structure_tensor().copy()
-    list(simulation.steps())
-    assert calls.number == passes
-    if not remodeling or not passes:  # the axis that the law of rotation turns lies along the load already
-        assert np.array_equal(before, simulation.cells.structure_tensor()) == (passes == 0)
-    simulation.close()
+    with made(scene(remodeling=remodeling, cells=cells, model=model)) as simulation:
+        needed, before = kernels.number, simulation.cells.structure_tensor().copy()
+        list(simulation.steps())
+        assert calls.number == passes
+        if not remodeling or not passes:  # the axis that the law of rotation turns lies along the load already
+            assert np.array_equal(before, simulation.cells.structure_tensor()) == (passes == 0)
     if not passes:
         Simulation(scene(cells=cells), SELF).close()
         assert kernels.number - needed > needed
@@ -157,12 +153,11 @@ def test_stress_that_nobody_writes_is_not_compiled(monkeypatch: pytest.MonkeyPat
 
     sizes = []
     for driver, name in (("cauchy", "cauchy_stress"), ("pk2", "cauchy_stress"), ("cauchy", "fibre_angle")):
-        simulation = Simulation(scene().with_values({"remodeling.driver": driver}), SELF)
-        fields = ElementFields(simulation.scene.geometry, simulation.stepper, [name])
-        assert set(fields()) == {name}
-        sizes.append(None if fields._state is None else fields._state.components)
-        assert (fields._shared is simulation.stepper.remodeling) == (sizes[-1] is None)
-        simulation.close()
+        with made(scene().with_values({"remodeling.driver": driver})) as simulation:
+            fields = ElementFields(simulation.scene.geometry, simulation.stepper, [name])
+            assert set(fields()) == {name}
+            sizes.append(None if fields._state is None else fields._state.components)
+            assert (fields._shared is simulation.stepper.remodeling) == (sizes[-1] is None)
     assert sizes == [None, 18, 9]  # the stress that drives the cells is there already
 
 
@@ -234,14 +229,13 @@ def test_the_printed_law_imports_no_other_coupling() -> None:
 
 def test_no_form_is_made_in_the_middle_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a step in parts needs is there before the first step."""
-    simulation = Simulation(scene(), SELF)
-    forms, expressions = Calls(monkeypatch, jit, "form"), Calls(monkeypatch, jit, "expression")
-    coupling: Any = simulation.stepper.coupling
-    assert isinstance(coupling.blend, Blend)
-    list(simulation.stepper.march([1.0, 2.0]))
-    work, before = Work(), dict(simulation.state.loading.values)
-    loads = {name: 1.1 * value for name, value in before.items()}
-    coupling._solve_in_parts(3.0, before, loads, work, failure=None)
-    assert work.substeps >= 2  # the cells', the loads'
-    assert forms.number == 0 and expressions.number == 0
-    simulation.close()
+    with made(scene()) as simulation:
+        forms, expressions = Calls(monkeypatch, jit, "form"), Calls(monkeypatch, jit, "expression")
+        coupling: Any = simulation.stepper.coupling
+        assert isinstance(coupling.blend, Blend)
+        list(simulation.stepper.march([1.0, 2.0]))
+        work, before = Work(), dict(simulation.state.loading.values)
+        loads = {name: 1.1 * value for name, value in before.items()}
+        coupling._solve_in_parts(3.0, before, loads, work, failure=None)
+        assert work.substeps >= 2  # the cells', the loads'
+        assert forms.number == 0 and expressions.number == 0

@@ -1,7 +1,7 @@
 """Start, tutorials and how-to pages: each command and each file of a page, in its order, with short times.
 
 What a page says that a command prints is compared, all but the numbers. `docs/make tutorials` runs the same pages in
-full and brings numbers and pictures up to date. NOT_RUN lists the commands that are shown and not run, and why.
+full and brings numbers and pictures up to date. pages.toml lists the commands that are shown and not run, and why.
 docs/fit.md is run by tests/studies/test_fit.py, docs/my_own_vessel.md by tests/body/test_my_own_vessel.py.
 """
 
@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -22,53 +23,10 @@ from tests.forks import forked
 
 ROOT = Path(__file__).parents[2]
 TUBE = "tutorial_tube"
-SHORT = {  # a test's times for those of the page
-    "end = 100.0": "end = 2.0",
-    "time.end=120": "time.end=3",
-    "time.end=300": "time.end=2",
-    "demos/artery.toml -o artery": "demos/artery.toml -o artery --set time.end=1",
-    "demos/artery.toml -o first": "demos/artery.toml -o first --set time.end=1",
-    "loads.pressure.value=2.4 -o half": "loads.pressure.value=2.4 -o half --set time.end=1",
-    "demos/layers.toml -o": "demos/layers.toml --set time.end=2 -o",
-    "run bent.toml": "run bent.toml --set time.end=1",
-    "run fitted/scene.toml": "run fitted/scene.toml --set time.end=2",
-    "inflation.toml -o": "inflation.toml --starts 1 -o",
-    "--time 0 25 150": "--time 0 1",
-    "--time 0 100": "--time 0 2",
-    "--time 0 150": "--time 0 2",
-    "--time 0 60": "--time 0 1",
-}
-NOT_RUN = {  # beginnings of commands in blocks of text, which nobody runs
-    "git clone": "needs the network",
-    "cd ": "the clone is where the tests are",
-    "docker ": "tests/container/run does, where there is an engine",
-    "apptainer ": "needs a cluster's engine",
-    "sbatch ": "needs a cluster's queue",
-    './with-fenicsx mpirun -n "$SLURM_NTASKS"': "the same; ranks are run above it on the page",
-    "./with-fenicsx remodel-fenicsx status vessel": "the same",
-    "./with-fenicsx remodel-fenicsx info            # makes": "is run on the first page",
-    "./with-fenicsx remodel-fenicsx trade": "tests/studies/test_trade.py does; it takes the time that it gets",
-    "./with-fenicsx remodel-fenicsx run demos/artery.toml --set loads.force.value=2.4": "shows a refusal",
-}
+OF_PAGES = tomllib.loads((Path(__file__).parent / "pages.toml").read_text(encoding="utf-8"))
+SHORT, NOT_RUN, LEFT_BEHIND = (OF_PAGES[name] for name in ("short", "not_run", "left_behind"))
 REFUSAL = "loads.force"
 PAGES = ["start", *sorted(page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md"))]
-LEFT_BEHIND = {
-    "start": ["first/report.html", "half/history.csv"],
-    "tutorial_artery": ["artery/history.csv", "artery.png"],
-    "tutorial_tube": ["high/report.html", "tube.png"],
-    "tutorial_layers": ["layers/report.html", "layers.png", "bent-axes.vtu", "bent/history.csv", "bent.png"],
-    "tutorial_residual_stress": ["with/history.csv", "angles.png"],
-    "tutorial_fit": ["fitted/fit.csv", "fitted/fit.png", "vessel/history.csv"],
-    "tutorial_biaxial": ["biaxial/fit.csv", "biaxial/fit.png", "held/report.html"],
-    "tutorial_sweep": ["sweep/sweep.csv", "sweep/sweep.png", "at-16/history.csv"],
-    "howto_accuracy": ["fast/history.csv"],
-    "howto_container": [],
-    "howto_export": ["fibres.feb", "fibres.inp", "fibres.vtu", "fibres.csv"],
-    "howto_extend": ["driven/history.csv"],
-    "howto_paraview": ["tube/fields_body.vtkhdf"],
-    "howto_ranks": ["ranks/history.csv"],
-    "howto_resume": ["long/history.csv"],
-}
 
 
 def blocks(page: str) -> list[tuple[str, str]]:
@@ -154,14 +112,6 @@ def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(capsys: pytest
     assert capsys.readouterr().err.split() == " ".join(shown).split()
 
 
-README_SHORT = {  # a test's times, and numbers of runs, for those of the README
-    "run demos/artery.toml": "run demos/artery.toml --set time.end=1",
-    "inflation.toml": "inflation.toml --starts 1 --no-likelihood-profiles",
-    "sweep demos/layers.toml loads.pressure.value=8:16:3": "sweep demos/layers.toml loads.pressure.value=8:16:2 "
-    "--set time.end=1",
-}
-
-
 def test_the_examples_of_the_readme_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -170,7 +120,7 @@ def test_the_examples_of_the_readme_run(
     for _, text in blocks(TUBE):
         keep(text)
     text, _ = (ROOT / "README.md").read_text(encoding="utf-8").split("## More commands")
-    for long, short in README_SHORT.items():
+    for long, short in OF_PAGES["short_readme"].items():
         assert long in text
         text = text.replace(long, short)
     lines = [line.partition("    #")[0] for block in re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)

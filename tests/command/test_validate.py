@@ -11,6 +11,7 @@ import pytest
 import tomlkit
 
 from remodel_fenicsx import cli, simulation
+from tests.conftest import Refused
 from tests.mesh_files import changed
 
 
@@ -47,17 +48,14 @@ BAD = tomllib.loads((Path(__file__).parent / "scenes_of_bad_files.toml").read_te
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_run_refuses_validate_refuses(tube: Path, case: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_run_refuses_validate_refuses(tube: Path, case: str, refused: Refused) -> None:
     """The same line, exit code 2, and nothing is written."""
     tables = dict(BAD[case])
     words = tables.pop("said")
     scene, out = written(tube, tables), tube.parent / "out"
     before = {*tube.parent.iterdir()}
-    assert cli.main(["validate", str(scene)]) == 2
-    said = capsys.readouterr()
-    assert words in said.err and len(said.err.strip().splitlines()) == 1 and not said.out
-    assert cli.main(["run", str(scene), "-o", str(out)]) == 2
-    assert capsys.readouterr().err == said.err
+    said = refused("validate", scene)
+    assert words in said and refused("run", scene, "-o", out) == said
     assert {*tube.parent.iterdir()} == before
 
 
@@ -74,10 +72,15 @@ def test_files_that_fit_are_valid(tube: Path, capsys: pytest.CaptureFixture[str]
     ],
 )
 def test_what_would_take_long_is_said(
-    tube: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], limit: str, words: str
+    tube: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    limit: str,
+    words: str,
+    refused: Refused,
 ) -> None:
     """Files that are not there are found nevertheless."""
     monkeypatch.setattr(simulation, limit, 10)
     assert cli.main(["validate", str(written(tube, {"cells": {"fibres": "far.csv"}}))]) == 0
     assert words in capsys.readouterr().out
-    assert cli.main(["validate", str(written(tube, {"cells": {"fibres": "none.csv"}}))]) == 2
+    refused("validate", written(tube, {"cells": {"fibres": "none.csv"}}))

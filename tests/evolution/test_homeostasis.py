@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx import Recording, Scene, Simulation
@@ -18,22 +17,16 @@ from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Case, slowly
 from tests.parts import tube
+from tests.runs import SELF, simulated
+from tests.values import ANGLES, isotropic
 
-SELF = MPI.COMM_SELF
 Array = NDArray[np.float64]
 
 
 def values(kinematics: str = "radial", **tables: Any) -> dict[str, Any]:
     """The artery of isotropic cells."""
-    base: dict[str, Any] = {
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "tube"},
-        "model": {"kinematics": kinematics},
-        "cells": {"initial": "isotropic"},
-        "time": {"end": "equilibrium"},
-        "output": {"columns": ["pass_residual"], "fields": False},
-    }
-    return base | tables
+    base = {"time": {"end": "equilibrium"}, "output": {"columns": ["pass_residual"], "fields": False}}
+    return isotropic(kinematics=kinematics, **base | tables)
 
 
 def artery(kinematics: str = "radial", **tables: Any) -> Scene:
@@ -140,21 +133,14 @@ def tube_in_time(
     **tables: Any,
 ) -> Any:
     """Of a tube on a ray, at once and in time to kappa t = 37: row, A at all points, simulation."""
-    ramp = [list(pair) for pair in factors]
-    base: dict[str, Any] = {
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
-        "model": {"kinematics": "radial"},
-        "mesh": {"degree": 2},
-        "cells": {"initial": "isotropic"},
-        "loads": {name: {"value": v, "ramp": ramp} for name, v in (("pressure", pressure), ("elongation", elongation))},
-        "output": {"fields": False},
-    }
-    found = []
+    ramp, found = [list(pair) for pair in factors], []
+    loads = {name: {"value": v, "ramp": ramp} for name, v in (("pressure", pressure), ("elongation", elongation))}
+    shape = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0}
+    base = isotropic(None, **{"geometry": shape, "mesh": {"degree": 2}, "loads": loads} | tables)
     at_once: dict[str, Any] = {"end": "equilibrium"} | ({"tolerance": tolerance} if tolerance else {})
     for time in (at_once, {"end": 1500.0, "tolerance": 0.5}):
-        simulation = Simulation(scene_from_dict(base | tables | {"time": time}), SELF)
-        row = list(simulation.steps())[-1].row
-        found.append((row, simulation.state.equilibrium_cells.structure_tensor(), simulation))
+        with simulated(base | {"time": time}) as (simulation, rows):
+            found.append((rows[-1], simulation.state.equilibrium_cells.structure_tensor(), simulation))
     return found
 
 
@@ -162,13 +148,9 @@ HALF_WAY_BACK = [(0.0, 0.0), (25.0, 1.0), (50.0, -0.3)]
 CAROTID: dict[str, Any] = {
     "geometry": {"shape": "tube", "inner_radius": 3.2, "outer_radius": 4.3, "length": 20.0},
     "material": {
-        "lame_lambda": 600.0,
-        "lame_mu": 3.0,
-        "chain_density": 2e25,
-        "temperature": 310.15,
-        "stress_unit": "kPa",
+        "lame_lambda": 600.0, "lame_mu": 3.0, "chain_density": 2e25, "temperature": 310.15, "stress_unit": "kPa",
     },
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("formulation", ["displacement", "selective-integration"])
@@ -178,7 +160,7 @@ def test_of_several_states_it_is_the_one_that_time_comes_to(formulation: str) ->
     (at_once, cells, _), (in_time, others, _) = tube_in_time(
         13.332, 0.3, [(0.0, 0.0), (25.0, 1.0)], mesh=mesh, **CAROTID
     )
-    for name in ("fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"):
+    for name in ANGLES:
         assert at_once[name] == pytest.approx(in_time[name], abs=0.5)
     assert in_time["fibre_angle_outer"] < 10
     assert at_once["inner_radius"] == pytest.approx(in_time["inner_radius"], rel=1e-3)

@@ -20,6 +20,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from tests.conftest import Case, slowly
 from tests.parts import tube
 from tests.runs import goes_on, taylor_orders
+from tests.values import isotropic
 
 Array = NDArray[np.float64]
 
@@ -141,15 +142,12 @@ def test_a_run_of_before_ends_at_a_step_without_a_solution(tmp_path: Path) -> No
 
 def pulled_cube(force: float, end: float, law: str = "explicit", kappa: float = 0.5, **material: float) -> Simulation:
     """Isotropic cells, pulled from the first step on."""
-    values: dict[str, Any] = {
-        "geometry": {"shape": "cube"},
-        "material": material,
-        "cells": {"initial": "isotropic"},
-        "loads": {"force": {"value": force, "ramp": [[0.0, 1.0]]}},
-        "remodeling": {"law": law, "coupling": "implicit", "kappa": kappa},
-        "time": {"end": end},
-        "output": {"columns": ["mean_fibre_angle", "newton_iterations"]},
-    }
+    values = isotropic(
+        None, "auto", geometry={"shape": "cube"}, material=material, time={"end": end},
+        loads={"force": {"value": force, "ramp": [[0.0, 1.0]]}},
+        remodeling={"law": law, "coupling": "implicit", "kappa": kappa},
+        output={"columns": ["mean_fibre_angle", "newton_iterations"]},
+    )  # fmt: skip
     return Simulation(scene_from_dict(values), MPI.COMM_SELF)
 
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from remodel_fenicsx import Scene
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.schema.settings import COUPLINGS
 from remodel_fenicsx.simulation import Simulation
+from tests.runs import made, simulated
 
 PAIRS = [
     (law, coupling)
@@ -44,13 +44,10 @@ def scene(first: float, second: float, law: str, coupling: str, **changes: Any) 
 @lru_cache
 def solved(*arguments: Any, changes: tuple[tuple[str, Any], ...] = ()) -> tuple[np.ndarray, np.ndarray, Simulation]:
     """A at all points of the last row, (elements, points, 3, 3); which elements are of the media; the simulation."""
-    simulation = Simulation(scene(*arguments, **dict(changes)), MPI.COMM_SELF)
-    for _ in simulation.steps():
-        pass
-    simulation.close()
-    domain = simulation.domain
-    cells = simulation.state.equilibrium_cells
-    return cells.structure_tensor(), domain.element_region == domain.regions["media"], simulation
+    with simulated(scene(*arguments, **dict(changes))) as (simulation, _):
+        domain = simulation.domain
+        cells = simulation.state.equilibrium_cells
+        return cells.structure_tensor(), domain.element_region == domain.regions["media"], simulation
 
 
 def one_better(simulation: Simulation) -> np.ndarray:
@@ -81,9 +78,8 @@ def test_cells_without_kappa_stay(law: str, coupling: str) -> None:
     lengths = simulation.state.cells.dimension_values
     np.testing.assert_allclose(np.sort(lengths[~media]), np.broadcast_to([0.5, 0.26**0.5, 0.7], lengths[~media].shape),
                                rtol=0, atol=1e-12)  # fmt: skip
-    start = Simulation(scene(FIRST, 0.0, law, coupling), MPI.COMM_SELF)
-    np.testing.assert_allclose(both[~media], start.cells.structure_tensor()[~media], rtol=0, atol=1e-12)
-    start.close()
+    with made(scene(FIRST, 0.0, law, coupling)) as start:
+        np.testing.assert_allclose(both[~media], start.cells.structure_tensor()[~media], rtol=0, atol=1e-12)
 
 
 def test_chosen_steps_hold_the_error_of_both_regions() -> None:
@@ -99,10 +95,9 @@ def test_chosen_steps_hold_the_error_of_both_regions() -> None:
 def test_no_step_is_longer_than_the_fastest_region_allows() -> None:
     """kappa dt of an explicit rule, wherever it is largest."""
     held = {"time.tolerance": 40.0, "time.end": 30.0}
-    made = Simulation(scene(0.4, SECOND, "tensor", "extrapolated", **held), MPI.COMM_SELF)
-    lengths = np.diff([0.0, *(step.time for step in made.steps())])
-    longest = made.stepper.coupling.traits.longest / 0.4
-    made.close()
+    with made(scene(0.4, SECOND, "tensor", "extrapolated", **held)) as chosen:
+        lengths = np.diff([0.0, *(step.time for step in chosen.steps())])
+        longest = chosen.stepper.coupling.traits.longest / 0.4
     assert 0.5 * longest < lengths.max() <= longest * (1 + 1e-9)
 
 

@@ -21,9 +21,9 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.fit import fit
 from remodel_fenicsx.studies.stability import stability
 from tests.reference.radial import CIRCUMFERENTIAL, RadialMaterial, Tube, cauchy_stress, structure
-from tests.runs import goes_on, rows_of
+from tests.runs import goes_on, made, rows_of, simulated
+from tests.values import ANGLES, ramped, isotropic
 
-ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 TURNOVER = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
 GROWING = [{"law": "tensor", "coupling": coupling, "turnover": TURNOVER} for coupling in ("staggered", "extrapolated")]
 LAWS = [("tensor", "extrapolated"), ("tensor", "relaxed"), ("explicit", "staggered")]
@@ -39,19 +39,16 @@ def pulse(a: float) -> list[dict[str, Any]]:
 
 def artery(cases: Any = (), end: float = 30.0, columns: Any = (), pressure: float = 4.8, **tables: Any) -> Any:
     """The paper's artery on one radius."""
-    ramp = [[0.0, 0.0], [24.0, 1.0]]
-    values: dict[str, Any] = {
-        "preset": "consistent",
-        "geometry": {"shape": "tube"},
-        "model": {"kinematics": "radial"},
-        "mesh": {"refinement": 4, "degree": 2},
-        "cells": {"initial": "isotropic"},
-        "material": {"repulsion": "length"},
-        "loads": {"pressure": {"value": pressure, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}},
-        "time": {"end": end, "step": 2.0},
-        "output": {"fields": False, "columns": list(columns)},
-    }
-    return values | ({"cases": list(cases)} if cases else {}) | tables
+    values = isotropic(
+        "consistent",
+        mesh={"refinement": 4, "degree": 2},
+        material={"repulsion": "length"},
+        loads=ramped(24.0, pressure=pressure, elongation=0.1),
+        time={"end": end, "step": 2.0},
+        output={"fields": False, "columns": list(columns)},
+        cases=list(cases) or None,
+    )
+    return values | tables
 
 
 def rest(cases: Any = (), **changes: Any) -> np.ndarray:
@@ -114,20 +111,18 @@ def test_against_an_independent_program() -> None:
         mean = sum(weight * stress for weight, stress in zip(weights, stresses, strict=True))
         squares = structure(squares, mean, kappa * step, 1.0)
     cases = [{"weight": w, "loads": {"pressure": f}} for w, f in zip(weights, factors, strict=True)]
-    simulation = Simulation(scene_from_dict(artery(
-        cases, end, remodeling={"coupling": "staggered"}, material={"repulsion": "log"}
-    )))  # fmt: skip
-    found = [step.row for step in simulation.steps()]
-    simulation.close()
-    names = ("inner_radius", "outer_radius", "inner_radius@2", "outer_radius@2")
-    np.testing.assert_allclose([[row[name] for name in names] for row in found], rows, rtol=5e-4)
-    assert found[-1]["inner_radius@2"] > found[-1]["inner_radius"] + 0.05
-    order = np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
-    cells, local = simulation.cells, simulation.cells.local_axes.axes
-    around = np.einsum("epa,epab,epb->ep", local[..., 0, :], cells.structure_tensor(), local[..., 0, :]).ravel()[order]
-    depth = simulation.quadrature.coordinates[..., 0].ravel()[order]
-    expected = np.interp(depth, tube.points, squares[:, CIRCUMFERENTIAL])
-    np.testing.assert_allclose(around, expected, atol=5e-3)
+    with made(artery(cases, end, remodeling={"coupling": "staggered"}, material={"repulsion": "log"})) as simulation:
+        found = [step.row for step in simulation.steps()]
+        names = ("inner_radius", "outer_radius", "inner_radius@2", "outer_radius@2")
+        np.testing.assert_allclose([[row[name] for name in names] for row in found], rows, rtol=5e-4)
+        assert found[-1]["inner_radius@2"] > found[-1]["inner_radius"] + 0.05
+        order = np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
+        cells, local = simulation.cells, simulation.cells.local_axes.axes
+        radial = local[..., 0, :]
+        around = np.einsum("epa,epab,epb->ep", radial, cells.structure_tensor(), radial).ravel()[order]
+        depth = simulation.quadrature.coordinates[..., 0].ravel()[order]
+        expected = np.interp(depth, tube.points, squares[:, CIRCUMFERENTIAL])
+        np.testing.assert_allclose(around, expected, atol=5e-3)
 
 
 def test_which_case_is_first_changes_no_cell() -> None:
@@ -220,10 +215,8 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
     tables = {"remodeling": GROWING[0], "columns": columns}
     changes = []
     for cases in (pulse(0.33), *([case | {"weight": 1.0}] for case in pulse(0.33))):
-        simulation = Simulation(scene_from_dict(artery(cases, end=4.0, **tables)))
-        list(simulation.steps())
-        changes.append([np.log(simulation.stepper.turnover._values(name)) for name in columns[:2]])
-        simulation.close()
+        with simulated(artery(cases, end=4.0, **tables)) as (simulation, _):
+            changes.append([np.log(simulation.stepper.turnover._values(name)) for name in columns[:2]])
     both, diastole, systole = np.array(changes)
     np.testing.assert_allclose(both, 2 / 3 * diastole + 1 / 3 * systole, atol=1e-12)
     assert np.abs(systole - diastole).max() > 1e-3
@@ -231,9 +224,11 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
 
 def test_kinematics_agree() -> None:
     """One radius, and a half-plane of closed ends: each case has a length of its own."""
-    ramp = [[0.0, 0.0], [8.0, 1.0]]
-    loads = {"pressure": {"value": 4.8, "ramp": ramp}, "elongation": {"value": 0.0, "ramp": ramp}}
-    base = {"loads": loads, "supports": {"ends": "closed"}, "time": {"end": 16.0, "step": 4.0}}
+    base = {
+        "loads": ramped(8.0, pressure=4.8, elongation=0.0),
+        "supports": {"ends": "closed"},
+        "time": {"end": 16.0, "step": 4.0},
+    }
     one, two = (
         rows_of(artery(pulse(0.33), **base, mesh={"degree": 2}, model={"kinematics": name}))[-1]
         for name in ("radial", "axisymmetric")
@@ -318,12 +313,11 @@ def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
         [{"weight": 0.9}, {"weight": 0.1, "loads": {"elongation": 40.0}}],
         remodeling={"law": "none", "coupling": "staggered"},
     )
-    simulation = Simulation(scene_from_dict(values | {"solver": {"maximum_halvings": 1}}))
-    states, before = list(simulation.state.cases().values()), []
-    with pytest.raises(StepFailure, match="load case 2: no equilibrium at time"):
-        for step in simulation.steps():
-            before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]
-    simulation.close()
+    with made(values | {"solver": {"maximum_halvings": 1}}) as simulation:
+        states, before = list(simulation.state.cases().values()), []
+        with pytest.raises(StepFailure, match="load case 2: no equilibrium at time"):
+            for step in simulation.steps():
+                before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]
     for state, (unknown, loads, time) in zip(states, before, strict=True):
         np.testing.assert_array_equal(state.unknown.x.array, unknown)
         assert (state.loading.values, state.time) == (loads, time)

@@ -9,40 +9,28 @@ import pytest
 
 from remodel_fenicsx.model import tensor_law
 from tests.runs import last_row
+from tests.values import ramped, isotropic
 
 
 @pytest.mark.parametrize(("exponent", "angle"), [(1.0, 35.26), (2.0, 26.57), (4.0, 14.04)])
 def test_fibres_of_a_thin_closed_tube(exponent: float, angle: float) -> None:
     """Its hoop stress is twice the axial one: tan^2 a = 2^-n; n = 1 is netting analysis."""
-    values = {
-        "preset": "consistent",
-        "geometry": {"shape": "tube", "inner_radius": 100.0, "outer_radius": 100.5, "length": 10.0},
-        "model": {"kinematics": "radial"},
-        "cells": {"initial": "isotropic"},
-        "supports": {"ends": "closed"},
-        "remodeling": {"exponent": exponent, "kappa": 0.1},
-        "loads": {
-            "pressure": {"value": 0.005, "ramp": [[0.0, 0.0], [10.0, 1.0]]},
-            "elongation": {"value": 0.0, "ramp": [[0.0, 0.0]]},
-        },
-        "time": {"end": 300.0, "step": 5.0},
-        "output": {"fields": False},
-    }
+    values = isotropic(
+        "consistent", geometry={"shape": "tube", "inner_radius": 100.0, "outer_radius": 100.5, "length": 10.0},
+        supports={"ends": "closed"}, remodeling={"exponent": exponent, "kappa": 0.1},
+        loads=ramped(10.0, pressure=0.005, elongation=0.0), time={"end": 300.0, "step": 5.0},
+    )  # fmt: skip
     assert last_row(values)["fibre_angle_middle"] == pytest.approx(angle, abs=0.25)
 
 
 def stiff_cube(**remodeling: Any) -> dict[str, Any]:
     """Under a stress of 10, which hardly deforms it."""
-    return {
-        "geometry": {"shape": "cube", "side": 1.0},
-        "model": {"kinematics": "point"},
-        "material": {"lame_mu": 1e6, "lame_lambda": 1e6},
-        "cells": {"initial": "isotropic"},
-        "loads": {"force": {"value": 10.0, "ramp": [[0.0, 1.0]]}},
-        "remodeling": {"law": "tensor", "coupling": "staggered", "kappa": 0.02} | remodeling,
-        "time": {"end": 20.0, "step": 1.0},
-        "output": {"fields": False, "columns": ["asleep_share", "mean_fibre_angle"]},
-    }
+    return isotropic(
+        None, "point", geometry={"shape": "cube", "side": 1.0}, material={"lame_mu": 1e6, "lame_lambda": 1e6},
+        loads={"force": {"value": 10.0, "ramp": [[0.0, 1.0]]}}, time={"end": 20.0, "step": 1.0},
+        remodeling={"law": "tensor", "coupling": "staggered", "kappa": 0.02} | remodeling,
+        output={"fields": False, "columns": ["asleep_share", "mean_fibre_angle"]},
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])

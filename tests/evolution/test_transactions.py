@@ -22,6 +22,7 @@ from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.run_folder import RunFolder
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from tests.parts import pulled_cube
+from tests.runs import made
 
 END, FAILS = 5, 3.0
 WITHOUT_LIMIT = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -66,10 +67,9 @@ def numbers(step: Step) -> dict[str, float]:
 @pytest.fixture(scope="module")
 def undisturbed() -> tuple[list[dict[str, float]], dict[str, Any]]:
     """All rows, and everything at the end."""
-    simulation = Simulation(scene(), MPI.COMM_SELF)
-    rows = [numbers(step) for step in simulation.steps()]
-    last = everything(simulation)
-    simulation.close()
+    with made(scene()) as simulation:
+        rows = [numbers(step) for step in simulation.steps()]
+        last = everything(simulation)
     return rows, last
 
 
@@ -202,27 +202,25 @@ def test_who_fails_before_the_first_step_leaves_the_start(undisturbed: Any) -> N
         def started(self, step: Step) -> None:
             raise RuntimeError(f"not at {step.time}")
 
-    simulation = Simulation(scene(), MPI.COMM_SELF)
-    before = everything(simulation)
-    with pytest.raises(RuntimeError, match="not at 0.0"):
-        next(simulation.steps([Refuses()]))
-    assert_same(everything(simulation), before)
-    assert [numbers(step) for step in simulation.steps()] == undisturbed[0]
-    simulation.close()
+    with made(scene()) as simulation:
+        before = everything(simulation)
+        with pytest.raises(RuntimeError, match="not at 0.0"):
+            next(simulation.steps([Refuses()]))
+        assert_same(everything(simulation), before)
+        assert [numbers(step) for step in simulation.steps()] == undisturbed[0]
 
 
 def test_who_fails_after_a_step_was_accepted_leaves_it_accepted(undisturbed: Any) -> None:
-    simulation = Simulation(scene(), MPI.COMM_SELF)
-    watchers = [simulation.observer, Spoiler("committed", RuntimeError("too late"))]
-    with pytest.raises(RuntimeError, match="too late"):
-        list(simulation.stepper.march([1.0, 2.0, 3.0, 4.0], watchers))
-    assert simulation.state.time == FAILS and simulation.state.number == 3
-    with pytest.raises(ValueError, match="does not come after"):
-        simulation.stepper.advance(FAILS, watchers)
-    rows = [numbers(simulation.stepper.advance(time, watchers)) for time in (4.0, 5.0)]
-    assert rows == undisturbed[0][3:]
-    assert_same(everything(simulation), undisturbed[1])
-    simulation.close()
+    with made(scene()) as simulation:
+        watchers = [simulation.observer, Spoiler("committed", RuntimeError("too late"))]
+        with pytest.raises(RuntimeError, match="too late"):
+            list(simulation.stepper.march([1.0, 2.0, 3.0, 4.0], watchers))
+        assert simulation.state.time == FAILS and simulation.state.number == 3
+        with pytest.raises(ValueError, match="does not come after"):
+            simulation.stepper.advance(FAILS, watchers)
+        rows = [numbers(simulation.stepper.advance(time, watchers)) for time in (4.0, 5.0)]
+        assert rows == undisturbed[0][3:]
+        assert_same(everything(simulation), undisturbed[1])
 
 
 # ---------------------------------------------------------------- two simulations in one process

@@ -14,33 +14,29 @@ from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.model import residual_stress as closing
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.turnover import rates
+from remodel_fenicsx.model.laws import turnover_rates
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
-from tests.runs import goes_on, made, taylor_orders
+from tests.runs import goes_on, last_row, made, taylor_orders
+from tests.values import ANGLES, ramped, isotropic
 
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLUMNS = ["content", "natural_length"]
-ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 
 
 def wall(end: float, step: float, turnover: dict[str, float] | None, columns: list[str], **changes: Any) -> Any:
     """A tube of 1 to 1.3 under a pressure of 1.2 and an elongation of 10 %."""
-    ramp = [[0.0, 0.0], [24.0, 1.0]]
-    remodeling = {"turnover": turnover} if turnover else {}
-    return {
-        "preset": "consistent",
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0},
-        "model": {"kinematics": "radial"},
-        "mesh": {"refinement": 2, "degree": 2},
-        "cells": {"initial": "isotropic"},
-        "remodeling": remodeling | changes,
-        "loads": {"pressure": {"value": 1.2, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}},
-        "time": {"end": end, "step": step},
-        "output": {"fields": False, "columns": [*ANGLES, "outer_radius", "stored_energy", *columns]},
-    }
+    return isotropic(
+        "consistent",
+        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0},
+        mesh={"refinement": 2, "degree": 2},
+        remodeling=({"turnover": turnover} if turnover else {}) | changes,
+        loads=ramped(24.0, pressure=1.2, elongation=0.1),
+        time={"end": end, "step": step},
+        output={"fields": False, "columns": [*ANGLES, "outer_radius", "stored_energy", *columns]},
+    )
 
 
 def opening_angle(simulation: Simulation) -> float:
@@ -52,7 +48,7 @@ def opening_angle(simulation: Simulation) -> float:
 
 def simulated(values: dict[str, Any]) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
     """All rows, and content and natural length at the points in the order of their radii."""
-    with made(scene_from_dict(values)) as simulation:
+    with made(values) as simulation:
         rows = [dict(step.row) for step in simulation.steps()]
         turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
         known = {} if turnover is None else {name: turnover._values(name).ravel()[order] for name in COLUMNS}
@@ -233,7 +229,7 @@ def test_rates_against_their_equation() -> None:
     chain, r0, contour, time = CHAINS["wormlike"], 1.0, 1.594, 40.0
     tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(4), natural_length=np.array([1.0, 1.3, 1.3, 1.0]))
     stretches = np.array([1.1, 1.15, 0.9, 1.4])
-    found = rates(tissue, stretches * tissue.natural_length, time, 1.1, 1.0)
+    found = turnover_rates(tissue, stretches * tissue.natural_length, time, 1.1, 1.0)
     tension = stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
     assert found.content == pytest.approx(np.clip(tension - 1, -1, 1) / time, abs=1e-15)
     growth = (1 / time + np.maximum(found.content, 0)) * (stretches / 1.1 - 1)
@@ -372,15 +368,10 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
 
 def cube(end: float, step: float, turnover: dict[str, float], **changes: Any) -> dict[str, Any]:
     """Equal cells under a force: one point."""
-    return {
-        "preset": "consistent",
-        "geometry": {"shape": "cube"},
-        "cells": {"initial": "isotropic"},
-        "loads": {"force": {"value": 3.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
-        "remodeling": {"turnover": {"time": 40.0} | turnover} | changes,
-        "time": {"end": end, "step": step},
-        "output": {"fields": False, "columns": COLUMNS},
-    }
+    return isotropic(
+        "consistent", "point", geometry={"shape": "cube"}, loads=ramped(10.0, force=3.0), output={"columns": COLUMNS},
+        remodeling={"turnover": {"time": 40.0} | turnover} | changes, time={"end": end, "step": step},
+    )  # fmt: skip
 
 
 def test_steps_that_are_too_long_for_the_turnover_are_said() -> None:
@@ -407,9 +398,7 @@ def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: f
         values["loads"]["pressure"]["ramp"] += [[1400.0, 1.0], [1424.0, factor]]
         values["time"] = {"end": "equilibrium", "step": 4.0}
         values["output"]["columns"].append("inner_radius")
-        simulation = Simulation(scene_from_dict(values))
-        row = dict([step.row for step in simulation.steps()][-1])
-        simulation.close()
+        row = last_row(values)
         wall_thickness = row["outer_radius"] - row["inner_radius"]
         found.append((wall_thickness, factor * row["inner_radius"] / wall_thickness))
     assert np.divide(found[1], found[0]) == pytest.approx([thickness, stress], rel=0.02)
@@ -421,11 +410,8 @@ def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instabilit
     """A deposition stretch that the load never reaches: the natural length falls too, and the rates with it."""
     values = cube(200.0, 2.0, {"time": 10.0, "deposition_stretch": 1.59})
     values["loads"]["force"]["value"] = 0.3
-    simulation = Simulation(scene_from_dict(values))
     with caplog.at_level(NOTICE):
-        rows = [dict(step.row) for step in simulation.steps()]
-    simulation.close()
-    assert rows[-1]["content"] < 0.1
+        assert last_row(values)["content"] < 0.1
     (said,) = (record for record in caplog.records if "factor of 10" in record.message)
     assert said.levelno == NOTICE and "content has changed" in said.message
     assert not [record for record in caplog.records if record.levelname == "WARNING"]

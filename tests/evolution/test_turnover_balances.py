@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.model.turnover import rates
-from remodel_fenicsx.scene import scene_from_dict
+from remodel_fenicsx.model.laws import turnover_rates
 from tests.evolution.test_turnover_bodies import TURNOVER, grown
+from tests.runs import made, simulated
+from tests.values import isotropic, ramped
 
 KAPPA = 0.1
 HELD = 8.0  # from here on no load changes
@@ -34,7 +33,7 @@ class Powers(Watcher):
         tissue, F = simulation.stepper.remodeling.parameters.at_points(), state.elastic_gradient()
         cells = [simulation.cells.point_cells]
         length = np.sqrt(simulation.cells.kernels.squared_length(F, cells[0]))
-        content, natural = rates(tissue, length, TURNOVER["time"], 1.1, 1.0)
+        content, natural = turnover_rates(tissue, length, TURNOVER["time"], 1.1, 1.0)
 
         def energy(time: float) -> np.ndarray:
             m, rho = tissue.content * np.exp(time * content), tissue.natural_length * np.exp(time * natural)
@@ -53,10 +52,9 @@ def balances(step: float, coupling: str) -> dict[str, float]:
     remodeling = {"turnover": TURNOVER, "coupling": coupling, "kappa": KAPPA}
     names = ["content", "inner_radius", "stored_energy", "remodeling_power", "turnover_power"]
     of = grown(time={"end": 24.0, "step": step}, output={"fields": False, "columns": names}, remodeling=remodeling)
-    simulation = Simulation(of, MPI.COMM_SELF)
-    powers = Powers(simulation)
-    rows = [dict(each.row) for each in simulation.steps([powers])]
-    simulation.close()
+    with made(of) as simulation:
+        powers = Powers(simulation)
+        rows = [dict(each.row) for each in simulation.steps([powers])]
     table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     table |= {name: np.array([row[name] for row in powers.rows]) for name in powers.rows[0]}
     np.testing.assert_allclose(table["turnover_power"], table["turnover"], rtol=1e-5, atol=1e-6)
@@ -100,20 +98,14 @@ def test_collagen_is_neither_made_nor_lost(coupling: str, order: int) -> None:
 # ---------------------------------------------------------------- a held stretch
 def held_stretch(force: float, step: float, coupling: str = "staggered") -> tuple[float, list[dict[str, float]]]:
     """r/r0 of isotropic cells that do not turn, in a matrix so stiff that chains leave it as it is; rows."""
-    values: dict[str, Any] = {
-        "geometry": {"shape": "cube"},
-        "model": {"kinematics": "point"},
-        "cells": {"initial": "isotropic"},
-        "material": {"lame_lambda": 1e8, "lame_mu": 1e8, "chain_density": 1e20, "repulsion": "log"},
-        "remodeling": {"law": "tensor", "kappa": 0.0, "coupling": coupling, "turnover": TURNOVER},
-        "loads": {"force": {"value": force * 1e8, "ramp": [[0.0, 0.0], [step, 1.0]]}},
-        "time": {"end": 20.0 + step, "step": step},
-        "output": {"fields": False, "columns": ["content", "natural_length"]},
-    }
-    simulation = Simulation(scene_from_dict(values), MPI.COMM_SELF)
-    rows = [dict(each.row) for each in simulation.steps()]
-    F = simulation.state.deformation_gradient()[0]
-    simulation.close()
+    values = isotropic(
+        None, "point", geometry={"shape": "cube"}, loads=ramped(step, force=force * 1e8),
+        material={"lame_lambda": 1e8, "lame_mu": 1e8, "chain_density": 1e20, "repulsion": "log"},
+        remodeling={"law": "tensor", "kappa": 0.0, "coupling": coupling, "turnover": TURNOVER},
+        time={"end": 20.0 + step, "step": step}, output={"columns": ["content", "natural_length"]},
+    )  # fmt: skip
+    with simulated(values) as (simulation, rows):
+        F = simulation.state.deformation_gradient()[0]
     return float(np.sqrt((F**2).sum() / 3)), rows
 
 

@@ -19,28 +19,27 @@ from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases
 from tests.evolution.test_load_cases import CUBE
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
+from tests.runs import simulated
+from tests.values import ramped, isotropic
 
 SELF = MPI.COMM_SELF
 TURNED = ["content", "natural_length"]
 TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0}
-RAMP = [[0.0, 0.0], [8.0, 1.0]]
 WALL = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0}
 
 
 def grown(kinematics: str = "radial", driver: str = "cauchy", pressure: float = 1.2, **tables: Any) -> Any:
     """A thin tube under load while its collagen is turned over."""
-    values = {
+    values: dict[str, Any] = {
         "preset": "consistent",
         "geometry": WALL,
-        "model": {"kinematics": kinematics},
         "mesh": {"degree": 2},
-        "cells": {"initial": "isotropic"},
         "remodeling": {"driver": driver, "turnover": TURNOVER},
-        "loads": {name: {"value": v, "ramp": RAMP} for name, v in (("pressure", pressure), ("elongation", 0.1))},
+        "loads": ramped(8.0, pressure=pressure, elongation=0.1),
         "time": {"end": 12.0, "step": 2.0},
         "output": {"fields": False, "columns": [*TURNED, "inner_radius", "outer_radius", "fibre_angle_outer"]},
     }
-    return scene_from_dict({name: table for name, table in (values | tables).items() if table is not None})
+    return scene_from_dict(isotropic(kinematics=kinematics, **values | tables))
 
 
 def at_its_end(scene: Any, domain: Any = None) -> tuple[dict[str, float], Simulation]:
@@ -176,22 +175,17 @@ def test_closed_ends_and_residual_stress() -> None:
         supports={"ends": "closed"},
         remodeling={"turnover": TURNOVER, "coupling": "staggered"},  # its first row has not grown
         output={"fields": False, "columns": columns},
-        loads={"pressure": {"value": 1.2, "ramp": RAMP}, "elongation": {"value": 0.0}},
+        loads=ramped(8.0, pressure=1.2, elongation=0.0),
     )
-    simulation = Simulation(of, SELF)
-    rows = [dict(step.row) for step in simulation.steps()]
-    found, expected = simulation.stepper.remodeling.driving_tensor()[1], cauchy_of_the_energy(simulation)
-    simulation.close()
+    with simulated(of) as (simulation, rows):
+        found, expected = simulation.stepper.remodeling.driving_tensor()[1], cauchy_of_the_energy(simulation)
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(found).max())
     assert rows[0]["opening_angle"] == pytest.approx(120.0, abs=0.01)
     assert rows[-1]["content"] > 1.2 and rows[-1]["axial_elongation"] > rows[3]["axial_elongation"] > 0.05
 
 
 # ---------------------------------------------------------------- ranks
-GROWING_CUBE = CUBE | {
-    "remodeling": {"turnover": TURNOVER},
-    "output": {"columns": ["mean_stretch", *TURNED]},
-}
+GROWING_CUBE = CUBE | {"remodeling": {"turnover": TURNOVER}, "output": {"columns": ["mean_stretch", *TURNED]}}
 ON_ONE_AND_TWO_RANKS = [{"scene": GROWING_CUBE}]
 
 

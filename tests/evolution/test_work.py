@@ -14,6 +14,8 @@ from remodel_fenicsx.evolution import stepper
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import PROOF
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
+from tests.runs import made
+from tests.values import isotropic
 
 Attempt = Solution | SolveFailure
 PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent", "implicit": "consistent"}
@@ -21,16 +23,7 @@ PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent", "im
 
 def artery(coupling: str, **changes: Any) -> Scene:
     """The wall of the paper's artery, of isotropic cells, for two steps."""
-    scene = scene_from_dict(
-        {
-            "preset": PRESETS[coupling],
-            "geometry": {"shape": "tube"},
-            "model": {"kinematics": "radial"},
-            "cells": {"initial": "isotropic"},
-            "remodeling": {"coupling": coupling, "frame": "material"},
-            "output": {"fields": False},
-        }
-    )
+    scene = scene_from_dict(isotropic(PRESETS[coupling], remodeling={"coupling": coupling, "frame": "material"}))
     return scene.with_values({"time.end": 2.0, **changes})
 
 
@@ -62,11 +55,10 @@ def counts(found: list[Attempt]) -> tuple[int, int, int]:
 
 def rows(scene: Scene, found: list[Attempt]) -> Iterator[tuple[dict[str, float], Any, list[Attempt]]]:
     """Row, work and attempts of each step; the latter are forgotten."""
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    for step in simulation.steps():
-        yield step.row, step.work, list(found)
-        found.clear()
-    simulation.close()
+    with made(scene) as simulation:
+        for step in simulation.steps():
+            yield step.row, step.work, list(found)
+            found.clear()
 
 
 @pytest.mark.parametrize("coupling", PRESETS)

@@ -23,6 +23,7 @@ from tests.locking_bodies import EXACT_TUBE, bar_scene, membrane_scene, register
 from tests.parts import cube, tube
 from tests.reference.radial import RadialMaterial, solve_radial
 from tests.runs import SELF, last_row, simulated
+from tests.values import ANGLES, ramped, isotropic
 
 SELECTIVE = "selective-integration"
 STIFF = Material(lame_mu=3.103, lame_lambda=3.103e4)
@@ -245,17 +246,15 @@ def test_when_elements_are_said_to_lock(changes: dict[str, Any], told: bool, cap
 # ---------------------------------------------------------------- cells that turn in a stiff bulk
 def remodeling_tube(ratio: float, **values: Any) -> Scene:
     """A thick tube of isotropic cells on a ray, lambda over mu given."""
-    loads = {
-        name: {"value": value, "ramp": [[0, 0], [20, 1]]} for name, value in (("pressure", 4.8), ("elongation", 0.1))
-    }
-    return Scene(
-        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0},
-        material={"lame_lambda": 3.103 * ratio}, cells={"initial": "isotropic"}, loads=loads,
+    scene = isotropic(
+        None, geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0},
+        material={"lame_lambda": 3.103 * ratio}, loads=ramped(20.0, pressure=4.8, elongation=0.1),
         remodeling={"law": "tensor"}, time={"end": 40.0, "step": 2.5},
-    ).with_values({"mesh.degree": 2, "model.kinematics": "radial"} | values)  # fmt: skip
+    )  # fmt: skip
+    return Scene(**scene).with_values({"mesh.degree": 2} | values)
 
 
-WATCHED = ("inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")
+WATCHED = ("inner_radius", "outer_radius", *ANGLES)
 
 
 def at_the_end(scene: Scene) -> np.ndarray:

@@ -18,26 +18,17 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
-from tests.runs import goes_on
+from tests.runs import goes_on, made
+from tests.values import isotropic, ramped
 
 SELF = MPI.COMM_SELF
 END = 4.0
-PRESSURE = {"value": 4.8, "ramp": [[0, 0], [END, 1]]}
-NO_ELONGATION = {"value": 0.0, "ramp": [[0, 0], [END, 1]]}
 
 
 def values(kinematics: str, loads: dict[str, Any], **tables: Any) -> dict[str, Any]:
-    base: dict[str, Any] = {
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "tube"},
-        "model": {"kinematics": kinematics},
-        "cells": {"initial": "isotropic"},
-        "loads": {"pressure": PRESSURE, "elongation": NO_ELONGATION} | loads,
-        "remodeling": {"kappa": 0.1},
-        "time": {"end": END},
-        "solver": {"method": "direct"},  # whose iterations are counted
-    }
-    return base | tables
+    direct = {"method": "direct"}  # whose iterations are counted
+    base = {"loads": ramped(END, pressure=4.8, elongation=0.0) | loads, "solver": direct}
+    return isotropic(kinematics=kinematics, **base | {"remodeling": {"kappa": 0.1}, "time": {"end": END}} | tables)
 
 
 def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]], list[float]]:
@@ -45,11 +36,10 @@ def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]],
     domain = None
     if scene.model.kinematics == "full":
         domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
-    simulation = Simulation(scene, SELF, domain)
-    rows, forces = [], []
-    for step in simulation.steps([Looking(simulation, force_of, forces)] if force_of else []):
-        rows.append(step.row)
-    simulation.close()
+    with made(scene, domain) as simulation:
+        rows, forces = [], []
+        for step in simulation.steps([Looking(simulation, force_of, forces)] if force_of else []):
+            rows.append(step.row)
     return rows, forces
 
 
@@ -116,7 +106,7 @@ def test_closed_ends_carry_the_force_on_the_caps() -> None:
     pulled, _ = rows_of(scene_from_dict(values("radial", {"axial_force": as_load(forces)})))
     for name in ("axial_elongation", "inner_radius"):
         np.testing.assert_allclose([row[name] for row in pulled], [row[name] for row in closed], rtol=1e-9)
-    free, _ = rows_of(scene_from_dict(values("radial", {"axial_force": NO_ELONGATION})))
+    free, _ = rows_of(scene_from_dict(values("radial", ramped(END, axial_force=0.0))))
     assert free[-1]["axial_elongation"] < 0.0 < closed[-1]["axial_elongation"]
 
 

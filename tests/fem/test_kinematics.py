@@ -17,11 +17,13 @@ from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, run
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, objections
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases, slowly
+from tests.conftest import Cases, Refused, slowly
 from tests.reference.radial import solve_radial
-from tests.runs import columns_of
+from tests.runs import columns_of, made, simulated
+from tests.tables import rows as table, values as values_of
 
 SELF = MPI.COMM_SELF
 ISOTROPIC = {"initial": "isotropic"}
@@ -54,12 +56,11 @@ def difference(one: Scene, other: Scene) -> float:
 def ray_and_reference(driver: str, end: float, **mesh: int) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
     """Of tests/reference all; radii (2, steps), angle and the reference's at the quadrature points of a ray."""
     exact = solve_radial(driver=driver, end=end, elements=150)
-    simulation = Simulation(scene("tube", "radial", end, mesh=mesh, remodeling={"driver": driver}), SELF)
-    steps = list(simulation.steps())
-    radii = np.array([[step.row[name] for step in steps] for name in ("inner_radius", "outer_radius")])
-    angle = Measurement(simulation.observer, steps[-1]).fibre_angle
-    expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
-    simulation.close()
+    with made(scene("tube", "radial", end, mesh=mesh, remodeling={"driver": driver})) as simulation:
+        steps = list(simulation.steps())
+        radii = np.array([[step.row[name] for step in steps] for name in ("inner_radius", "outer_radius")])
+        angle = Measurement(simulation.observer, steps[-1]).fibre_angle
+        expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
     assert np.ptp(angle) > 3.0
     return exact, radii, angle, expected
 
@@ -90,17 +91,16 @@ def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     """Its law, typed by hand in the reference too; linear elements, which other tests of this law compile anyway."""
     changes = {"driver": driver, "law": "tensor", "frame": "material"}
     tables: dict[str, Any] = {"mesh": {"refinement": 18}, "material": {"repulsion": "log"}}
-    simulation = Simulation(scene("tube", "radial", 10.0, remodeling=changes, **tables), SELF)
-    steps = list(simulation.steps())
     exact, printed = (solve_radial(driver=driver, law=law, end=10.0, elements=150) for law in ("tensor", "explicit"))
-    inner = [step.row["inner_radius"] for step in steps]
-    np.testing.assert_allclose(inner, exact.inner_radii, rtol=2e-5)
-    assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
-    angle = Measurement(simulation.observer, steps[-1]).fibre_angle
-    expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
-    # linear elements: about their middle the strain rises and falls by 0.1 degrees
-    np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
-    simulation.close()
+    with made(scene("tube", "radial", 10.0, remodeling=changes, **tables)) as simulation:
+        steps = list(simulation.steps())
+        inner = [step.row["inner_radius"] for step in steps]
+        np.testing.assert_allclose(inner, exact.inner_radii, rtol=2e-5)
+        assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
+        angle = Measurement(simulation.observer, steps[-1]).fibre_angle
+        expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
+        # linear elements: about their middle the strain rises and falls by 0.1 degrees
+        np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
 
 
 @pytest.mark.slow
@@ -190,42 +190,17 @@ def test_it_is_named_never_chosen_and_says_what_it_means(caplog: pytest.LogCaptu
 
 # ---------------------------------------------------------------- rules
 TUBE = values("tube", AUTO, 2.0)
-RULES = [
-    # kinematics, what is refused, a neighbour that is allowed, words of the reason
-    ("radial", {"cells.axes": "global"}, {"cells.axes": "cylindrical"}, "along the diagonal"),
-    ("radial", {"cells.axes": "global"}, {"cells.axes": "global", "cells.initial": "aligned"}, "along the diagonal"),
-    ("axisymmetric", {"cells.axes": "global"}, {"cells.axes": "cylindrical"}, "along the diagonal"),
-    ("radial", {"supports.ends": "clamped"}, {"supports.ends": "free"}, "not alike"),
-    ("radial", {"cells.initial": "random"}, {"cells.initial": [0.6, 0.0, 0.8]}, "1536 elements"),
-    ("axisymmetric", {"cells.initial": "random"}, {"supports.ends": "clamped"}, "1536 elements"),
-    ("sector", {"cells.initial": "random", "remodeling.law": "rotation"}, {"cells.initial": "random"}, "of symmetry"),
-    ("sector", {"remodeling.law": "rotation"}, {"remodeling.law": "rate"}, "planes of symmetry"),
-    ("radial", {"remodeling.law": "rotation"}, {"remodeling.law": "tensor"}, "planes of symmetry"),
-]
-SOLIDS = [
-    ("cube", {"cells.initial": "random", "mesh.refinement": 2}, {"cells.initial": "random"}, "8 elements"),
-    ("cube", {"cells.initial": "random", "mesh.element": "tetrahedron"}, {"mesh.element": "tetrahedron"}, "random"),
-    ("tendon", {"cells.initial": "random"}, {"cells.initial": [0.48, 0.6, 0.64]}, "480 elements"),
-    # its cells become unequal in the first pass, for l0 belongs to ranks: 6e-4 in the mean stretch
-    ("tendon", {"cells.axes": "cylindrical", "cells.initial": [0.6, 0.52915026221, 0.6]},
-     {"cells.axes": "cylindrical"}, "not the same everywhere"),
-    ("tendon", {"cells.axes": "cylindrical", "cells.initial": [0.6, 0.52915026221, 0.6]},
-     {"cells.axes": "cylindrical", "cells.initial": [0.6, 0.52915026221, 0.6], "remodeling.law": "none"},
-     "not the same everywhere"),
-    ("cube", {"remodeling.law": "rotation"}, {"remodeling.law": "relaxation"}, "planes of symmetry"),
-]  # fmt: skip
-ALL_RULES = [("tube", *rule) for rule in RULES] + [(rule[0], "point", *rule[1:]) for rule in SOLIDS]
 
 
-@pytest.mark.parametrize(("shape", "name", "refused", "allowed", "words"), ALL_RULES)
+@pytest.mark.parametrize(("shape", "name", "refused", "allowed", "words"), table(__file__, "kinematics_rules.txt"))
 def test_every_rule_refuses_a_scene_and_allows_its_neighbour(
-    shape: str, name: str, refused: dict[str, Any], allowed: dict[str, Any], words: str
+    shape: str, name: str, refused: str, allowed: str, words: str
 ) -> None:
-    base = scene(shape, AUTO, 2.0)
-    assert [reason for reason in objections(base.with_values(refused), name) if words in reason]
+    base, asked = scene(shape, AUTO, 2.0), values_of(refused)
+    assert [reason for reason in objections(base.with_values(asked), name) if words in reason]
     with pytest.raises(SceneError, match=f"model.kinematics = '{name}': .*{words}"):
-        base.with_values({**refused, "model.kinematics": name})
-    chosen = base.with_values({**allowed, "model.kinematics": name})
+        base.with_values({**asked, "model.kinematics": name})
+    chosen = base.with_values({**values_of(allowed), "model.kinematics": name})
     assert chosen.model.kinematics == name
 
 
@@ -346,11 +321,9 @@ def test_another_size_compiles_nothing(shape: str, name: str, size: dict[str, fl
 def test_small_reduced_problems_are_factorised_by_petsc_itself() -> None:
     """Whole bodies only where the choice is left to `auto`."""
     for name, method, package in (("point", "direct", "petsc"), ("full", "auto", "petsc"), ("full", "direct", "mumps")):
-        simulation = Simulation(scene("cube", name, 1.0, solver={"method": method}), SELF)
-        list(simulation.steps())
-        factorisation = simulation.stepper.coupling.newton.factorisation()
-        assert factorisation is not None and factorisation.getFactorSolverType() == package
-        simulation.close()
+        with simulated(scene("cube", name, 1.0, solver={"method": method})) as (simulation, _):
+            factorisation = simulation.stepper.coupling.newton.factorisation()
+            assert factorisation is not None and factorisation.getFactorSolverType() == package
 
 
 def test_the_mesh_of_a_reduction_is_where_that_part_of_the_body_lies() -> None:
@@ -359,13 +332,12 @@ def test_the_mesh_of_a_reduction_is_where_that_part_of_the_body_lies() -> None:
         ("axisymmetric", ((1, 3), (0, 0), (0, 8)), np.pi * 8 * 8),
         ("sector", ((0, 3), (0, 3), (0, 8)), 8 * 8 * 16 * np.sin(np.pi / 8) / 2),
     ):
-        simulation = Simulation(scene("tube", name, 1.0), SELF)
-        x = simulation.domain.mesh.geometry.x
-        np.testing.assert_allclose(np.stack([x.min(axis=0), x.max(axis=0)], axis=1), spans, atol=1e-12)
-        assert simulation.quadrature.integral(np.ones(simulation.quadrature.shape)) == pytest.approx(volume, rel=1e-9)
-        whole = simulation.scene
-        assert simulation.domain.number_of_elements == whole.geometry.reductions[name].elements(whole)
-        simulation.close()
+        with made(scene("tube", name, 1.0)) as simulation:
+            x = simulation.domain.mesh.geometry.x
+            np.testing.assert_allclose(np.stack([x.min(axis=0), x.max(axis=0)], axis=1), spans, atol=1e-12)
+            whole, quadrature = simulation.scene, simulation.quadrature
+            assert quadrature.integral(np.ones(quadrature.shape)) == pytest.approx(volume, rel=1e-9)
+            assert simulation.domain.number_of_elements == whole.geometry.reductions[name].elements(whole)
 
 
 TENSOR = {"law": "tensor", "coupling": "extrapolated"}
@@ -417,7 +389,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     [("cube", "point", 3), ("tube", "radial", 3), ("tube", "axisymmetric", 9), ("tube", "sector", 12)],
 )
 def test_recorded_fields_are_revolved_into_the_body(
-    shape: str, name: str, cell: int, whole: Callable[[str], Path], tmp_path: Path
+    shape: str, name: str, cell: int, whole: Callable[[str], Path], tmp_path: Path, refused: Refused
 ) -> None:
     """Held against the full run: nodes and elements of its own mesh. Elements of `full` lie between chords."""
     folders = {name: run(scene(shape, name, 1.0), tmp_path / name, SELF), "full": whole(shape)}
@@ -438,24 +410,17 @@ def test_recorded_fields_are_revolved_into_the_body(
     for field in ("displacement", "deformation_gradient", "cauchy_stress", "fibre_angle", "chain_extension"):
         size = np.abs(expected[field] - (np.eye(3).ravel() if field == "deformation_gradient" else 0.0)).max()
         np.testing.assert_allclose(found[field], expected[field], rtol=0, atol=tolerance * size, err_msg=field)
-    structure = [sum_of_dyads(fields) for fields in (found, expected)]
+    axes = (np.stack([fields[f"axis_{i}"] for i in (1, 2, 3)], axis=1) for fields in (found, expected))
+    structure = map(structure_tensor, (found["cell_dimensions"], expected["cell_dimensions"]), axes)
     np.testing.assert_allclose(*structure, rtol=0, atol=0.01)
     with h5py.File(folders[name] / "fields_body_chains.vtkhdf") as file:
         assert file["VTKHDF/NumberOfCells"][0] == 4 * len(full.elements)
-    assert cli.main(["revolve", str(folders[name])]) == 2  # nothing is overwritten
+    refused("revolve", folders[name])  # nothing is overwritten
 
 
-def sum_of_dyads(fields: dict[str, np.ndarray]) -> np.ndarray:
-    """A of each element."""
-    axes = np.stack([fields[f"axis_{i}"] for i in (1, 2, 3)], axis=1)
-    scaled = fields["cell_dimensions"][:, :, None] * axes
-    return np.swapaxes(scaled, 1, 2) @ scaled
-
-
-def test_a_full_run_has_nothing_to_revolve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_run_has_nothing_to_revolve(tmp_path: Path, refused: Refused) -> None:
     folder = run(scene("cube", "full", 1.0), tmp_path / "run", SELF)
-    assert cli.main(["revolve", str(folder)]) == 2
-    assert "'full': the fields are those of the body already" in capsys.readouterr().err
+    assert "'full': the fields are those of the body already" in refused("revolve", folder)
 
 
 # ---------------------------------------------------------------- what buckles

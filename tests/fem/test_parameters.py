@@ -13,13 +13,14 @@ import pytest
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.evolution.stepper import Stepper
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Cells, Remodeling
 from tests import parts
 from tests.parts import cube
+from tests.runs import simulated
 
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 FORCE = 6.0
@@ -181,18 +182,16 @@ def test_without_chains_nothing_locks(law: str) -> None:
         remodeling={"law": law},
         time={"end": 11.0},
     )
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    rows = [step.row for step in simulation.steps()]
-    exact = neo_hookean_stretch(30.0, scene.material.lame_lambda, scene.material.lame_mu)
-    assert exact > 3 * scene.material.contour_length
-    assert rows[-1]["mean_stretch"] == pytest.approx(exact, rel=1e-8)
-    assert {row["max_chain_extension"] for row in rows} == {0.0}
-    assert {row["remodeling_power"] for row in rows} == {0.0}
-    # no chain is in the kernels: two constants of the matrix, the size of the body; the only field is the displacement
-    (energy,) = simulation.stepper.coupling.equilibrium.energies
-    assert energy.coefficients() == (simulation.unknown,)
-    assert {float(c.value) for c in energy.constants()} == {27.293, 3.103, scene.geometry.side}
-    simulation.close()
+    with simulated(scene) as (simulation, rows):
+        exact = neo_hookean_stretch(30.0, scene.material.lame_lambda, scene.material.lame_mu)
+        assert exact > 3 * scene.material.contour_length
+        assert rows[-1]["mean_stretch"] == pytest.approx(exact, rel=1e-8)
+        assert {row["max_chain_extension"] for row in rows} == {0.0}
+        assert {row["remodeling_power"] for row in rows} == {0.0}
+        # no chain is in the kernels: constants of the matrix and the size of the body; the only field is displacement
+        (energy,) = simulation.stepper.coupling.equilibrium.energies
+        assert energy.coefficients() == (simulation.unknown,)
+        assert {float(c.value) for c in energy.constants()} == {27.293, 3.103, scene.geometry.side}
 
 
 # ---------------------------------------------------------------- a mesh of the user's

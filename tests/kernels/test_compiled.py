@@ -14,6 +14,7 @@ from remodel_fenicsx.model.tensors import passes_through_zero
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from tests.parts import tube
+from tests.runs import made
 
 COUNT = 203  # no multiple of the eight that are done at once
 
@@ -193,11 +194,10 @@ class Compare(Watcher):
 def test_a_pass_of_a_tube(changes: dict[str, str]) -> None:
     """Random cells; the other frame; cells that are all alike, so that nothing but rounding tells some axes apart."""
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length": 2.0, "time.end": 6.0} | changes)
-    simulation = Simulation(scene, MPI.COMM_SELF, tube(length=2.0, divisions=(8, 2, 1), comm=MPI.COMM_SELF))
-    compare = Compare(simulation)
-    for _ in simulation.steps([compare]):
-        pass
-    simulation.close()
+    with made(scene, tube(length=2.0, divisions=(8, 2, 1), comm=MPI.COMM_SELF)) as simulation:
+        compare = Compare(simulation)
+        for _ in simulation.steps([compare]):
+            pass
     assert compare.dimensions < 1e-13
     assert compare.axes < 1e-12
     assert 0.0 < compare.power < 1e-12  # they differ by rounding: both have been made

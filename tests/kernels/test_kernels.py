@@ -19,15 +19,15 @@ from mpi4py import MPI
 from setuptools import Distribution
 
 import remodel_fenicsx.kernels
-from remodel_fenicsx import cli
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx import kernels
 from remodel_fenicsx.kernels import tensor
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.system.environment import KERNELS, versions
+from tests.conftest import Refused
+from tests.runs import simulated
 
 ROOT = Path(__file__).parents[2]
 NUMBERS = {"factor.c": kernels.NO_NUMBERS, "spectral.c": kernels.NO_NUMBERS, "tensor.c": tensor.NUMBERS}
@@ -49,23 +49,9 @@ def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
     """All that the compiler sees when it optimises."""
     if name == "factor.c" and not kernels.is_available():
         pytest.skip("no header of CHOLMOD 5 (SuiteSparse 7) is here")
-    folder = f"-I{kernels.include_folder() or ROOT}"
-    command = [
-        *CC,
-        *jit.LIBRARY_FLAGS,
-        folder,
-        "-Wall",
-        "-Wextra",
-        "-Werror",
-        "-c",
-        "-x",
-        "c",
-        "-",
-        "-o",
-        tmp_path / "object",
-    ]
-    text = kernels.source(name, NUMBERS[name])
-    done = subprocess.run(command, input=text, capture_output=True, text=True)
+    folder, asked = f"-I{kernels.include_folder() or ROOT}", "-Wall -Wextra -Werror -c -x c - -o".split()
+    command = [*CC, *jit.LIBRARY_FLAGS, folder, *asked, tmp_path / "object"]
+    done = subprocess.run(command, input=kernels.source(name, NUMBERS[name]), capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert not {"-w", "-Wno-all"} & set(jit.LIBRARY_FLAGS)
 
@@ -126,9 +112,8 @@ def test_a_wheel_has_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     distribution = Distribution()
     distribution.parse_config_files()
-    distribution.include_package_data = (
-        False  # beside this there is no list of files, and making one writes into the tree
-    )
+    # with it a list of files would be written into the tree
+    distribution.include_package_data = False
     command: Any = distribution.get_command_obj("build_py")
     command.ensure_finalized()
     listed = {Path(package.replace(".", "/"), name) for package, _, _, names in command.data_files for name in names}
@@ -152,25 +137,20 @@ def test_numpy_does_the_same_and_no_c_runs(
         if where == "numpy":
             kernels._say_so.cache_clear()
             monkeypatch.setattr(jit, "library", None)
-        with caplog.at_level(logging.INFO):
-            simulation = Simulation(scene, MPI.COMM_SELF)
-            for _ in simulation.steps():
-                pass
-        wanted = kernels.CompiledPointKernels if where == "C" else kernels.PointKernels
-        assert type(simulation.cells.kernels) is wanted
-        found.append(structure_tensor(*simulation.cells.point_cells[:2]))
-        simulation.close()
+        with caplog.at_level(logging.INFO), simulated(scene) as (simulation, _):
+            wanted = kernels.CompiledPointKernels if where == "C" else kernels.PointKernels
+            assert type(simulation.cells.kernels) is wanted
+            found.append(structure_tensor(*simulation.cells.point_cells[:2]))
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-12)
     assert caplog.text.count(f"{KERNELS}=numpy") == 1
 
 
-def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, refused: Refused) -> None:
     """One line, before anything is read."""
     monkeypatch.setenv(KERNELS, "numpy")
     assert type(kernels.point_kernels(MPI.COMM_SELF)) is kernels.PointKernels
     assert tensor.tensor_kernels(MPI.COMM_SELF) is None
     monkeypatch.setenv(KERNELS, "c")
-    assert cli.main(["run", "no-such-scene.toml"]) == 2
-    assert capsys.readouterr().err == f"remodel-fenicsx: {KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
+    assert refused("run", "no-such-scene.toml") == f"{KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
     with pytest.raises(RemodelError, match=KERNELS):
         kernels.point_kernels(MPI.COMM_SELF)

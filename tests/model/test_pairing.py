@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.body import Cube, LoadKind
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
@@ -12,6 +11,7 @@ from remodel_fenicsx.model.laws import LAWS, Array, Drive, relaxed
 from remodel_fenicsx.model.spectral import PAIRINGS, continued, principal
 from remodel_fenicsx.schema.units import FORCE
 from tests import parts
+from tests.runs import made
 
 COUNT, KAPPA = 50, 0.05
 IDENTITY = np.broadcast_to(np.eye(3), (COUNT, 3, 3))
@@ -175,8 +175,7 @@ def test_a_cube_whose_load_turns(monkeypatch: pytest.MonkeyPatch) -> None:
             time={"end": 6.0},
             output={"columns": ["pass_residual"]},
         )  # fmt: skip
-        simulation = Simulation(scene, MPI.COMM_SELF)
-        largest[pairing] = max(step.row["pass_residual"] for step in simulation.steps() if step.time > 1.0)
-        simulation.close()
+        with made(scene) as simulation:
+            largest[pairing] = max(step.row["pass_residual"] for step in simulation.steps() if step.time > 1.0)
     assert largest["continuous"] < 3 * KAPPA
     assert largest["sorted"] > 0.3

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.laws import LAWS, Array, Drive, angle_left, turned
 from tests import parts
+from tests.runs import made
 
 TAU = 3.0
 FIBRE = np.array([0.9, 0.4, 0.1])  # dimensions of a cell
@@ -223,9 +223,8 @@ def test_a_cube_with_fibres_across_its_load(coupling: str, caplog: pytest.LogCap
         remodeling={"law": "rotation", "rotation_time": tau, "driver": "finger", "coupling": coupling},
         time={"end": 6.0},
     )
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    angles = [step.row["mean_fibre_angle"] for step in simulation.steps()]
-    simulation.close()
+    with made(scene) as simulation:
+        angles = [step.row["mean_fibre_angle"] for step in simulation.steps()]
     expected = [np.pi / 2]
     for _ in range(5):
         expected.append((1 - share) * expected[-1] + share * angle_left(np.array(expected[-1:]), 1 / tau)[0])

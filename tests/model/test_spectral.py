@@ -39,6 +39,13 @@ def test_distinct_values(size: float) -> None:
     assert np.all(cosines[np.abs(cosines) > 1e-3] > 0)
 
 
+def test_only_the_symmetric_part_counts() -> None:
+    rng = np.random.default_rng(2)
+    tensors, previous = rng.normal(size=(COUNT, 3, 3)), random_axes(rng)
+    for one, other in zip(principal(tensors, previous), principal(np.swapaxes(tensors, 1, 2), previous)):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("values, single, pair", [([5.0, 5.0, -2.0], 2, (0, 1)), ([5.0, -2.0, -2.0], 0, (1, 2))])
 def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     values: list[float], single: int, pair: tuple[int, int]

@@ -18,6 +18,7 @@ from remodel_fenicsx.pictures.bodies import coloured, scale_colours
 from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.results.whole_body import WholeBody
+from tests.conftest import Refused
 from tests.report.conftest import Recorded
 from tests.tables import rows
 
@@ -252,28 +253,31 @@ def test_mp4_without_ffmpeg_is_one_line(
 # ---------------------------------------------------------------- what is refused
 @pytest.mark.parametrize(("name", "words", "said"), rows(__file__, "refused.txt"))
 def test_bad_input_is_one_line_and_writes_nothing(
-    recorded: Recorded, name: str, words: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-) -> None:  # fmt: skip
+    recorded: Recorded,
+    name: str,
+    words: str,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    refused: Refused,
+) -> None:
     folder = recorded(name)
     before = sorted(os.listdir(folder))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rendering.subprocess, "run", lambda *command, **how: pytest.fail("something was drawn"))
-    assert cli.main([str(folder) if word == "DIR" else word for word in words.split()]) == 2
-    message = capsys.readouterr().err
-    assert message.startswith(f"remodel-fenicsx: {said.replace('DIR', str(folder))}") and message.count("\n") == 1
+    message = refused(*(folder if word == "DIR" else word for word in words.split()))
+    assert message.startswith(said.replace("DIR", str(folder)))
     assert os.listdir() == [] and sorted(os.listdir(folder)) == before
 
 
-def test_a_run_of_one_time_does_not_move(recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_run_of_one_time_does_not_move(recorded: Recorded, tmp_path: Path, refused: Refused) -> None:
     """It is drawn, and not animated."""
     run = Recording(recorded("cube"))
     folder = shutil.copytree(recorded("without fields"), tmp_path / "run")
     with TransientGrid(folder / "fields.vtkhdf", run.points, run.elements, 12) as grid:
         fields = run.fields(run.times[-1])
         grid.append(0.0, {"displacement": fields.pop("displacement")}, fields)
-    assert cli.main(["animate", str(folder)]) == 2
-    assert f"{folder}: fields of one time alone are recorded, so nothing moves" in capsys.readouterr().err
+    assert f"{folder}: fields of one time alone are recorded, so nothing moves" in refused("animate", folder)
     assert cli.main(["picture", str(folder)]) == 0 and (folder / "cube-t0.png").is_file()
 
 
@@ -289,7 +293,9 @@ def test_what_cannot_be_drawn_is_exit_code_5(
 
 # ---------------------------------------------------------------- what belongs to others
 @pytest.mark.parametrize("kind", ["file", "link", "broken link", "folder"])
-def test_nothing_is_overwritten(recorded: Recorded, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_nothing_is_overwritten(
+    recorded: Recorded, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture, refused: Refused
+) -> None:
     """What the default name is taken by stays, and no link is followed."""
     folder, victim = shutil.copytree(recorded("cube"), tmp_path / "run"), tmp_path / "victim"
     mine = b"a year of work"
@@ -305,8 +311,8 @@ def test_nothing_is_overwritten(recorded: Recorded, kind: str, tmp_path: Path, c
         victim.write_bytes(mine)
     assert cli.main(["picture", str(folder)]) == 0
     assert capsys.readouterr().out == f"{folder / 'cube-t10-2.png'}\n"
-    assert cli.main(["picture", str(folder), "-o", str(places[1])]) == 2
-    assert f"-o {places[1]}: is there already; allowed is a new file\n" in capsys.readouterr().err
+    said = refused("picture", folder, "-o", places[1])
+    assert f"-o {places[1]}: is there already; allowed is a new file\n" in said
     assert victim.exists() == (kind == "link") and (kind != "link" or victim.read_bytes() == mine)
     assert all(place.is_dir() if kind == "folder" else place.is_symlink() == ("link" in kind) for place in places)
     assert kind != "file" or all(place.read_bytes() == mine for place in places)
@@ -326,12 +332,9 @@ def test_no_module_of_the_working_folder_runs(
     )
 
 
-def test_a_pipe_in_the_place_of_fields_is_refused(
-    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_pipe_in_the_place_of_fields_is_refused(recorded: Recorded, tmp_path: Path, refused: Refused) -> None:
     """Opening it would wait for ever."""
     folder = shutil.copytree(recorded("cube"), tmp_path / "run")
     (folder / "fields.vtkhdf").unlink()
     os.mkfifo(folder / "fields.vtkhdf")
-    assert cli.main(["picture", str(folder)]) == 2
-    assert "is a pipe or a device, not a file" in capsys.readouterr().err
+    assert "is a pipe or a device, not a file" in refused("picture", folder)

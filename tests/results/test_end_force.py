@@ -12,25 +12,16 @@ from remodel_fenicsx import Simulation, cli
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from tests.parts import tube
 from tests.reference.radial import solve_radial
+from tests.values import ramped, isotropic
 
 SELF = MPI.COMM_SELF
 END = 2.0
-RAMP = [[0.0, 0.0], [END, 1.0]]
 FORCES = ["axial_force", "reduced_axial_force"]
 
 
 def scene(kinematics: str, **tables: Any) -> Scene:
-    base: dict[str, Any] = {
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "tube"},
-        "model": {"kinematics": kinematics},
-        "cells": {"initial": "isotropic"},
-        "loads": {"pressure": {"value": 2.4, "ramp": RAMP}, "elongation": {"value": 0.05, "ramp": RAMP}},
-        "remodeling": {"kappa": 0.1},
-        "time": {"end": END},
-        "output": {"columns": FORCES},
-    }
-    return scene_from_dict(base | tables)
+    base = {"loads": ramped(END, pressure=2.4, elongation=0.05), "remodeling": {"kappa": 0.1}, "time": {"end": END}}
+    return scene_from_dict(isotropic(kinematics=kinematics, **base | {"output": {"columns": FORCES}} | tables))
 
 
 def rows_of(made: Scene, look: Any = None, domain: Any = None) -> tuple[list[dict[str, float]], list[Any]]:
@@ -102,9 +93,8 @@ def test_random_cells_pull_at_the_end_with_the_reaction_of_its_nodes(formulation
 
 @pytest.mark.parametrize("kinematics", ["radial", pytest.param("axisymmetric", marks=pytest.mark.slow)])
 def test_closed_ends_need_no_force_and_a_load_is_what_a_machine_measures(kinematics: str) -> None:
-    pressure = {"pressure": {"value": 2.4, "ramp": RAMP}}
     for force in (0.0, 5.0):
-        loads = pressure | {"elongation": {"value": 0.0, "ramp": RAMP}, "axial_force": {"value": force, "ramp": RAMP}}
+        loads = ramped(END, pressure=2.4, elongation=0.0, axial_force=force)
         rows, _ = rows_of(scene(kinematics, supports={"ends": "closed"}, loads=loads))
         given = [force * row["time"] / END for row in rows]
         np.testing.assert_allclose([row["reduced_axial_force"] for row in rows], given, atol=1e-8)

@@ -16,6 +16,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, cli, run
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
+from tests.conftest import Refused
 
 RAMP = [[0.0, 0.0], [3.0, 1.0]]
 TUBE: dict[str, Any] = {
@@ -252,24 +253,20 @@ def test_vtu_and_csv_hold_the_same(start: Path) -> None:
     np.testing.assert_allclose(middle, recording.points[recording.elements].mean(axis=1), atol=1e-12)
 
 
-def test_what_cannot_be_exported_is_said_in_a_line(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refused(*words: str, folder: Path = recorded) -> str:
-        assert cli.main(["export", str(folder), "--format", "csv", "-o", str(tmp_path / "new.csv"), *words]) == 2
+def test_what_cannot_be_exported_is_said_in_a_line(recorded: Path, tmp_path: Path, refused: Refused) -> None:
+    def said(*words: str | Path, folder: Path = recorded) -> str:
+        found = refused("export", folder, "--format", "csv", "-o", tmp_path / "new.csv", *words)
         assert not (tmp_path / "new.csv").exists()
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        return said
+        return found
 
-    assert "no fields at time 1.5; recorded are 0, 1, 2" in refused("--time", "1.5")
+    assert "no fields at time 1.5; recorded are 0, 1, 2" in said("--time", "1.5")
     (tmp_path / "old.csv").write_text("dear")
-    assert "old.csv: is there already; allowed is a new file" in refused("-o", str(tmp_path / "old.csv"))
+    assert "old.csv: is there already; allowed is a new file" in said("-o", tmp_path / "old.csv")
     assert (tmp_path / "old.csv").read_text() == "dear"
-    assert "there is no such folder" in refused(folder=tmp_path / "nowhere")
+    assert "there is no such folder" in said(folder=tmp_path / "nowhere")
     point = {"geometry": {"shape": "cube"}, "model": {"kinematics": "point"}, "time": {"end": 1.0}}
     folder = run(Scene(preset="kuhl-holzapfel-2007", **point), tmp_path / "point")
-    assert "its kinematics are 'point', a part of the body; revolve writes" in refused(folder=folder)
+    assert "its kinematics are 'point', a part of the body; revolve writes" in said(folder=folder)
     point |= {"model": {"kinematics": "full"}, "output": {"fields": ["displacement"]}}
     folder = run(Scene(preset="kuhl-holzapfel-2007", **point), tmp_path / "no cells")
-    assert "output.fields was without cell_dimensions, axis_1, axis_2, axis_3" in refused(folder=folder)
+    assert "output.fields was without cell_dimensions, axis_1, axis_2, axis_3" in said(folder=folder)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, __version__, cli, preset_scene, run
+from tests.conftest import Refused
 
 
 @pytest.fixture
@@ -86,12 +87,10 @@ def newer_checkpoints(folder: Path) -> None:
 
 @pytest.mark.parametrize("change", [newer_scene, newer_checkpoints])
 def test_what_a_newer_version_has_left_is_refused_in_one_line(
-    folder: Path, capsys: pytest.CaptureFixture[str], change: Callable[[Path], None]
+    folder: Path, refused: Refused, change: Callable[[Path], None]
 ) -> None:
     """Nothing changes in the folder."""
     change(folder)
     kept = {path: path.read_bytes() for path in folder.iterdir()}
-    assert cli.main(["run", "--resume", str(folder), "--set", "time.end=5", "-q"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "newer version" in line
+    assert "newer version" in refused("run", "--resume", folder, "--set", "time.end=5", "-q")
     assert {path: path.read_bytes() for path in folder.iterdir()} == kept

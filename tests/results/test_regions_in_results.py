@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
+from remodel_fenicsx import Recording, Scene, SceneError, run
 from remodel_fenicsx.results.whole_body import revolve
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.studies import sweep as study
 from tests.conftest import Cases, forked_children
 from tests.results.test_resume import assert_same
+from tests.runs import made
 
 RAMP = [[0.0, 0.0], [3.0, 1.0]]
 VALUES: dict[str, Any] = {
@@ -62,10 +62,9 @@ def test_the_columns_of_regions_share_out_those_of_the_body(recorded: Path) -> N
 
 
 def test_only_what_is_asked_for_is_measured() -> None:
-    simulation = Simulation(Scene(**VALUES | {"output": {"columns": ["fibre_angle_media"]}}), MPI.COMM_SELF)
-    assert [column.name for column in simulation.observer.columns][-1] == "fibre_angle_media"
-    assert len(simulation.observer.columns) == 4, "time, loads and it"
-    simulation.close()
+    with made(Scene(**VALUES | {"output": {"columns": ["fibre_angle_media"]}})) as simulation:
+        assert [column.name for column in simulation.observer.columns][-1] == "fibre_angle_media"
+        assert len(simulation.observer.columns) == 4, "time, loads and it"
     with pytest.raises(SceneError, match="output.columns = 'fibre_angle_intima': no such column on request; allowed"):
         Scene(**VALUES | {"output": {"columns": ["fibre_angle_intima"]}})
 

@@ -52,22 +52,14 @@ LENGTHS = {"m": 0.0123, "cm": 1.23, "mm": 12.3, "um": 12300.0}
 @pytest.mark.parametrize("unit", LENGTHS)
 @pytest.mark.parametrize("text", ["12.3 mm", "1.23 cm", "12300 um", "12300 µm", "0.0123 m", "12300 micrometers"])
 def test_lengths_in_every_unit_exactly(unit, text):
-    # a product of floats gives 12.299999999999999 for some of these
-    assert scene_from_dict(
-        {"geometry": {"shape": "cube", "side": text, "length_unit": unit}, "time": {"end": 1.0}}
-    ).geometry.side == pytest.approx(LENGTHS[unit], rel=0, abs=0)
+    scene = scene_from_dict({"geometry": {"shape": "cube", "side": text, "length_unit": unit}, "time": {"end": 1.0}})
+    assert scene.geometry.side == LENGTHS[unit]  # a product of floats gives 12.299999999999999 for some of these
 
 
 def test_the_units_are_those_of_the_scene():
     keys = {"material__stress_unit": "kPa", "geometry__length_unit": "cm"}
-    scene = artery(
-        **keys,
-        loads__pressure__value="100 mmHg",
-        geometry__inner_radius="1 mm",
-        geometry__length="8 mm",
-        material__lame_lambda="27.293 Pa",
-        solver__absolute_tolerance="1 mN",
-    )
+    keys |= {"loads__pressure__value": "100 mmHg", "geometry__inner_radius": "1 mm", "geometry__length": "8 mm"}
+    scene = artery(**keys, material__lame_lambda="27.293 Pa", solver__absolute_tolerance="1 mN")
     assert scene.loads["pressure"].value == 13.3322387415
     assert (scene.geometry.inner_radius, scene.geometry.length) == (0.1, 0.8)
     assert scene.geometry.outer_radius == 3.0  # a number without a unit stays as it is
@@ -107,23 +99,10 @@ def test_set_with_and_without_quotes(value):
     assert read_scene(ARTERY, [f"loads.pressure.value={value}"]).loads["pressure"].value == 13332.2387415
 
 
-@pytest.mark.parametrize("text", ["5 mm", "-5 mm", "2e21 / m^3", "37 degC", "1 N/mm^2", "1 kg m s^-2", "37 °C"])
-def test_a_quantity(text):
-    assert is_quantity(text)
-
-
-@pytest.mark.parametrize(
-    "text", ["5", "2e21", "mm", "two words", "5 mm = 3", "5 mm, 6 mm", "2 / 3", "5 m(", "", "1_000"]
-)
-def test_no_quantity(text):
-    assert not is_quantity(text)
-
-
-def test_exit_code_and_one_line(capsys):
-    assert cli.main(["validate", str(ARTERY), "--set", "loads.pressure.value=100 mmhg"]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1
-    assert err.startswith("remodel-fenicsx: loads.pressure.value = '100 mmhg': 'mmhg' is no unit of stress; must be ")
+def test_a_quantity():
+    assert all(map(is_quantity, ("5 mm", "-5 mm", "2e21 / m^3", "37 degC", "1 N/mm^2", "1 kg m s^-2", "37 °C")))
+    for text in ("5", "2e21", "mm", "two words", "5 mm = 3", "5 mm, 6 mm", "2 / 3", "5 m(", "", "1_000"):
+        assert not is_quantity(text), text
 
 
 def test_validate_prints_stiffness_load_and_warnings(capsys):

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from benchmarks.stability_map.cases import all_cases
 from benchmarks.stability_map.running import Runner
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import Change, StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
@@ -20,22 +19,19 @@ from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.solver.diagnosis import diagnosed
 from tests.locking_bodies import thick_tube
 from tests.runs import made
+from tests.values import ramped, isotropic
 
 LARGEST = 0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
 
 
 def thin_tube(pressure: float = 0.5, end: float = 1.0, **values: Any) -> Scene:
     """Few of its chains run around it: with closed ends its pressure has a largest value."""
-    return scene_from_dict({
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.1, "length": 8.0},
-        "model": {"kinematics": "radial"},
-        "cells": {"initial": [0.4, 0.2, 0.8944271909999159]},
-        "supports": {"ends": "closed"},
-        "remodeling": {"law": "none"},
-        "loads": {"pressure": {"value": pressure, "ramp": [[0.0, 0.0], [1.0, 1.0]]}},
-        "time": {"end": end, "step": 1.0},
-        "output": {"columns": ["inner_radius"]},
-    }).with_values(values)  # fmt: skip
+    scene = isotropic(
+        None, geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.1, "length": 8.0},
+        cells={"initial": [0.4, 0.2, 0.8944271909999159]}, supports={"ends": "closed"}, remodeling={"law": "none"},
+        loads=ramped(1.0, pressure=pressure), time={"end": end, "step": 1.0}, output={"columns": ["inner_radius"]},
+    )  # fmt: skip
+    return scene_from_dict(scene).with_values(values)
 
 
 def radii(scene: Scene) -> tuple[list[float], int]:
@@ -79,12 +75,11 @@ def test_a_part_that_starts_where_the_tangent_is_singular_is_no_way_on(caplog: p
 
 def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:
     """The far state that Newton's method ends near may miss the tolerance by a little; the tangent knows better."""
-    simulation = Simulation(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125}), MPI.COMM_SELF)
-    before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
-    last = simulation.unknown.x.array - before
-    failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), residual_over_tolerance=50.0)
-    refusal = diagnosed(simulation.stepper.coupling.newton, failure, last)
-    simulation.close()
+    with made(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125})) as simulation:
+        before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
+        last = simulation.unknown.x.array - before
+        failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), residual_over_tolerance=50.0)
+        refusal = diagnosed(simulation.stepper.coupling.newton, failure, last)
     assert refusal.kind == "limit point"
 
 
@@ -123,10 +118,9 @@ def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
     """Newton's method starts at the wide tube, whose branch reaches down below the limit point."""
     caplog.set_level(logging.INFO)
     narrow, _ = radii(thin_tube(0.29))
-    wide = Simulation(thin_tube(0.5, **{"time.step": 0.25, "solver.relative_tolerance": 1e-9}), MPI.COMM_SELF)
-    list(wide.steps())
-    far = wide.unknown.x.array.copy()
-    wide.close()
+    with made(thin_tube(0.5, **{"time.step": 0.25, "solver.relative_tolerance": 1e-9})) as wide:
+        list(wide.steps())
+        far = wide.unknown.x.array.copy()
     solve, starts = GuardedNewton.solve, [far]
 
     def misled(newton: GuardedNewton, origin: Any = None) -> Any:
@@ -172,16 +166,10 @@ def test_parts_of_quasi_newton_steps_are_no_jump(method: str) -> None:
 @pytest.mark.parametrize("method", ["direct", "lagged"])
 def test_a_step_that_takes_many_tangents_is_gone_in_parts(method: str) -> None:
     """A thin tube of random cells under long steps has several equilibria; 20 to 200 parts lead to this one."""
-    scene = scene_from_dict({
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.2, "length": 3.0},
-        "model": {"kinematics": "sector"},
-        "cells": {"initial": "random", "seed": 1},
-        "loads": {"pressure": {"value": 1.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]},
-                  "elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [4.0, 1.0]]}},
-        "time": {"end": 3.0, "step": 1.0},
-        "solver": {"method": method},
-        "output": {"columns": ["inner_radius"]},
-    })  # fmt: skip
-    found, _ = radii(scene)
+    scene = isotropic(
+        kinematics="sector", geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.2, "length": 3.0},
+        cells={"initial": "random", "seed": 1}, loads=ramped(4.0, pressure=1.0, elongation=0.1),
+        time={"end": 3.0, "step": 1.0}, solver={"method": method}, output={"columns": ["inner_radius"]},
+    )  # fmt: skip
+    found, _ = radii(scene_from_dict(scene))
     assert found[-1] == pytest.approx(1.45346788, rel=1e-8)

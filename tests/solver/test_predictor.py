@@ -17,6 +17,7 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from tests.parts import pulled_cube
 from tests.results.test_resume import SELF, rows
+from tests.runs import made
 
 RATES = {"force": 2.0}
 PREDICTED, NOT_PREDICTED = {"predictor": "autoregressive"}, {"predictor": "none"}
@@ -24,9 +25,8 @@ PREDICTED, NOT_PREDICTED = {"predictor": "autoregressive"}, {"predictor": "none"
 
 @pytest.fixture
 def simulation() -> Any:
-    made = Simulation(pulled_cube(9.0, solver=NOT_PREDICTED), SELF)
-    yield made
-    made.close()
+    with made(pulled_cube(9.0, solver=NOT_PREDICTED)) as found:
+        yield found
 
 
 def follow(simulation: Simulation, increments: list[np.ndarray], rates: dict[str, float] = RATES) -> Autoregressive:
@@ -99,9 +99,8 @@ def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation
 def test_with_tolerance_predicts_where_steps_are_chosen() -> None:
     equal = pulled_cube(9.0).with_values({"solver.predictor": "with-tolerance"})
     for scene, kind in ((equal, Predictor), (equal.with_values({"time.tolerance": 1.0}), Responsive)):
-        simulation = Simulation(scene, SELF)
-        assert type(simulation.stepper.coupling.predictor) is kind  # type: ignore[attr-defined]
-        simulation.close()
+        with made(scene) as simulation:
+            assert type(simulation.stepper.coupling.predictor) is kind  # type: ignore[attr-defined]
     assert PREDICTORS["with-tolerance"] is Predictor
 
 

@@ -305,22 +305,15 @@ def test_a_newton_step_does_not_turn_elements_inside_out() -> None:
     np.testing.assert_allclose(step.array, asked / 4)  # at a half it is zero
 
 
-@pytest.mark.parametrize("stretch", [2.5, 4.0, 8.0])
-def test_start_beyond_the_contour_length_fails_and_stays(stretch: float) -> None:
-    made = stretched_bar(stretch)
+@pytest.mark.parametrize(("stretch", "said"), [(2.5, "reached r/L = "), (8.0, "reached r/L = "), (-0.5, "J = -0.125")])
+def test_a_start_beyond_the_contour_length_or_inside_out_fails_and_stays(stretch: float, said: str) -> None:
+    made = stretched_bar(max(stretch, 1.0))
+    if stretch < 0:
+        made.set_displacement((stretch - 1) * made.nodes)
     start = made.displacement.x.array.copy()
-    with pytest.raises(SolveFailure, match="reached r/L = "):
+    with pytest.raises(SolveFailure, match=said):
         made.problem().solve()
     np.testing.assert_array_equal(made.displacement.x.array, start)
-
-
-def test_collapsed_start_fails_and_stays() -> None:
-    made = stretched_bar(1.0)
-    turned_inside_out = -1.5 * made.nodes
-    made.set_displacement(turned_inside_out)
-    with pytest.raises(SolveFailure, match="J = -0.125"):
-        made.problem().solve()
-    np.testing.assert_array_equal(made.displacement.x.array, turned_inside_out.ravel())
 
 
 def test_a_request_to_stop_that_is_taken_back_is_forgotten() -> None:
@@ -342,9 +335,8 @@ def test_nan_anywhere_is_a_failure_not_a_result(where: str) -> None:
     made = held_cube()
     problem = made.problem()
     made.loading.set({"force": 1.0})
-    {"displacement": made.displacement, "dimensions": made.cells.dimensions, "axes": made.cells.axes}[where].x.array[
-        7
-    ] = np.nan
+    function = {"displacement": made.displacement, "dimensions": made.cells.dimensions, "axes": made.cells.axes}[where]
+    function.x.array[7] = np.nan
     before = made.displacement.x.array.copy()
     extension = problem.extension()
     assert not extension.admissible and extension.max_chain_extension == np.inf
@@ -376,16 +368,6 @@ def test_a_failed_solve_leaves_a_solver_that_works() -> None:
     again.loading.set({"force": 1.0})
     again.problem().solve()
     np.testing.assert_allclose(made.displacement.x.array, again.displacement.x.array, atol=1e-12)
-
-
-def test_no_equilibrium_is_said_with_the_number_of_iterations() -> None:
-    """No tube of this wall holds a pressure of 50."""
-    made = parts.body(tube(length=2.0, divisions=(8, 3, 1)), Cells(initial="isotropic", axes="cylindrical"))
-    made.supported().loading.set({"pressure": 50.0, "elongation": 0.0})
-    with pytest.raises(SolveFailure) as caught:
-        made.problem().solve()
-    assert caught.value.newton_iterations > 0 and caught.value.reason
-    assert not made.displacement.x.array.any()
 
 
 # ---------------------------------------------------------------- convergence of the elements

@@ -20,6 +20,7 @@ from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants, worth
 from remodel_fenicsx.watch.warnings import VolumeResponse
 from tests import parts
 from tests.parts import tube
+from tests.runs import made
 
 SELF = MPI.COMM_SELF
 TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]],
@@ -66,9 +67,8 @@ def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
 def test_the_paper_s_tendon_has_few_factors() -> None:
     """Its 1,881 unknowns are many for a body in three dimensions; the preset leaves the method open."""
     scene = preset_scene("kuhl-holzapfel-2007", "tendon").with_values({"time.end": 1.0})
-    simulation = Simulation(scene, SELF)
-    assert (scene.solver.method, simulation.stepper.coupling.newton.method) == ("auto", "lagged")
-    simulation.close()
+    with made(scene) as simulation:
+        assert (scene.solver.method, simulation.stepper.coupling.newton.method) == ("auto", "lagged")
 
 
 # ---------------------------------------------------------------- same states, other work
@@ -311,15 +311,14 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
 @pytest.mark.parametrize("method", ["auto", "lagged"])
 def test_loads_are_held_from_the_second_step_of_equal_loads_on(method: str) -> None:
     """A second solve of a step is no step of its own."""
-    simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.method": method}), SELF)
-    state, held = simulation.state, []
-    phase = LoadPhase(state)
-    for number, force in enumerate((1.0, 2.0, 2.0, 2.0, 3.0)):
-        state.number = number
-        state.loading.set({"force": force})
-        held += [phase.held(), phase.held()]
-    assert held == [False, False, False, False, True, True, True, True, False, False]
-    simulation.close()
+    with made(preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.method": method})) as simulation:
+        state, held = simulation.state, []
+        phase = LoadPhase(state)
+        for number, force in enumerate((1.0, 2.0, 2.0, 2.0, 3.0)):
+            state.number = number
+            state.loading.set({"force": force})
+            held += [phase.held(), phase.held()]
+        assert held == [False, False, False, False, True, True, True, True, False, False]
 
 
 def test_the_method_may_be_another_one_where_loads_are_held(
@@ -371,12 +370,11 @@ def test_steps_far_from_linear_take_few_factors(caplog: pytest.LogCaptureFixture
     """The paper's tendon stretches by a half in three steps; `direct` takes 21 tangents for them."""
     caplog.set_level(logging.INFO)
     scene = preset_scene("kuhl-holzapfel-2007", "tendon").with_values({"time.end": 3.0})
-    simulation = Simulation(scene, SELF)
-    work = [step.work for step in simulation.steps()]
-    assert sum(step.tangents for step in work) < 18
-    assert sum(step.newton_iterations for step in work) < 45
-    assert "solved once more" not in caplog.text
-    simulation.close()
+    with made(scene) as simulation:
+        work = [step.work for step in simulation.steps()]
+        assert sum(step.tangents for step in work) < 18
+        assert sum(step.newton_iterations for step in work) < 45
+        assert "solved once more" not in caplog.text
 
 
 def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptureFixture) -> None:
@@ -385,11 +383,10 @@ def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptu
     scene, rows, said = preset_scene("kuhl-holzapfel-2007", "tube"), {}, {}
     for method in methods.SOLVER_METHODS:
         domain = tube(divisions=(12, 4, 8), comm=SELF)
-        simulation = Simulation(scene.with_values({"time.end": 1.0, "solver.method": method}), SELF, domain)
-        rows[method] = [step.row for step in simulation.steps()]
-        said[method] = caplog.text
-        caplog.clear()
-        simulation.close()
+        with made(scene.with_values({"time.end": 1.0, "solver.method": method}), domain) as simulation:
+            rows[method] = [step.row for step in simulation.steps()]
+            said[method] = caplog.text
+            caplog.clear()
         assert_same(rows[method], rows["direct"])
         assert "solved once more, with" not in said[method]
     assert "cannot be factorised as positive definite" in said["lagged"]

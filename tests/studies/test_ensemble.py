@@ -23,7 +23,7 @@ from remodel_fenicsx.studies.page import Answer
 from remodel_fenicsx.studies.study import Run, Study, TooFewRuns
 from remodel_fenicsx.system.interrupts import Paused
 from tests import forks
-from tests.conftest import forked_children
+from tests.conftest import Refused, forked_children
 from tests.parts import pulled_cube
 
 END = 5.0
@@ -211,13 +211,11 @@ def test_a_deviation_of_few_seeds_is_not_known() -> None:
     assert replace(found, isotropic={}).verdict().startswith("Not known: the run with isotropic cells has failed")
 
 
-def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(scene(output={"fields": False}).with_values({"cells.initial": "isotropic"}).to_toml())
-    assert cli.main(["ensemble", str(path), "-o", str(tmp_path / "out")]) == 2
-    assert "an ensemble needs 'random' cells" in capsys.readouterr().err
-    assert cli.main(["ensemble", str(path), "--seeds", "1"]) == 2
-    assert "--seeds 1: allowed is a whole number at least 2" in capsys.readouterr().err
+    assert "an ensemble needs 'random' cells" in refused("ensemble", path, "-o", tmp_path / "out")
+    assert "--seeds 1: allowed is a whole number at least 2" in refused("ensemble", path, "--seeds", "1")
     assert not (tmp_path / "out").exists()
 
 

@@ -12,16 +12,21 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Scene, Simulation
+from remodel_fenicsx import Scene
 from remodel_fenicsx.body.reductions import choice, expected_thrust, explained
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.stability import stability, unseen_by
 from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
-from tests.runs import made
+from tests.runs import made, simulated
+from tests.values import isotropic
 
 MU, LAME = 3.103, 27.293
 YOUNG, POISSON = MU * (3 * LAME + 2 * MU) / (LAME + MU), LAME / (2 * (LAME + MU))
+BARE: dict[str, Any] = {
+    "material": {"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
+    "remodeling": {"law": "none", "coupling": "staggered"}, "time": {"end": 1.0},
+}  # fmt: skip
 SECOND_MOMENT = np.pi / 4 * (1.5**4 - 1)
 
 
@@ -32,24 +37,15 @@ def ramped(value: float) -> dict[str, Any]:
 
 def slender(kinematics: str, pressure: float, **changes: Any) -> Scene:
     """A tube without chains, 40 long, its wall from 1 to 1.5."""
-    scene = Scene(
-        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.5, "length": 40.0},
-        material={"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
-        cells={"initial": "isotropic"},
-        model={"kinematics": kinematics},
-        loads={"pressure": ramped(pressure)},
-        remodeling={"law": "none", "coupling": "staggered"},
-        time={"end": 1.0},
-    )
-    return scene.with_values(changes)
+    shape = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.5, "length": 40.0}
+    loads = {"pressure": ramped(pressure)}
+    return Scene(**isotropic(None, kinematics, geometry=shape, loads=loads, **BARE)).with_values(changes)
 
 
 @contextmanager
 def watched(scene: Scene) -> Iterator[BucklingWarning]:
     """The watcher at the end of a run."""
-    with made(scene) as simulation:
-        for _ in simulation.steps():
-            pass
+    with simulated(scene) as (simulation, _):
         yield BucklingWarning(simulation.stepper, scene.geometry.strut(scene.supports.ends))
 
 
@@ -80,15 +76,8 @@ def test_eulers_load_of_an_unloaded_tube(kinematics: str, ends: str, factor: flo
 
 def column(force: float, kinematics: str = "point") -> Scene:
     """A slender tendon under a dead force."""
-    return Scene(
-        geometry={"shape": "tendon", "length": 10.0, "area": 0.1},
-        material={"lame_mu": MU, "lame_lambda": LAME, "chain_density": 0.0},
-        cells={"initial": "isotropic"},
-        model={"kinematics": kinematics},
-        loads={"force": ramped(force)},
-        remodeling={"law": "none", "coupling": "staggered"},
-        time={"end": 1.0},
-    )
+    shape = {"shape": "tendon", "length": 10.0, "area": 0.1}
+    return Scene(**isotropic(None, kinematics, geometry=shape, loads={"force": ramped(force)}, **BARE))
 
 
 def test_a_tendon_is_a_column_with_a_free_end() -> None:
@@ -117,11 +106,8 @@ def test_the_whole_tube_loses_its_stability_where_the_ray_says_so(caplog: Any) -
             shares.append(watcher.thrust_share())
         changes = {"mesh.degree": 2, "output.columns": ["negative_eigenvalues"]}
         whole = slender("full", pressure, **changes)
-        simulation = Simulation(
-            whole, MPI.COMM_SELF, tube(1.0, 1.5, 40.0, 1, "hexahedron", 2, MPI.COMM_SELF, (8, 1, 8))
-        )
-        counts.append([step.row["negative_eigenvalues"] for step in simulation.steps()][-1])
-        simulation.close()
+        with made(whole, tube(1.0, 1.5, 40.0, 1, "hexahedron", 2, MPI.COMM_SELF, (8, 1, 8))) as simulation:
+            counts.append([step.row["negative_eigenvalues"] for step in simulation.steps()][-1])
     assert counts == [0, 2]
     assert shares[0] < 0.9 < shares[1]
 
@@ -164,13 +150,8 @@ def test_auto_is_full_where_thrust_comes_near_eulers_load(changes: dict[str, Any
 
 # ---------------------------------------------------------------- the analysis of passes
 def test_the_analysis_of_a_reduction_says_what_it_does_not_see(tmp_path: Path) -> None:
-    changes = {
-        "material.chain_density": 2e21,
-        "remodeling.law": "explicit",
-        "remodeling.coupling": "staggered",
-        "geometry.length": 8.0,
-    }
-    scene = slender("radial", 0.5, **changes).with_values({"time.end": 2.0})
+    changes = {"material.chain_density": 2e21, "remodeling.law": "explicit", "geometry.length": 8.0, "time.end": 2.0}
+    scene = slender("radial", 0.5, **changes)
     place, found = stability(scene, tmp_path / "radial", 1, MPI.COMM_SELF)
     log = (place / "run.log").read_text()
     (unseen,) = unseen_by(found.scene)

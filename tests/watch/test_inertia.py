@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from remodel_fenicsx import Scene, Simulation, read_scene
+from remodel_fenicsx import Scene, read_scene
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.fem.solver_methods import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
@@ -193,14 +193,14 @@ def test_a_start_that_is_indefinite_is_told_apart(
 
 
 def test_stop_ends_before_the_first_unstable_step() -> None:
-    simulation = Simulation(pushed_cube(-30.0, **{"solver.unstable": "stop"}), MPI.COMM_SELF)
-    done = []
-    with pytest.raises(StepFailure, match="the equilibrium at time 2 is unstable: 1 negative eigenvalue") as caught:
-        for step in simulation.steps():
-            done.append(step.negative_eigenvalues)
-    assert done == [0] and simulation.state.time == 1.0 and simulation.loading.values == {"force": -10.0}
-    assert caught.value.refusal.kind == "lost stability" and 'solver.unstable = "warn"' in caught.value.refusal.advice
-    simulation.close()
+    with made(pushed_cube(-30.0, **{"solver.unstable": "stop"})) as simulation:
+        done = []
+        with pytest.raises(StepFailure, match="the equilibrium at time 2 is unstable: 1 negative eigenvalue") as caught:
+            for step in simulation.steps():
+                done.append(step.negative_eigenvalues)
+        assert done == [0] and simulation.state.time == 1.0 and simulation.loading.values == {"force": -10.0}
+    refusal = caught.value.refusal
+    assert refusal.kind == "lost stability" and 'solver.unstable = "warn"' in refusal.advice
 
 
 def test_what_was_not_counted_is_an_empty_field(tmp_path: Path) -> None:
@@ -217,12 +217,10 @@ def refused(values: dict[str, Any]) -> tuple[StepFailure, float]:
     """The failure of a short, coarse artery of equal cells, and its last time."""
     base = {"geometry.length": 1.0, "cells.initial": "isotropic", "loads.pressure.value": 0.0}
     scene = read_scene(DEMOS / "artery.toml").with_values({**base, **values})
-    simulation = Simulation(scene, MPI.COMM_SELF, tube(length=1.0, divisions=(8, 3, 1)))
-    with pytest.raises(StepFailure) as caught:
-        for _ in simulation.steps():
-            pass
-    simulation.close()
-    return caught.value, simulation.state.time
+    with made(scene, tube(length=1.0, divisions=(8, 3, 1))) as simulation:
+        with pytest.raises(StepFailure) as caught:
+            list(simulation.steps())
+        return caught.value, simulation.state.time
 
 
 def test_an_asymptote_of_the_pressure_is_a_limit_point() -> None:

@@ -10,35 +10,25 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Simulation
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.warnings import VolumeLoss
 from tests.conftest import Case, slowly
+from tests.runs import rows_of, simulated
+from tests.values import PAPER, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 
 
 def tube_scene(**tables: Any) -> Scene:
-    base: dict[str, Any] = {
-        "preset": "kuhl-holzapfel-2007",
-        "geometry": {"shape": "tube"},
-        "model": {"kinematics": "radial"},
-        "cells": {"initial": "isotropic"},
-        "loads": {"pressure": {"value": 0.0, "ramp": [[0, 0], [1, 1]]}, "elongation": {"value": 0.0, "ramp": [[0, 1]]}},
-        "remodeling": {"law": "none"},
-        "time": {"end": 3.0},
-    }
-    return scene_from_dict(base | tables)
+    base = {"loads": ramped(1.0, pressure=0.0, elongation=0.0), "remodeling": {"law": "none"}, "time": {"end": 3.0}}
+    return scene_from_dict(isotropic(**base | tables))
 
 
 def squeezed(elongation: float, ratio: float, **tables: Any) -> Scene:
     """A tube of a matrix alone that is made shorter; ratio is lambda/mu."""
-    loads = {
-        "pressure": {"value": 0.0, "ramp": [[0, 0], [1, 1]]},
-        "elongation": {"value": elongation, "ramp": [[0, 0], [2, 1]]},
-    }
+    loads = ramped(1.0, pressure=0.0) | ramped(2.0, elongation=elongation)
     return tube_scene(material={"chain_density": 0.0, "lame_lambda": ratio, "lame_mu": 1.0}, loads=loads, **tables)
 
 
@@ -46,10 +36,7 @@ def said(scene: Scene, caplog: pytest.LogCaptureFixture, word: str) -> list[tupl
     """Lines of a run with a word: level and text."""
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        simulation = Simulation(scene, SELF)
-        for _ in simulation.steps():
-            pass
-        simulation.close()
+        rows_of(scene)
     return [(record.levelno, record.getMessage()) for record in caplog.records if word in record.getMessage()]
 
 
@@ -89,12 +76,10 @@ def test_the_worst_point_alone_is_enough_for_a_warning(caplog: pytest.LogCapture
     assert [level for level, _ in lines] == [logging.WARNING]
     (lost,) = re.findall(r"has lost up to (\d+) % of its volume", lines[0][1])
     assert int(lost) > 40  # of the worst point: the body as a whole has lost a few per cent
-    simulation = Simulation(scene, SELF)
-    rows = [step.row for step in simulation.steps()]
-    watcher = next(watcher for watcher in simulation.watchers if isinstance(watcher, VolumeLoss))
-    assert min(row["min_jacobian"] for row in rows) == watcher._numbers["least"] < 0.6
-    assert watcher._numbers["mean"] > 0.9 and 1.2 < watcher._numbers["x"] < 1.3
-    simulation.close()
+    with simulated(scene) as (simulation, rows):
+        watcher = next(watcher for watcher in simulation.watchers if isinstance(watcher, VolumeLoss))
+        assert min(row["min_jacobian"] for row in rows) == watcher._numbers["least"] < 0.6
+        assert watcher._numbers["mean"] > 0.9 and 1.2 < watcher._numbers["x"] < 1.3
 
 
 def test_chains_that_point_out_of_the_wall_are_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -110,9 +95,7 @@ def test_chains_that_point_out_of_the_wall_are_said(caplog: pytest.LogCaptureFix
 @pytest.mark.parametrize("refinement", [1, *slowly(2)])
 def test_a_front_within_the_inner_layer_is_said(refinement: int, caplog: pytest.LogCaptureFixture) -> None:
     """Chains turn from circumferential to axial at R = 1.2: in the first of 8 elements, or the second of 16."""
-    ramp = [[0, 0], [25, 1]]
-    loads = {"pressure": {"value": 3.0, "ramp": ramp}, "elongation": {"value": 0.3, "ramp": ramp}}
-    time, remodeling = {"end": "equilibrium"}, {"law": "explicit"}
+    loads, time, remodeling = ramped(25.0, pressure=3.0, elongation=0.3), {"end": "equilibrium"}, {"law": "explicit"}
     scene = tube_scene(loads=loads, mesh={"degree": 2, "refinement": refinement}, remodeling=remodeling, time=time)
     found = said(scene, caplog, "A front lies there")
     assert [level for level, _ in found] == [logging.WARNING] * (refinement == 1)
@@ -122,13 +105,10 @@ def test_a_front_within_the_inner_layer_is_said(refinement: int, caplog: pytest.
 def test_one_and_two_ranks_agree(case: Case) -> None:
     """Of random cells on the whole tube: forces, shares and angles."""
     columns = ["axial_force", "reduced_axial_force", "radial_share", "fibre_angle_inner", "angle_profile_4"]
-    loads = {
-        "pressure": {"value": 2.4, "ramp": [[0, 0], [2, 1]]},
-        "elongation": {"value": -0.2, "ramp": [[0, 0], [2, 1]]},
-    }
     scene = {
-        "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube", "length": 2.0}, "time": {"end": 2.0},
-        "loads": loads, "output": {"columns": columns}, "material": {"lame_lambda": 2.0},
+        "preset": PAPER, "geometry": {"shape": "tube", "length": 2.0}, "time": {"end": 2.0},
+        "loads": ramped(2.0, pressure=2.4, elongation=-0.2), "output": {"columns": columns},
+        "material": {"lame_lambda": 2.0},
     }  # fmt: skip
     one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
     for name in columns:
@@ -139,17 +119,11 @@ def test_one_and_two_ranks_agree(case: Case) -> None:
 @pytest.mark.parametrize(("factor", "told"), [(1e-6, False), (1e-8, True), (0.0, False)])
 def test_loads_that_are_hardly_more_than_rounding_are_told(factor: float, told: bool, caplog: Any) -> None:
     """Whose tensions count in part: the angle is another one than that of loads a hundred times as large."""
-    loads = {"pressure": 4.8 * factor, "elongation": 0.1 * factor}
-    scene = Scene(
-        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0},
-        model={"kinematics": "radial"}, cells={"initial": "isotropic"}, remodeling={"law": "tensor"},
-        loads={name: {"value": value, "ramp": [[0, 0], [25, 1]]} for name, value in loads.items()},
-        time={"end": 50.0, "step": 2.5},
-    )  # fmt: skip
-    simulation = Simulation(scene, MPI.COMM_SELF)
+    shape = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0}
+    loads = ramped(25.0, pressure=4.8 * factor, elongation=0.1 * factor)
+    scene = isotropic(None, geometry=shape, loads=loads, remodeling={"law": "tensor"}, time={"end": 50.0, "step": 2.5})
     with caplog.at_level(logging.WARNING):
-        rows = [step.row for step in simulation.steps()]
-    simulation.close()
+        rows = rows_of(scene)
     if factor:
         assert (abs(rows[-1]["fibre_angle_inner"] - 23.03) > 1.0) == told
     assert ["the loads are weak" in record.getMessage() for record in caplog.records] == [True] * told
