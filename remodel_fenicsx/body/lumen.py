@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-ENDINGS = (".stl", ".ply", ".vtp", ".obj")
+SURFACE_ENDINGS = (".stl", ".ply", ".vtp", ".obj")
 SHARP = 60.0  # degrees between two triangles from which on Gmsh keeps an edge between them
 LONGEST_HEAD = 10**5  # bytes of a PLY file
 SMOOTHINGS = 50  # of the normals where a wall would fold over: more change no corner that is still there
@@ -46,9 +46,9 @@ class Surface(NamedTuple):
 
 
 def read_surface(path: Path) -> Surface:
-    """The surface of a file; its ending is one of `ENDINGS`."""
-    if path.suffix.lower() not in ENDINGS:
-        raise LumenError(f"{path}: allowed is a file that ends with {', '.join(ENDINGS)}")
+    """The surface of a file; its ending is one of `SURFACE_ENDINGS`."""
+    if path.suffix.lower() not in SURFACE_ENDINGS:
+        raise LumenError(f"{path}: allowed is a file that ends with {', '.join(SURFACE_ENDINGS)}")
     try:
         found, _ = read_guarded(path, f"{__name__}:{'polygons' if path.suffix.lower() == '.vtp' else path.suffix[1:]}")
     except (OSError, UnreadableFile, ForeignFileError) as error:

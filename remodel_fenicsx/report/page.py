@@ -426,7 +426,7 @@ def angles(run: ReportedRun) -> Card | None:
 
 def stress(run: ReportedRun) -> Card | None:
     """Stress through the wall, and what the law of Laplace says of its mean around."""
-    body, history = run.body, run.history
+    body, history = run.body, run.recording.history
     if body is None or body.wall_stress is None or len(body.whole.depth) < 2:
         return None
     through, start, end = run.recording.scene.geometry.depth_in_words
