@@ -40,8 +40,6 @@ class TurnedFields:
     def __init__(
         self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
     ):
-        from scipy.spatial import cKDTree  # a run that draws nothing needs none
-
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
         self.nodes = spatial.cKDTree(own_points).query(back)[1]
