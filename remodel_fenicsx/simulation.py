@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from dolfinx.fem import Function
@@ -29,7 +29,7 @@ from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
 from remodel_fenicsx.schema.settings import Cells, Properties, missing_for_steps_of_cells
-from remodel_fenicsx.state import State, UnitCells, by_region
+from remodel_fenicsx.state import Snapshot, State, UnitCells, by_region
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
 from remodel_fenicsx.watch import WATCHERS
@@ -105,27 +105,6 @@ class Simulation:
         self.unknown, self.cells, self.loading = self.state.unknown, self.state.cells, self.state.loading
         self.quadrature, self.tissue = self.cells.quadrature, self.stepper.tissue
         self.watchers = watchers(self.scene, parts)
-        self._start = self.state.snapshot()
-
-    def begin_again(self, scene: Scene) -> bool:
-        """From t = 0 with a scene that differs in numbers of tissue, kappa, loads and opening angle; whether it can."""
-        tissue, kappa = parameters_of(scene.properties(), self.domain)
-        known, stepper, kinematics = self.stepper.tissue.parameters, self.stepper, cast(Any, self.state.kinematics)
-        varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
-        if self.control or self.rest or any(varies[name] and not isinstance(known[name], Function) for name in varies):
-            return False
-        for name, value in tissue.parameters.items():
-            numbers = known[name].x.array if isinstance(known[name], Function) else known[name].value
-            numbers[...] = value.x.array if varies[name] else value
-        stepper.load_values = partial(values_of_loads, next(iter(scene.each_case())).loads)
-        stepper.remodeling.set_kappa(kappa)
-        self.state.restore(self._start)
-        if not scene.natural.is_of_the_mesh:
-            values, closed = natural_gradient(scene, self.quadrature, self.domain, self.cells.local_axes)
-            self.quadrature.values(kinematics.gradient, (3, 3))[:] = values
-            kinematics.closing = closed
-        self.scene = scene
-        return True
 
     def load_values(self, time: float, case: int = 0) -> LoadValues:
         """Magnitude of every load at a time, in a load case; the first is 0."""
@@ -229,6 +208,28 @@ def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
         own += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
         found += [OtherCaseWatcher(case, watcher) for watcher in own if watcher is not None]
     return [watcher for watcher in found if watcher is not None]
+
+
+def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
+    """From its start, with other numbers of tissue, kappa, loads and opening angle of its scene; whether it can."""
+    tissue, kappa = parameters_of(scene.properties(), simulation.domain)
+    known, stepper, kinematics = simulation.stepper.tissue.parameters, simulation.stepper, simulation.state.kinematics
+    varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
+    watched = simulation.control or simulation.rest or scene.solver.unstable == "stop"  # by who knows numbers
+    if watched or any(varies[name] and not isinstance(known[name], Function) for name in varies):
+        return False
+    for name, value in tissue.parameters.items():
+        numbers = known[name].x.array if isinstance(known[name], Function) else known[name].value
+        numbers[...] = value.x.array if varies[name] else value
+    stepper.load_values = partial(values_of_loads, scene.loads)
+    stepper.remodeling.set_kappa(kappa)
+    simulation.state.restore(start)
+    if isinstance(kinematics, NaturalConfiguration):
+        cells, quadrature = simulation.cells, simulation.quadrature
+        values, kinematics.closing = natural_gradient(scene, quadrature, simulation.domain, cells.local_axes)
+        quadrature.values(kinematics.gradient, (3, 3))[:] = values
+    simulation.scene = scene
+    return True
 
 
 def values_of_loads(loads: Mapping[str, Any], time: float) -> LoadValues:

@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain, SymbolicMesh, build_domain
 from remodel_fenicsx.body.axes import found_axes
-from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import LocalAxes
 
 Array = NDArray[np.float64]
-FACES = ("inner", "outer", "inlet", "outlet")
+FACES: dict[str, Callable[[Array], NDArray[np.bool_]]] = {
+    "inner": lambda x: np.isclose(np.hypot(x[0], x[1]), 1.0), "outer": lambda x: np.isclose(np.hypot(x[0], x[1]), 2.0),
+    "inlet": lambda x: np.isclose(x[2], 0.0), "outlet": lambda x: np.isclose(x[2], 1.0),
+}  # fmt: skip
 # a hexahedron between its first and its last corner, in dolfinx's order
 TETRAHEDRA = ((0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7))
 
@@ -119,33 +121,24 @@ def ring(
 ) -> Domain:
     """The mesh of a body in blocks around, through and along; each is a hexahedron or six tetrahedra."""
     around, through, along = counts
-    first, second, third = (axis.ravel() for axis in np.indices((around, through + 1, along + 1)))
-    number = np.arange(len(first)).reshape(around, through + 1, along + 1)
+    places = np.indices((around, through + 1, along + 1)).reshape(3, -1)
+    number = np.arange(places.shape[1]).reshape(around, through + 1, along + 1)
     corners = []
     for corner in range(8):
         i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
-        turned = np.roll(number, -i, axis=0)
-        corners.append(turned[:, j : through + j, k : along + k].ravel())
+        corners.append(np.roll(number, -i, axis=0)[:, j : through + j, k : along + k].ravel())
     hexahedra = np.stack(corners, axis=1)
     cells = hexahedra if kind == "hexahedron" else np.concatenate([hexahedra[:, list(those)] for those in TETRAHEDRA])
     here = slice(None) if comm.rank == 0 else slice(0)
     element = SymbolicMesh(basix.ufl.element("Lagrange", kind, 1, shape=(3,)))
-    nodes = place(first / around, second / through, third / along)
-    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells[here], x=nodes[here], e=element)
-    mesh.topology.create_connectivity(2, 3)
-    mesh.topology.create_connectivity(3, 2)
-    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-    in_mesh = mesh.geometry.input_global_indices
-    values = np.zeros(len(facets), dtype=np.int32)
-    to_cells, to_facets = mesh.topology.connectivity(2, 3), mesh.topology.connectivity(3, 2)
-    corners_of = basix.topology(basix.CellType[kind])[2]
-    for row, facet in enumerate(facets):
-        cell = to_cells.links(facet)[0]
-        local = int(np.flatnonzero(to_facets.links(cell) == facet)[0])
-        of_facet = in_mesh[geometry_dofmap(mesh)[cell][corners_of[local]]]
-        sides = (second == 0, second == through, third == 0, third == along)
-        values[row] = 1 + [bool(side[of_facet].all()) for side in sides].index(True)
-    tags = dolfinx.mesh.meshtags(mesh, 2, facets, values)
+    shares = places / np.array(counts)[:, None]
+    tube = straight(1.0, 2.0, 1.0).place(*shares)  # on which the faces are easily told apart
+    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells[here], x=tube[here], e=element)
+    found = [dolfinx.mesh.locate_entities_boundary(mesh, 2, marker) for marker in FACES.values()]
+    facets, values = np.concatenate(found), np.repeat(np.arange(1, 5, dtype=np.int32), list(map(len, found)))
+    order = np.argsort(facets)
+    tags = dolfinx.mesh.meshtags(mesh, 2, facets[order], values[order])
+    mesh.geometry.x[:] = place(*shares)[mesh.geometry.input_global_indices]
     return Domain(mesh, tags, {name: tag for tag, name in enumerate(FACES, start=1)}, "ring", {"size": 1.0})
 
 

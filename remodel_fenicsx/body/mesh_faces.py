@@ -223,7 +223,7 @@ def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
         raise MeshFileError(f"element {file.cell_numbers[bad]} shares a facet with two others")
     one = np.flatnonzero(count[inverse.reshape(-1)] == 1)
     facets_one, cell = facets[one], one // len(local)
-    flipped = _orientation(file)[cell] < 0  # elements may be numbered as in a mirror
+    flipped = jacobian_determinants(file).mean(axis=1)[cell] < 0  # elements may be numbered as in a mirror
     facets_one[flipped] = facets_one[flipped][:, ::-1]
     return facets_one, cell, facets[first[count == 2]]
 
@@ -268,10 +268,6 @@ def node_order(file: MeshFile) -> NDArray[np.int64]:
     """dolfinx's order of an element's nodes, as places in Gmsh's."""
     kind = getattr(dolfinx.mesh.CellType, file.kind)
     return np.asarray(dolfinx.cpp.io.perm_gmsh(kind, file.cells.shape[1]), dtype=np.int64)
-
-
-def _orientation(file: MeshFile) -> Array:
-    return np.asarray(np.sign(jacobian_determinants(file).mean(axis=1)))
 
 
 def _area_vectors(places: Array) -> Array:
@@ -395,17 +391,13 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> list
     for part in parts:
         support = supports.get(part.name)
         if support is not None and support.kind != "free":
-            motions = _motions((part.places - middle) / size)
+            # displacements (facets, 6, 3) of the unit motions along and about the axes
+            turns = np.cross(np.eye(3)[None], (part.places - middle)[:, None] / size)
+            motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
             matrix += np.einsum("fki,fij,flj->kl", motions, _held_directions(support, part), motions) / len(motions)
     values, vectors = np.linalg.eigh(matrix)
     still = vectors[:, values <= STILL * max(float(values[-1]), 1e-300)]
     return [_in_words(motion, middle, size) for motion in _plain(still).T]
-
-
-def _motions(places: Array) -> Array:
-    """Displacements (facets, 6, 3) of the unit motions along and about the axes at places (facets, 3)."""
-    turns = np.cross(np.eye(3)[None], places[:, None])
-    return np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
 
 
 def _held_directions(support: Support, part: Face) -> Array:

@@ -287,18 +287,21 @@ def objections(scene: Any, name: str) -> list[str]:
     return reasons
 
 
+def _in_the_mean(scene: Any, name: str) -> list[str]:
+    reduction = scene.geometry.reductions.get(name)
+    rules = () if reduction is None else reduction.in_the_mean
+    return [reason for rule in rules if (reason := rule(scene)) is not None]
+
+
 def is_for_means(scene: Any, name: str) -> bool:
     """Whether a kinematics, where it is allowed, is right for means over many seeds alone."""
-    reduction = scene.geometry.reductions.get(name)
-    return reduction is not None and any(rule(scene) is not None for rule in reduction.in_the_mean)
+    return bool(_in_the_mean(scene, name))
 
 
 def only_for_means(scene: Any) -> list[str]:
     """Why the scene's own kinematics is right for means over many seeds alone, in words; nothing where it is exact."""
     name = scene.model.kinematics
-    reduction = scene.geometry.reductions.get(name)
-    rules = () if reduction is None else reduction.in_the_mean
-    return [f"{name!r}: {reason}" for rule in rules if (reason := rule(scene)) is not None]
+    return [f"{name!r}: {reason}" for reason in _in_the_mean(scene, name)]
 
 
 def for_means(scene: Any) -> str:

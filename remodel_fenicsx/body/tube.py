@@ -18,10 +18,10 @@ from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.body.shape import Array, Column, End, LoadKind, check_lengths
 from remodel_fenicsx.body.wall import (
     AngleOf,
+    CONFIGURATIONS,
     RoundWall,
     Wall,
     angle_columns,
-    angle_columns_on_request,
     stress_columns,
     check_layers,
     tube_layers,
@@ -202,10 +202,6 @@ MEANS = {
 }
 
 
-def _add_pressure(loading: Loading, name: str) -> None:
-    (loading.add_cavity_pressure if loading.has_caps else loading.add_follower_pressure)(name, "inner")
-
-
 def _elongation(m: Any) -> float:
     """As prescribed, or as found where the length is an unknown."""
     strain = getattr(m.state.kinematics, "strain_of_length", None)
@@ -271,7 +267,9 @@ class Tube(RoundWall):
 
     loads: ClassVar[dict[str, LoadKind]] = {
         "pressure": LoadKind(
-            lambda shape, loading, name: _add_pressure(loading, name),
+            lambda shape, loading, name: (
+                loading.add_cavity_pressure if loading.has_caps else loading.add_follower_pressure
+            )(name, "inner"),
             "pressure on the deformed inner face, and on the caps of closed ends",
             STRESS,
             reductions=("radial", "axisymmetric", "sector"),
@@ -321,7 +319,7 @@ class Tube(RoundWall):
             by_case=False,
             of_one_tissue=True,
         ),
-        *angle_columns_on_request(MEANS),
+        *itertools.chain.from_iterable(angle_columns(MEANS, name) for name in CONFIGURATIONS),
         *stress_columns(MEANS),
         Column(
             "mean_hoop_stress",

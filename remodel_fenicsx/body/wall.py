@@ -196,31 +196,22 @@ def _middle_angle(m: Any, angle: Array) -> float:
     return float(m.quadrature.mean_of_known(angle, m.tool("middle elements", elements)))
 
 
-def angle_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
-    """Of the cells' own configuration."""
+def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str = "") -> tuple[Column, ...]:
+    """Of the cells' own configuration, or of another one of `CONFIGURATIONS`."""
+    name = f"fibre_angle_{configuration}" if configuration else "fibre_angle"
     return tuple(
         Column(
-            f"fibre_angle_{where}",
+            f"{name}_{where}",
             "degrees",
-            f"{ANGLE_IN} {words}",
-            partial(_of, mean, "fibre_angle"),
-            by_case=False,
+            (
+                f"as `fibre_angle_{where}`, but {CONFIGURATIONS[configuration]}"
+                if configuration
+                else f"{ANGLE_IN} {words}"
+            ),
+            partial(_of, mean, name),
+            by_case=bool(configuration),
         )
         for where, (words, mean) in means.items()
-    )
-
-
-def angle_columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
-    """Of the other configurations."""
-    return tuple(
-        Column(
-            f"fibre_angle_{name}_{where}",
-            "degrees",
-            f"as `fibre_angle_{where}`, but {meaning}",
-            partial(_of, mean, f"fibre_angle_{name}"),
-        )
-        for name, meaning in CONFIGURATIONS.items()
-        for where, (_, mean) in means.items()
     )
 
 
@@ -328,7 +319,7 @@ class WalledMesh(Walled):
 
     columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
     columns_on_request: ClassVar[tuple[Column, ...]] = (
-        *angle_columns_on_request(MEANS_ON_A_MESH),
+        *itertools.chain.from_iterable(angle_columns(MEANS_ON_A_MESH, name) for name in CONFIGURATIONS),
         *stress_columns(MEANS_ON_A_MESH),
         *Walled.columns_on_request,
     )

@@ -589,12 +589,6 @@ def cards(run: ReportedRun) -> list[Card]:
     return [card for card in (part(run) for part in PAGE_PARTS) if card is not None]
 
 
-def data_of(cards_: list[Card]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Data by card and arrays by card and name, as the script takes them."""
-    data = {card.name: dict(card.data) for card in cards_}
-    return data, {f"{card.name}.{name}": array for card in cards_ for name, array in card.arrays.items()}
-
-
 # ---------------------------------------------------------------- the page as one file
 # Template, cards, data, scripts; nothing in it asks for anything from outside.
 
@@ -630,7 +624,9 @@ def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     """The page as text; parameters and errors as of `write_report`."""
     if not has_a_body(recording):
         return page_with(cards(ReportedRun(recording)))
-    whole, most = WholeBody(recording), _times_at_most(recording, size)
+    whole, count = WholeBody(recording), 6 * len(recording.points) + 11 * len(recording.elements)
+    # more times than this do not fit, however small they become
+    most = max(FEWEST_TIMES, int(1e6 * size / (4 / 3 * BEST_RATIO * count)))
     for _ in range(TRIES):
         body = ShownBody.of(whole, kept_times(recording.history, recording.times, most))
         found = cards(ReportedRun(recording, body))
@@ -643,15 +639,10 @@ def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     return page
 
 
-def _times_at_most(recording: RecordedRun, size: float) -> int:
-    """More times than this do not fit, however small they become."""
-    count = 6 * len(recording.points) + 11 * len(recording.elements)
-    return max(FEWEST_TIMES, int(1e6 * size / (4 / 3 * BEST_RATIO * count)))
-
-
 def page_with(found: list[Card]) -> str:
     """A page with these cards, the first one the head, whose data have the page's `name`."""
-    data, arrays = data_of(found)
+    data = {card.name: dict(card.data) for card in found}  # as the script takes them
+    arrays = {f"{card.name}.{name}": array for card in found for name, array in card.arrays.items()}
     block, table = packed(arrays)
     script = "{\n" + "\n".join(_asset(name) for name in SCRIPTS) + "\n}\n"
     style = "\n".join(_asset(name) for name in STYLES)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
@@ -18,6 +19,7 @@ from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
 from remodel_fenicsx.system.files import part_of
 
+spatial = Late("scipy.spatial")  # most runs show no reduction
 Array = NDArray[np.float64]
 Fields = tuple[Array | None, dict[str, Array]]
 
@@ -38,11 +40,9 @@ class TurnedFields:
     def __init__(
         self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
     ):
-        from scipy.spatial import cKDTree  # a run that draws nothing needs none
-
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
-        self.nodes = cKDTree(own_points).query(back)[1]
+        self.nodes = spatial.cKDTree(own_points).query(back)[1]
         self.offsets = back - own_points[self.nodes]
         owner = np.zeros(len(own_points), dtype=np.int64)
         owner[own_elements.reshape(-1)] = np.repeat(np.arange(len(own_elements)), own_elements.shape[1])
@@ -50,7 +50,7 @@ class TurnedFields:
         self.centres = points[elements].mean(axis=1)
         self.element_turns = turn(self.centres)
         # the mean of nodes that were turned back each by itself: chords of a coarse mesh lie inside of their circles
-        self.sources = cKDTree(own_points[own_elements].mean(axis=1)).query(back[elements].mean(axis=1))[1]
+        self.sources = spatial.cKDTree(own_points[own_elements].mean(axis=1)).query(back[elements].mean(axis=1))[1]
 
     def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
         """Displacement of the body's nodes, where it was recorded, and fields of its elements."""

@@ -41,8 +41,9 @@ from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.tables import Table, fault, shown
 from remodel_fenicsx.schema.toml import read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
-from remodel_fenicsx.simulation import Simulation, with_choices
+from remodel_fenicsx.simulation import Simulation, begin_again, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.studies.page import COLOURS, DOTS_PER_INCH, STYLE, Answer, Page, label, made_with, panels
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
@@ -301,7 +302,7 @@ def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], 
 
 
 # ---------------------------------------------------------------- what a scene says where a table has measurements
-# keys whose numbers a simulation takes that is built already (`Simulation.begin_again`)
+# keys whose numbers a simulation takes that is built already (`begin_again`)
 TISSUE, OTHERS = r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))", r"loads\.\w+\.value|natural\.\w+"
 CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
 # what differences of runs divide by a small change is rounding alone
@@ -352,20 +353,20 @@ class Kept:
 
     def __init__(self, keys: Sequence[str]):
         self._may_stay = all(re.fullmatch(CAN_BE_SET, key) for key in keys)
-        self._known: dict[Any, Simulation] = {}
+        self._known: dict[Any, tuple[Simulation, Snapshot]] = {}
 
     def simulation(self, scene: Scene, table: Measured, is_passive: bool) -> Simulation:
         """At t = 0."""
         use = id(table), is_passive, scene.model.kinematics, scene.mesh.formulation
-        known = self._known.pop(use, None)
-        if known is None or not (self._may_stay and known.begin_again(scene)):
-            if known is not None:
-                known.close()
-            known = Simulation(scene, MPI.COMM_SELF)
-            known.watchers = [one for one in known.watchers if not isinstance(one, WarnsOnce)]
-            known.observer.columns = tuple(one for one in known.observer.columns if one.name in ("time", *table.sd))
-        self._known[use] = known
-        return known
+        if use in self._known:
+            if self._may_stay and begin_again(*self._known[use], scene):
+                return self._known[use][0]
+            self._known.pop(use)[0].close()
+        made = Simulation(scene, MPI.COMM_SELF)
+        made.watchers = [one for one in made.watchers if not isinstance(one, WarnsOnce)]
+        made.observer.columns = tuple(one for one in made.observer.columns if one.name in ("time", *table.sd))
+        self._known[use] = made, made.state.snapshot()
+        return made
 
 
 def _run(
@@ -571,29 +572,29 @@ def fit(
     """Fit numbers of a scene to measurements."""
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
-    with hold_log(quiet=quiet) as held:
-        unknowns, tables = read_measurements(Path(data), scene)
-        mark = fingerprint(scene, unknowns, tables)
-        place, journal = _place(folder, f"{scene.name}-fit", mark)
-        problem, first = Problem(scene, unknowns, tables, journal), np.log([u.start for u in unknowns])
-        try:
-            at_start = problem.models(first)
-        except StepFailure as failure:
-            raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
-        for doubt in doubts(tables, at_start, scene):
-            log.warning("%s", doubt)
-        near = first, problem.jacobian(first, central=True)
-        problem.check_tells_apart(near[1])
     random = np.random.default_rng(1)
-    points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
     with ExitStack() as stack:
+        line = stack.enter_context(Line(f"{scene.name} fit", quiet))
+        with hold_log(quiet=quiet) as held:
+            unknowns, tables = read_measurements(Path(data), scene)
+            mark = fingerprint(scene, unknowns, tables)
+            place, journal = _place(folder, f"{scene.name}-fit", mark)
+            problem, first = Problem(scene, unknowns, tables, journal), np.log([u.start for u in unknowns])
+            line.show(f"the start, and derivatives there: {2 * len(unknowns) + 1} runs")
+            try:
+                at_start = problem.models(first)
+            except StepFailure as failure:
+                raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
+            for doubt in doubts(tables, at_start, scene):
+                log.warning("%s", doubt)
+            near = first, problem.jacobian(first, central=True)
+            problem.check_tells_apart(near[1])
+        points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
         stack.enter_context(RunLock(place))
         journal.begin(mark)
         stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
-        line = stack.enter_context(Line(f"{scene.name} fit", quiet))
-
         pool = ProcessPoolExecutor(jobs or cores(), get_context("fork"), _begin_with, (problem,))
-        stack.callback(_end, pool)
+        stack.callback(_end, pool, active_children())
 
         def on_cores(tasks: Mapping[str, Callable[[Problem], Any]]) -> list[Any]:
             asked = [pool.submit(_told, *task) for task in tasks.items()]
@@ -642,10 +643,10 @@ def _told(words: str, task: Callable[[Problem], Any]) -> tuple[Any, dict[Point, 
     return answer, new
 
 
-def _end(pool: ProcessPoolExecutor) -> None:
-    """At once, whatever they do."""
+def _end(pool: ProcessPoolExecutor, others: Sequence[Any]) -> None:
+    """At once, whatever its processes do."""
     pool.shutdown(wait=False, cancel_futures=True)
-    for process in active_children():
+    for process in set(active_children()).difference(others):
         process.kill()
 
 
@@ -684,8 +685,8 @@ def minimised(
     enough: float = ENOUGH,
 ) -> Any:
     """SciPy's least squares from a start, logarithms."""
-    # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells how
-    # residuals change: differences are made only where they pay.
+    # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells what
+    # residuals do: differences are made only where they pay
     from scipy.optimize import least_squares
 
     free = np.array([number != held for number in range(len(start))])

@@ -18,7 +18,7 @@ import sysconfig
 import types
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.environment import extensions_for_children
@@ -42,7 +42,8 @@ class Worker:
 
     def begin(self, arguments: Sequence[str], messages: Path) -> None:
         """Begin a command, with a file for all that it says."""
-        _emptied(messages).close()
+        messages.unlink(missing_ok=True)  # whatever was in its place: a link too
+        os.close(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         self.messages, self.is_at_work = messages, True
         assert self.process.stdin is not None
         if self.is_alive:  # else `poll` will see it; PETSc, where it is loaded, aborts at a closed pipe
@@ -75,7 +76,11 @@ class Worker:
             self.process.terminate()
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.close()
-        _wait(self.process)
+        try:
+            self.process.wait(timeout=SECONDS_TO_END)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
         self.process.stdout.close()
 
 
@@ -126,24 +131,9 @@ def environment_of_child() -> dict[str, str]:
     return os.environ | own | extensions_for_children()
 
 
-def _emptied(messages: Path) -> TextIO:
-    """A new file for what a run says, whatever was in its place: a link too."""
-    messages.unlink(missing_ok=True)
-    return open(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w")
-
-
 def last_line(said: str) -> str:
     """Of what a process has said."""
     return (said.strip().splitlines() or ["it said nothing"])[-1]
-
-
-def _wait(process: subprocess.Popen[Any]) -> None:
-    """Until it has ended, or is killed for taking too long."""
-    try:
-        process.wait(timeout=SECONDS_TO_END)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 # ---------------------------------------------------------------- readers of files of others

@@ -69,7 +69,7 @@ def scene(shape: str, end: float = 3.0, **tables: Any) -> Scene:
     """Pressed and pulled, with isotropic cells."""
     radii = {"inner_radius": 1.0, "outer_radius": 3.0} if shape == "tube" else {}
     values = {"geometry": {"shape": shape, "length": 2.0, **radii}, "loads": ramped(2.0, pressure=2.0, elongation=0.1)}
-    values |= {"time": {"end": end}, "solver": {"method": "direct"}}
+    values |= {"time": {"end": end}, "solver": {"method": "direct"}, "output": {}}
     return Scene(**isotropic(None, "full", **values | tables))
 
 

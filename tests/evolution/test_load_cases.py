@@ -290,7 +290,7 @@ def test_the_mean_of_targets_has_their_shares() -> None:
 def test_a_run_goes_on_with_all_cases(tmp_path: Path) -> None:
     found = goes_on(artery(pulse(0.4), 20.0), tmp_path, 10.0)
     page = (tmp_path / "whole" / "report.html").read_text()
-    assert "0.667 of the time: pressure times 0.6; 0.333 of the time: pressure times 1.8" in page
+    assert "weight 0.666667, loads pressure 0.6" in page and "weight 0.333333, loads pressure 1.8" in page
     assert "inner_radius@2" in found.history
     with pytest.raises(SceneError):
         resume(found.path, ["cases=[]"])

@@ -389,7 +389,7 @@ def test_cells_that_stay_are_said_to_take_staggered_turnover(caplog: pytest.LogC
     assert "kappa is 0" in caplog.text and "in place of 'implicit'" in caplog.text
 
 
-@pytest.mark.parametrize(("gain", "thickness", "stress"), [(1.0, 0.70, 3.1), (2.0, 0.86, 2.0)])
+@pytest.mark.parametrize(("gain", "thickness", "stress"), [(1.0, 0.753, 2.75), (2.0, 0.908, 1.85)])
 def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: float, stress: float) -> None:
     """As docs/turnover.md says under Limits: its thickness and p r_i/h after half as much again, over those before."""
     found = []
@@ -401,7 +401,7 @@ def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: f
         row = last_row(values)
         wall_thickness = row["outer_radius"] - row["inner_radius"]
         found.append((wall_thickness, factor * row["inner_radius"] / wall_thickness))
-    assert np.divide(found[1], found[0]) == pytest.approx([thickness, stress], rel=0.02)
+    assert np.divide(found[1], found[0]) == pytest.approx([thickness, stress], rel=0.01)
 
 
 def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instability(

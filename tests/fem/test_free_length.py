@@ -27,7 +27,7 @@ END = 4.0
 
 def values(kinematics: str, loads: dict[str, Any], **tables: Any) -> dict[str, Any]:
     direct = {"method": "direct"}  # whose iterations are counted
-    base = {"loads": ramped(END, pressure=4.8, elongation=0.0) | loads, "solver": direct}
+    base = {"loads": ramped(END, pressure=4.8, elongation=0.0) | loads, "solver": direct, "output": None}
     return isotropic(kinematics=kinematics, **base | {"remodeling": {"kappa": 0.1}, "time": {"end": END}} | tables)
 
 

@@ -21,40 +21,21 @@ from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
 from tests.model.test_condensed import deformations, points, solved
+from tests.tables import rows as table, values as values_of
 from tests.watch.test_over_correction import Tilt
 
 PAPER, CONSISTENT = "kuhl-holzapfel-2007", "consistent"
 METRES = 1e-9
 POWER = 2.0**-30  # about metres
-POINT = {"model.kinematics": "point", "time.end": 12.0, "time.step": 2.0}
-RANDOM = {"mesh.refinement": 2, "cells.initial": "random", "time.end": 6.0, "time.step": 2.0}
-RADIAL = {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 30.0, "time.step": 5.0}
-IMPLICIT = {"remodeling.coupling": "implicit", "remodeling.frame": "material", "time.end": 15.0}
-FINGER = {"remodeling.driver": "finger", "remodeling.kappa": 0.3, "remodeling.law": "relaxation"}
-AND_BACK = [[0.0, 0.0], [3.0, 1.0], [5.0, -0.1], [10.0, -0.1], [11.0, 1.0]]
-CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "explicit": (PAPER, "cube", POINT),
-    "rate, length": (PAPER, "cube", {**POINT, "remodeling.law": "rate", "material.repulsion": "length"}),
-    "rotation": (PAPER, "cube", {**RANDOM, "remodeling.law": "rotation"}),
-    "relaxation, random": (PAPER, "cube", {**RANDOM, "remodeling.law": "relaxation", "remodeling.frame": "material"}),
-    "tensor, random": (CONSISTENT, "cube", RANDOM),
-    "compression": (PAPER, "cube", {**RANDOM, "loads.force.value": -3.0, "mesh.refinement": 1}),
-    "extrapolated": (CONSISTENT, "tube", RADIAL),
-    "pk2, staggered": (CONSISTENT, "tube", {**RADIAL, "remodeling.driver": "pk2", "remodeling.coupling": "staggered"}),
-    "implicit": (CONSISTENT, "tube", {**RADIAL, "remodeling.coupling": "implicit"}),
-    "implicit, printed": (PAPER, "tube", {**RADIAL, **IMPLICIT}),
-    "relaxed": (PAPER, "tube", {**RADIAL, "remodeling.coupling": "relaxed", "remodeling.pairing": "continuous"}),
-    "long steps": (PAPER, "tube", {**RADIAL, **FINGER}),
-    "load to nothing and back": (PAPER, "cube", {**POINT, "time.end": 14.0, "time.step": 1.0, "remodeling.kappa": 0.1,
-                                                 "loads.force.ramp": AND_BACK}),
-    "strong": (PAPER, "tube", {**RADIAL, "loads.pressure.value": 50.0, "time.end": 60.0}),
-    "near locking": (PAPER, "cube", {**POINT, "cells.end_to_end_length": 0.999 * 2.125}),
-    "chosen steps": (CONSISTENT, "tube", {**RADIAL, "time.end": 50.0, "time.tolerance": 1.0}),
-    "chosen steps, printed": (PAPER, "tube", {**RADIAL, "time.end": 50.0, "time.tolerance": 2.0}),
-    "equilibrium": (CONSISTENT, "tube", {**RADIAL, "time.end": "equilibrium"}),
-    "equilibrium, finger": (PAPER, "tube", {**RADIAL, "time.end": "equilibrium", "remodeling.driver": "finger",
-                                            "remodeling.law": "relaxation"}),
-}  # fmt: skip
+BASES: dict[str, dict[str, Any]] = {
+    "point": {"model.kinematics": "point", "time.end": 12.0, "time.step": 2.0},
+    "random": {"mesh.refinement": 2, "cells.initial": "random", "time.end": 6.0, "time.step": 2.0},
+    "radial": {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 30.0, "time.step": 5.0},
+}
+CASES = {
+    name: (preset, shape, BASES[base] | values_of(changes))
+    for name, preset, shape, base, changes in table(__file__, "chain_lengths.txt")
+}
 
 
 class Run(NamedTuple):
