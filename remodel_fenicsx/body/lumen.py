@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.system.children import UnreadableFile, read_guarded, tree_by_rule
+from remodel_fenicsx.system.children import UnreadableFile, check_xml, read_guarded
 from remodel_fenicsx.system.files import ForeignFileError, write_new
 
 Array = NDArray[np.float64]
@@ -95,11 +95,9 @@ def polygons(file: str) -> dict[str, Any]:
     from vtkmodules.vtkFiltersCore import vtkTriangleFilter
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
-    text = Path(file).read_bytes()
-    tree_by_rule(text)
+    check_xml(Path(file).read_bytes())
     reader, triangulated = vtkXMLPolyDataReader(), vtkTriangleFilter()
-    reader.ReadFromInputStringOn()
-    reader.SetInputString(text.decode())
+    reader.SetFileName(file)
     triangulated.SetInputConnection(reader.GetOutputPort())
     triangulated.Update()
     data = triangulated.GetOutput()

@@ -137,7 +137,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str, BeforeValidator(_file)] = Field(
         description=(
-            "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one that meshio reads "
+            "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one of VTK or meshio "
             "(`.vtu`, `.vtk`, `.xdmf`). Its path is relative to the scene's folder."
         ),
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf"},

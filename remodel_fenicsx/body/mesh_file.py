@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib
+import itertools
 import json
 import re
 import warnings
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.system.children import DAMAGED, UnreadableFile, read_guarded
+from remodel_fenicsx.system.children import DAMAGED, UnreadableFile, check_xml, read_guarded
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -132,11 +133,55 @@ def read_exchange_file(path: Path) -> ExchangeFile:
 # what the child calls, without the modules of other formats
 
 
-def _arrays(kind: str, file: str) -> dict[str, Any]:
-    return _as_arrays(importlib.import_module(f"meshio.{kind}").read(file))
+def arrays_xdmf(file: str) -> dict[str, Any]:
+    """Those of a file in XDMF."""
+    return _as_arrays(importlib.import_module("meshio.xdmf").read(file))
 
 
-arrays_vtu, arrays_vtk, arrays_xdmf = (functools.partial(_arrays, kind) for kind in ("vtu", "vtk", "xdmf"))
+def arrays_vtu(file: str) -> dict[str, Any]:
+    """Those of a file in VTK's XML, however its writers pack numbers."""
+    check_xml(Path(file).read_bytes())
+    return _of_vtk("vtkXMLUnstructuredGridReader", "vtkIOXML", file)
+
+
+def arrays_vtk(file: str) -> dict[str, Any]:
+    """Those of a file in VTK's old format, as text or not."""
+    return _of_vtk("vtkUnstructuredGridReader", "vtkIOLegacy", file)
+
+
+def _of_vtk(reader: str, module: str, file: str) -> dict[str, Any]:
+    """By VTK itself, as meshio would have them."""
+    import meshio
+    from meshio._vtk_common import vtk_to_meshio_type
+
+    try:
+        made = getattr(importlib.import_module(f"vtkmodules.{module}"), reader)()
+        numbers = importlib.import_module("vtkmodules.util.numpy_support").vtk_to_numpy
+    except ImportError:
+        raise UnreadableFile("VTK, which reads such files, is not installed: pip install vtk") from None
+    made.SetFileName(file)
+    for read_all in ("ReadAllScalarsOn", "ReadAllVectorsOn", "ReadAllTensorsOn", "ReadAllFieldsOn"):
+        getattr(made, read_all, lambda: None)()
+    made.Update()
+    grid = made.GetOutput()
+    if not grid.GetNumberOfCells():
+        raise UnreadableFile("has no elements")
+    types, nodes = numbers(grid.GetCellTypesArray()), numbers(grid.GetCells().GetConnectivityArray())
+    starts = numbers(grid.GetCells().GetOffsetsArray())
+    changes: Any = np.flatnonzero(np.diff(types)) + 1
+    cuts = [0, *changes.tolist(), len(types)]
+    cells, pieces = [], [slice(a, b) for a, b in itertools.pairwise(cuts)]
+    for piece in pieces:
+        rows = nodes[starts[piece.start] : starts[piece.stop]].reshape(piece.stop - piece.start, -1)
+        cells.append((vtk_to_meshio_type[int(types[piece.start])], rows))
+
+    def arrays(data: Any) -> dict[str, Any]:
+        found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
+        return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
+
+    of_cells = {name: [values[piece] for piece in pieces] for name, values in arrays(grid.GetCellData()).items()}
+    points = numbers(grid.GetPoints().GetData())
+    return _as_arrays(meshio.Mesh(points, cells, arrays(grid.GetPointData()), of_cells))
 
 
 def _as_arrays(mesh: Any, group_names: list[tuple[int, int, str]] | None = None) -> dict[str, Any]:

@@ -67,6 +67,35 @@ def test_the_mesh_is_that_of_gmsh(tmp_path: Path, ending: str, element: str, deg
         assert np.abs(sorted_rows(sides[0].round(9)) - sorted_rows(sides[1].round(9))).max() < 1e-8
 
 
+PACKED = [
+    ("vtu", mode, packer) for mode in ("Ascii", "Binary", "Appended", "raw") for packer in ("None", "LZ4", "LZMA")
+]
+
+
+@pytest.mark.parametrize(("ending", "mode", "packer"), [*PACKED, ("vtk", "Ascii", ""), ("vtk", "Binary", "")])
+def test_what_vtk_writes_is_read(tmp_path: Path, ending: str, mode: str, packer: str) -> None:
+    """In each of the ways in which its writers, and so ParaView and PyVista, pack numbers."""
+    io = pytest.importorskip("vtkmodules.vtkIOXML" if ending == "vtu" else "vtkmodules.vtkIOLegacy")
+    source = converted(write_tube(tmp_path / "tube.msh", "tetrahedron", 2), ".vtu")
+    reader = pytest.importorskip("vtkmodules.vtkIOXML").vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(source))
+    reader.Update()
+    writer = getattr(io, "vtkXMLUnstructuredGridWriter" if ending == "vtu" else "vtkUnstructuredGridWriter")()
+    writer.SetInputData(reader.GetOutput())
+    writer.SetFileName(str(tmp_path / f"packed.{ending}"))
+    if ending == "vtu":
+        getattr(writer, f"SetDataModeTo{mode.replace('raw', 'Appended')}")()
+        getattr(writer, f"SetCompressorTypeTo{packer}")()
+        writer.SetEncodeAppendedData(mode != "raw")
+    else:
+        getattr(writer, f"SetFileTypeTo{mode.replace('Ascii', 'ASCII')}")()
+    assert writer.Write() == 1
+    one, other = read_mesh(source), read_mesh(tmp_path / f"packed.{ending}")
+    tolerance = 1e-12 if ending == "vtu" and mode != "Ascii" else 1e-5
+    np.testing.assert_allclose(one.points[one.cells], other.points[other.cells], atol=tolerance)
+    np.testing.assert_array_equal(one.facet_groups, other.facet_groups)
+
+
 def scene_of(file: Path, **geometry: Any) -> Any:
     return scene_from_dict(
         {
