@@ -94,7 +94,7 @@ def unloaded(
     """
     if not scene.geometry.is_loaded:
         return scene
-    with Line(f"{scene.name}, unloaded body", silent=quiet or comm.rank != 0) as line:
+    with Line(f"{scene.name} unloaded", silent=quiet or comm.rank != 0) as line:
         if isinstance(scene.geometry, RoundWall):
             return unloaded_tube(scene, comm, line.show)
         if folder is None:
@@ -172,7 +172,7 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
         step = before = np.zeros_like(numbers)
         for _ in range(MOST_LOADINGS):
             runs += 1
-            said(f"run {runs}, {100 * share:g} % of the loads{words}")
+            said(f"run {runs}{words}, {100 * share:g} % of the loads")
             found = np.exp(numbers)
             loaded = _loaded(scene, comm, found, share)
             if np.abs(given - loaded).max() <= LOADED_AGAIN * given.max():
@@ -182,7 +182,7 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
                 change = slope @ (before - error)
                 slope = slope + np.outer(step - change, step @ slope) / (step @ change)
             step, before = slope @ error, error
-            numbers, words = numbers + step, f"; the one before was off by {np.abs(error).max():.1e}"
+            numbers, words = numbers + step, f", off by {np.abs(error).max():.0e} before"
         raise ArithmeticError(f"off by {np.abs(error).max():.2g} after {MOST_LOADINGS} runs")
 
     in_shares(find, np.zeros(len(given)))
@@ -283,7 +283,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
         places, step, length, words = start, np.zeros_like(start), 1.0, ""
         for _ in range(MOST_MOVES):
             iterations += 1
-            said(f"Newton iteration {iterations}, {100 * share:g} % of the loads{words}")
+            said(f"iteration {iterations}{words}, {100 * share:g} % of the loads")
             write(places)
             with unsaid(), contextlib.closing(Simulation(scene.with_values(changes), comm)) as simulation:
                 found = _newton_step(simulation, given, share)
@@ -294,7 +294,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
                 places = places - length * step
                 continue
             size, length = float(np.abs(found).max()), 1.0
-            words = f"; nodes have moved by {size:.1e}"
+            words = f", moved by {size:.0e} before"
             while not comm.bcast(file is None or _is_whole(replace(file, points=places + length * found))):
                 length /= 2
                 if length < LEAST_STEP:

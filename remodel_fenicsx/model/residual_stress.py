@@ -227,7 +227,10 @@ def solved(
         columns = residual(moved, stresses + (tangents @ strains[..., None])[..., 0]).imag / COMPLEX_STEP
         if not np.isfinite(columns).all() or not np.isfinite(present).all():
             break
-        step = np.linalg.solve(columns.T, present)
+        try:
+            step = np.linalg.solve(columns.T, present)
+        except np.linalg.LinAlgError:
+            break
         if np.abs(present).max() < CLOSED:
             return values - step  # bending is soft: what is left of the balance may be a millionth of the angle
         for share in (0.5**power for power in range(12)):

@@ -601,8 +601,8 @@ def fit(
             left = set(asked)
             while left:
                 left = wait(left, 0.5).not_done
-                words = f"{len(left)} of {len(asked)} left: {', '.join(tasks)}"
-                line.show(f"{words}; {journal.path.read_bytes().count(10) - 1} runs so far")
+                runs = journal.path.read_bytes().count(b"\n") - 1
+                line.show(f"{runs} runs, {len(left)} of {len(asked)} left: {', '.join(tasks)}")
             answers = [one.result() for one in asked]
             for _, known in answers:
                 problem.known |= known
