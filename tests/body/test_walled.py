@@ -97,7 +97,7 @@ def test_columns_of_tetrahedra_have_elements_in_every_mesh() -> None:
 
 def test_recorded_fields_and_layers_of_pictures(tmp_path: Path) -> None:
     """Local axes without being asked for, and a picture that knows the layers by the recorded depth."""
-    recording = Recording(run(scene("walled", 1.0), tmp_path / "run", MPI.COMM_SELF))
+    recording = Recording(run(scene("walled", 1.0, output={"fields": True}), tmp_path / "run", MPI.COMM_SELF))
     fields = recording.fields(1.0)
     assert {*CONSTANT_FIELDS} <= set(fields)
     body = WholeBody(recording)
