@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, Literal
+from unittest.mock import patch
 
 import numpy as np
 import ufl
@@ -122,15 +123,9 @@ def transversely_isotropic(F: Any, lame_lambda: Any, lame_mu: Any) -> Any:
 @contextmanager
 def registered() -> Iterator[None]:
     """Within, scenes know the two shapes and the matrix energy "cardiac"."""
-    shapes: dict[str, type[Shape]] = {"bar": Bar, "membrane": Membrane}
-    SHAPES.update(shapes)
-    MATRICES["cardiac"] = Matrix(logarithmic_dilatation, transversely_isotropic)
-    try:
+    cardiac = Matrix(logarithmic_dilatation, transversely_isotropic)
+    with patch.dict(SHAPES, bar=Bar, membrane=Membrane), patch.dict(MATRICES, cardiac=cardiac):
         yield
-    finally:
-        for name in shapes:
-            del SHAPES[name]
-        del MATRICES["cardiac"]
 
 
 def elastic_scene(

@@ -6,6 +6,7 @@ import runpy
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -23,7 +24,6 @@ ELASTIC = {"remodeling.law": "none", "remodeling.coupling": "staggered", "materi
 @pytest.fixture
 def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Scene]]:
     """The scene of a script, which has been run; what it registers is taken back."""
-    shapes = dict(SHAPES)
     monkeypatch.setattr(Tube, "loads", dict(Tube.loads))
     monkeypatch.setattr(Tube, "columns", Tube.columns)
 
@@ -31,9 +31,8 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Scene]]:
         runpy.run_path(str(FOLDER / f"{name}.py"))
         return read_scene(FOLDER / f"{name}.toml")
 
-    yield read
-    SHAPES.clear()
-    SHAPES.update(shapes)
+    with patch.dict(SHAPES):
+        yield read
 
 
 def test_each_is_short() -> None:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from remodel_fenicsx import cli
 from remodel_fenicsx.body.lumen import oriented, Surface
 from remodel_fenicsx.scene import scene_from_dict
+from tests.conftest import Refused
+from tests.tables import rows
 
 RADIUS, LENGTH, AROUND, ALONG = 1.0, 4.0, 48, 24
 Triangles = NDArray[np.int64]
@@ -130,29 +132,16 @@ def of_three() -> tuple[Any, Any]:
     return np.vstack([points, [[2.0, 0, 2.0]]]), np.vstack([triangles, [[*triangles[7, :2], len(points)]]])
 
 
-@pytest.mark.parametrize(
-    ("made", "words", "said"),
-    [
-        (closed, ["--thickness", 0.3], "the surface is closed; cut its ends open"),
-        (two, ["--thickness", 0.3], "has 2 parts"),
-        (of_three, ["--thickness", 0.3], r"three triangles or more meet in one edge, at \("),
-        (lambda: tube(3.5), ["--thickness", 1.0], r"--thickness: too thick: the wall .* at \("),
-        (tube, ["--thickness", 0], "--thickness 0: allowed is a number above 0"),
-        (tube, [], "--thickness: missing"),
-        (tube, ["--thickness", 1, "--layers", "media=0.3"], "the layers come to 0.3"),
-        (tube, ["--layers", "media"], "--layers media: allowed is NAME=THICKNESS"),
-        (tube, ["--thickness", 0.3, "--size", -1], "--size: allowed"),
-        (tube, ["--thickness", 0.3, "--through", 0], "--through: allowed"),
-    ],
-)
+SURFACES = {"tube": tube, "bend": lambda: tube(3.5), "closed": closed, "two": two, "of three": of_three}
+
+
+@pytest.mark.parametrize(("made", "words", "said"), rows(__file__, "bad_lumens.txt"))
 def test_what_is_no_lumen_is_refused_in_one_line(
-    made: Any, words: list[Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: str, words: str, said: str, tmp_path: Path, refused: Refused
 ) -> None:
-    file = written(tmp_path / "lumen.stl", *made())
+    file = written(tmp_path / "lumen.stl", *SURFACES[made]())
     size = [] if "--size" in words else ["--size", 0.5]
-    assert wall(file, *words, *size, "-o", tmp_path / "vessel.msh") == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and re.search(said, lines[0]), lines
+    assert re.search(said, refused("wall", file, *words.split(), *size, "-o", tmp_path / "vessel.msh"))
     assert list(tmp_path.iterdir()) == [file]
 
 
@@ -164,13 +153,10 @@ def test_what_is_no_lumen_is_refused_in_one_line(
         ("lumen.step", b""), ("lumen.vtp", b"<VTKFile type='PolyData'><xi:include href='/etc/passwd'/></VTKFile>"),
     ],
 )  # fmt: skip
-def test_files_that_are_none_are_refused_in_one_line(
-    name: str, text: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_that_are_none_are_refused_in_one_line(name: str, text: bytes, tmp_path: Path, refused: Refused) -> None:
     (tmp_path / name).write_bytes(text)
-    assert wall(tmp_path / name, "--thickness", 1, "--size", 1, "-o", tmp_path / "vessel.msh") == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and name in lines[0]
+    words = ("--thickness", 1, "--size", 1, "-o", tmp_path / "vessel.msh")
+    assert name in refused("wall", tmp_path / name, *words)
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 

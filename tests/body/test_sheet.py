@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError, Simulation, read_scene
+from remodel_fenicsx import Scene, SceneError, read_scene
 from remodel_fenicsx.studies.fit import model_of, read_measurements
 from tests.reference.point import cauchy, repulsion_of_logarithm
 from tests.reference.radial import RadialMaterial
+from tests.runs import last_row
+from tests.values import ramped
 
 DEMOS = Path(__file__).parents[2] / "demos"
-RAMP = [[0.0, 0.0], [4.0, 1.0]]
 STIFF = {"lame_lambda": 31030.0, "lame_mu": 3.103, "repulsion": "log"}
 
 
@@ -24,19 +24,11 @@ def sheet(loads: dict[str, float], **tables: Any) -> Scene:
     rest: dict[str, Any] = {"cells": {"initial": "isotropic"}, "remodeling": {"law": "none"}} | tables
     return Scene(
         geometry={"shape": "sheet", "length_x": 2.0, "length_y": 4.0, "thickness": 0.5},
-        loads={name: {"value": value, "ramp": RAMP} for name, value in loads.items()},
+        loads=ramped(4.0, **loads),
         time={"end": 4.0, "step": 1.0},
         solver={"relative_tolerance": 1e-12},
         **rest,
     )
-
-
-def last_row(scene: Scene) -> dict[str, float]:
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
-        return [step.row for step in simulation.steps()][-1]
-    finally:
-        simulation.close()
 
 
 @pytest.mark.parametrize("material", [{"repulsion": "log"}, STIFF], ids=["soft", "nearly incompressible"])
@@ -128,13 +120,9 @@ def test_protocols_are_read_as_they_are_published(tmp_path: Path) -> None:
     _, (table,) = read_measurements(tmp_path / "data.toml", scene)
     assert table.loads == ("elongation_x", "elongation_y")
     found = model_of(scene, table, {})
-    (tmp_path / "driven.csv").write_text(
-        "force_x,force_y,elongation_x,elongation_y\n"
-        + "".join(
-            f"{2 * x!r},{y!r},0,0\n"
-            for x, y in zip(found["nominal_stress_x"].tolist(), found["nominal_stress_y"].tolist())
-        )
-    )
+    stresses = zip(found["nominal_stress_x"].tolist(), found["nominal_stress_y"].tolist())
+    rows = "".join(f"{2 * x!r},{y!r},0,0\n" for x, y in stresses)
+    (tmp_path / "driven.csv").write_text("force_x,force_y,elongation_x,elongation_y\n" + rows)
     sd = 'drive = ["force_x", "force_y"]\nsd = { elongation_x = 1.0, elongation_y = 1.0 }'
     (tmp_path / "data.toml").write_text(text.format("driven", sd))
     _, (table,) = read_measurements(tmp_path / "data.toml", scene)

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene
+from remodel_fenicsx import Scene, SceneError, preset_scene
 from remodel_fenicsx.scene import scene_from_dict
 from tests.mesh_files import LENGTH, RADII, write_tube
 from tests.reference.radial import AXIAL, CIRCUMFERENTIAL, RADIAL, solve_radial
+from tests.runs import last_row
+from tests.values import ramped
 
 ELEMENTS, END = 8, 30.0
 PLACES = {"inner": slice(None, 3), "outer": slice(-3, None)}  # three Gauss points of the first and the last element
@@ -25,14 +26,6 @@ def artery(**changes: Any) -> Scene:
     values = {"cells.initial": "isotropic", "mesh.degree": 2, "model.kinematics": "radial", "time.end": END}
     columns = {"output.columns": [*NAMES, "mean_hoop_stress", "inner_radius", "outer_radius"]}
     return preset_scene("kuhl-holzapfel-2007", "tube").with_values(values | columns | changes)
-
-
-def last_row(scene: Scene) -> dict[str, float]:
-    simulation = Simulation(scene, MPI.COMM_SELF)
-    try:
-        return [step.row for step in simulation.steps()][-1]
-    finally:
-        simulation.close()
 
 
 def test_they_are_those_of_the_reference_while_it_remodels() -> None:
@@ -64,7 +57,7 @@ def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:
     """Two layers of a tube; a mesh file of one tissue beside the same tube on one radius."""
     tables: dict[str, Any] = {
         "cells": {"initial": "isotropic"}, "remodeling": {"law": "none"}, "time": {"end": 2.0, "step": 1.0},
-        "loads": {"pressure": {"value": 1.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+        "loads": ramped(2.0, pressure=1.0),
     }  # fmt: skip
     names = ["hoop_stress_inner", "hoop_stress_middle", "radial_stress_inner"]
     round_tube = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}

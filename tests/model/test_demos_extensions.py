@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -24,14 +25,11 @@ FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
 @pytest.fixture(autouse=True)
 def parts() -> Iterator[None]:
     """Those of the files, as the command line loads them."""
-    before = [(registry, dict(registry)) for registry in (CHAINS, DRIVERS, LAWS)]
-    for name in ("freely_jointed_chain", "mandel_driver", "kappa_by_temperature"):
-        assert len((FOLDER / f"{name}.py").read_text().splitlines()) < 60
-        runpy.run_path(str(FOLDER / f"{name}.py"))
-    yield
-    for registry, parts in before:
-        registry.clear()
-        registry.update(parts)
+    with patch.dict(CHAINS), patch.dict(DRIVERS), patch.dict(LAWS):
+        for name in ("freely_jointed_chain", "mandel_driver", "kappa_by_temperature"):
+            assert len((FOLDER / f"{name}.py").read_text().splitlines()) < 60
+            runpy.run_path(str(FOLDER / f"{name}.py"))
+        yield
 
 
 def scene(preset: str = "kuhl-holzapfel-2007", **changes: Any) -> Scene:

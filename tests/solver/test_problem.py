@@ -187,7 +187,7 @@ def test_a_prescribed_elongation_is_reached_as_fast_as_newton_can() -> None:
     solution = made.problem(parts.TIGHT.model_copy(update={"method": "direct"})).solve()
     u = made.displacement.x.array.reshape(-1, 3)
     np.testing.assert_allclose(u[:, 2], 0.2 * made.nodes[:, 2], atol=1e-10)
-    assert solution.newton_iterations <= 6  # the last one at the rounding of the forces
+    assert solution.newton_iterations <= 5  # the last one at the rounding of the forces; six without lifting
 
 
 # ---------------------------------------------------------------- guards
