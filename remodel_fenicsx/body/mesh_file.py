@@ -12,8 +12,10 @@ import hashlib
 import importlib
 import itertools
 import json
+import logging
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +26,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.children import DAMAGED, UnreadableFile, check_xml, read_guarded
 
+log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -35,7 +38,8 @@ VOLUMES = {
     "hexahedron27": ("hexahedron", 2),
 }
 FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of facets
-ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27"
+WEDGE = "wedge"
+ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27, wedges of 6"
 # Gmsh's order of nodes, as places in VTK's, which meshio has
 # https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering, https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron)
 ORDERS = {
@@ -339,19 +343,59 @@ def _add_groups(mesh: Any, groups_of: dict[tuple[int, int], list[int]]) -> None:
 # ---------------------------------------------------------------- what all lead to
 
 
+# a wedge as seen from each of its corners, and its tetrahedra from its smallest one; J. Dompierre et al., How to
+# subdivide pyramids, prisms and hexahedra into tetrahedra (1999): diagonals begin at the smallest corner of a face
+_SEEN = np.array(
+    [
+        (0, 1, 2, 3, 4, 5),
+        (1, 2, 0, 4, 5, 3),
+        (2, 0, 1, 5, 3, 4),
+        (3, 5, 4, 0, 2, 1),
+        (4, 3, 5, 1, 0, 2),
+        (5, 4, 3, 2, 1, 0),
+    ]
+)
+_SPLIT = np.array([[(0, 1, 2, 4), (0, 4, 2, 5), (0, 4, 5, 3)], [(0, 1, 2, 5), (0, 1, 5, 4), (0, 4, 5, 3)]])
+
+
+def _split(points: Array, block: Block) -> Block:
+    """Wedges of boundary layers as three tetrahedra each, quadrilaterals beside them as two triangles."""
+    nodes, rows = block.nodes, np.arange(len(block.nodes))
+    if block.kind == WEDGE:
+        seen = nodes[rows[:, None], _SEEN[nodes.argmin(axis=1)]]
+        other = np.minimum(seen[:, 1], seen[:, 5]) < np.minimum(seen[:, 2], seen[:, 4])
+        found = seen[rows[:, None, None], _SPLIT[other.astype(int)]]
+        sides = points[found[:, :, 1:]] - points[found[:, :, :1]]
+        turned = np.linalg.det(sides).sum(axis=1) < 0  # all of a wedge or none: one that is twisted stays so
+        found[turned] = found[turned][:, :, [0, 2, 1, 3]]
+        return Block("tetra", np.repeat(block.groups, 3), found.reshape(-1, 4))
+    if block.kind == "quad":
+        turned_by_one = np.where((nodes.argmin(axis=1) % 2 == 1)[:, None], np.roll(nodes, -1, axis=1), nodes)
+        return Block("triangle", np.repeat(block.groups, 2), turned_by_one[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    return block
+
+
+def _numbered(blocks: list[Block]) -> Iterator[tuple[Integers, Block]]:
+    """Each with the numbers of its elements, from 1 in the order of the file."""
+    starts = np.cumsum([1, *(len(block.nodes) for block in blocks)])
+    for start, block in zip(starts, blocks, strict=False):
+        yield np.arange(start, start + len(block.nodes)), block
+
+
 def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int]], data: bytes) -> MeshFile:
     """What a file of any kind holds."""
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise MeshFileError(f"a node is at {tuple(points[bad][0].tolist())}: its place must be finite")
-    starts = np.cumsum([0, *(len(block.nodes) for block in blocks)])
-    numbers = [np.arange(start, start + len(block.nodes)) for start, block in zip(starts + 1, blocks, strict=False)]
-    for number, block in zip(numbers, blocks, strict=True):
-        if block.kind not in (*VOLUMES, *FACET_CORNERS) and not block.kind.startswith(("vertex", "line")):
+    for number, block in _numbered(blocks):
+        if block.kind not in (*VOLUMES, *FACET_CORNERS, WEDGE) and not block.kind.startswith(("vertex", "line")):
             raise MeshFileError(f"elements of type {block.kind!r}; allowed are {ALLOWED_ELEMENTS}")
         if (lost := ((block.nodes < 0) | (block.nodes >= len(points))).any(axis=1)).any():
             raise MeshFileError(f"element {number[lost][0]} has a node that is not there")
-    solid = [(number, block) for number, block in zip(numbers, blocks, strict=True) if block.kind in VOLUMES]
+    if any(block.kind == WEDGE and len(block.nodes) for block in blocks):
+        log.info("wedges are split into three tetrahedra each, quadrilaterals of faces into two triangles")
+        blocks = [_split(points, block) for block in blocks]
+    solid = [(number, block) for number, block in _numbered(blocks) if block.kind in VOLUMES]
     kinds = sorted({VOLUMES[block.kind] for _, block in solid if len(block.nodes)})
     if not kinds:
         raise MeshFileError("no elements of a volume; in Gmsh: a physical volume, and Mesh 3D")

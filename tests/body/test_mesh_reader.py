@@ -14,10 +14,12 @@ import pytest
 
 from remodel_fenicsx import SceneError
 from remodel_fenicsx.body import mesh_file
+from remodel_fenicsx.body.lumen import rims
 from remodel_fenicsx.body.mesh_faces import boundary_of, jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFileError, read_mesh
 from remodel_fenicsx.body.mesh_body import refined
 from remodel_fenicsx.scene import scene_from_dict
+from tests.body.test_lumen import tube
 from tests.mesh_files import write_tube
 from tests.runs import last_row
 
@@ -96,6 +98,33 @@ def test_what_vtk_writes_is_read(tmp_path: Path, ending: str, mode: str, packer:
     np.testing.assert_array_equal(one.facet_groups, other.facet_groups)
 
 
+def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A wall of prisms, as boundary layers are; its volume, and no facet but those of its faces."""
+    points, triangles = tube()
+    size, levels = len(points), [1.0, 1.2, 1.5]
+    rng = np.random.default_rng(1)
+    order = rng.permutation(3 * size)  # any corner may be the smallest
+    whole = np.empty((3 * size, 3))
+    whole[order] = np.concatenate([points * [level, level, 1.0] for level in levels])
+    wedges = np.concatenate([np.hstack([triangles + k * size, triangles + (k + 1) * size]) for k in range(2)])
+    quads = [
+        np.concatenate([np.hstack([rim + k * size, rim[:, ::-1] + (k + 1) * size]) for k in range(2)])
+        for rim in rims(triangles)
+    ]
+    cells = [("wedge", wedges), ("triangle", triangles), ("triangle", triangles + 2 * size)]
+    cells += [("quad", quad) for quad in quads]
+    tags = [np.full(len(rows), number) for number, (_, rows) in enumerate(cells)]
+    mesh = meshio.Mesh(whole, [(kind, order[rows]) for kind, rows in cells], cell_data={"medit:ref": tags})
+    mesh.write(tmp_path / "wall.vtu")
+    faces = {"inner": 1, "outer": 2, "inlet": 3, "outlet": 4}
+    caplog.set_level("INFO")
+    file, boundary, _ = scene_of(tmp_path / "wall.vtu", faces=faces).geometry.checked()
+    assert file.kind == "tetrahedron" and len(file.cells) == 3 * len(wedges) and "wedges are split" in caplog.text
+    sides = file.points[file.cells[:, 1:]] - file.points[file.cells[:, :1]]
+    volumes = np.linalg.det(sides) / 6
+    assert volumes.min() > 0 and volumes.sum() == pytest.approx(np.pi * (1.5**2 - 1.0) * 4.0, rel=0.01)
+
+
 def scene_of(file: Path, **geometry: Any) -> Any:
     return scene_from_dict(
         {
@@ -170,7 +199,7 @@ def test_numbers_in_a_column_of_their_own_are_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cells", "tags", "words"),
     [
-        ([("wedge", [[0, 1, 2, 4, 5, 6]])], [[1]], "elements of type 'wedge'"),
+        ([("pyramid", [[0, 1, 2, 3, 4]])], [[1]], "elements of type 'pyramid'"),
         ([("hexahedron", [range(8)])], [[0.5]], "no whole number for each element"),
         ([("hexahedron", [range(8)])], [[np.nan]], "no whole number for each element"),
         ([("quad", [range(4)])], [[1]], "no elements of a volume"),
