@@ -38,6 +38,9 @@ from remodel_fenicsx.watch.stability import EquilibriumStability
 log = logging.getLogger(__name__)
 
 TIME_ERROR = "time_error"  # the column
+BEYOND = 0.5
+"""Widths of the innermost layer: points that lie so far inside of a thin wall have rounding for stretches, for
+polynomials of degree 24 grow by T_24(1 + 2 BEYOND) = 3e13 up to there."""
 ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
 """Elements of a body, and bytes of a file of fibres, that are looked at in a few seconds without a run."""
 
@@ -323,8 +326,10 @@ def natural_gradient(scene: Scene, quadrature: Quadrature, domain: Domain, local
         except ArithmeticError as error:
             asked = f"natural.opening_angle = {natural.opening_angle:g}"
             raise SceneError(f"{asked}: must be smaller, or natural.layers nearer to 1: {error}") from error
-        stretches = found.stretches(np.linalg.norm(local_axes.coordinates[..., :2], axis=-1))
-        if quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:  # points outside of a thin wall
+        radii, (inner, next_one, *_) = np.linalg.norm(local_axes.coordinates[..., :2], axis=-1), found.panels.edges
+        stretches = found.stretches(radii)
+        beyond = quadrature.maximum(((inner - radii) / (next_one - inner)).reshape(quadrature.shape))
+        if beyond > BEYOND or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:
             rule = "must be smaller, or mesh.refinement larger: the sides of elements are chords that leave the wall"
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
