@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.system.children import UnreadableFile, check_xml, read_guarded
 from remodel_fenicsx.system.files import ForeignFileError, write_new
 
@@ -47,10 +48,11 @@ class Surface(NamedTuple):
 
 def read_surface(path: Path) -> Surface:
     """The surface of a file; its ending is one of `SURFACE_ENDINGS`."""
-    if path.suffix.lower() not in SURFACE_ENDINGS:
+    ending = path.suffix.lower()
+    if ending not in SURFACE_ENDINGS:
         raise LumenError(f"{path}: allowed is a file that ends with {', '.join(SURFACE_ENDINGS)}")
     try:
-        found, _ = read_guarded(path, f"{__name__}:{'polygons' if path.suffix.lower() == '.vtp' else path.suffix[1:]}")
+        found, _ = read_guarded(path, f"{__name__}:{ending[1:]}")
     except (OSError, UnreadableFile, ForeignFileError) as error:
         raise LumenError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
     points, triangles = found.pop("points"), found.pop("triangles")
@@ -89,7 +91,7 @@ def obj(file: str) -> dict[str, Any]:
     return _as_arrays(file, "obj")
 
 
-def polygons(file: str) -> dict[str, Any]:
+def vtp(file: str) -> dict[str, Any]:
     """In the child process: VTK's own file, by VTK."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkTriangleFilter
@@ -179,6 +181,11 @@ def _signed_volume(points: Array, triangles: Integers) -> float:
     return volume / 6
 
 
+def _area(surface: Surface) -> float:
+    a, b, c = (surface.points[surface.triangles[:, k]] for k in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
 def remeshed(surface: Surface, size: float) -> Surface:
     """The surface with triangles of a size, by Gmsh; arrays as at the nearest corner before."""
     import meshio
@@ -187,12 +194,15 @@ def remeshed(surface: Surface, size: float) -> Surface:
     with tempfile.TemporaryDirectory() as folder, gmsh_model("wall") as gmsh:
         file = Path(folder) / "lumen.stl"
         meshio.Mesh(surface.points, [("triangle", surface.triangles)]).write(file)
-        gmsh.merge(str(file))
-        gmsh.model.mesh.classifySurfaces(np.radians(SHARP), True, True, np.pi)
-        gmsh.model.mesh.createGeometry()
-        for option in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
-            gmsh.option.setNumber(option, size)
-        gmsh.model.mesh.generate(2)
+        try:
+            gmsh.merge(str(file))
+            gmsh.model.mesh.classifySurfaces(np.radians(SHARP), True, True, np.pi)
+            gmsh.model.mesh.createGeometry()
+            for option in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
+                gmsh.option.setNumber(option, size)
+            gmsh.model.mesh.generate(2)
+        except Exception as error:  # Gmsh has no other
+            raise LumenError(f"--size {size:g}: Gmsh could not divide the surface so: {error}") from error
         numbers, places, _ = gmsh.model.mesh.getNodes()
         corners = gmsh.model.mesh.getElementsByType(2)[1]
     used, triangles = np.unique(corners, return_inverse=True)
@@ -343,15 +353,19 @@ def write_wall(
         raise LumenError(f"-o {path}: allowed is a file that ends with .msh")
     if path.exists():
         raise LumenError(f"-o {path}: is there already; nothing is overwritten")
-    if not 0.0 < size < np.inf or not 1 <= through <= MOST_THROUGH:
-        key, rule = (
-            ("--through", f"a whole number up to {MOST_THROUGH}") if 0.0 < size < np.inf else ("--size", "a number")
-        )
-        raise LumenError(f"{key}: allowed is {rule} above 0")
-    shares = _thicknesses(layers)
-    found = remeshed(read_surface(surface), size)
+    if not 0.0 < size < np.inf:
+        raise LumenError("--size: allowed is a number above 0")
+    if not 1 <= through <= MOST_THROUGH:
+        raise LumenError(f"--through: allowed is a whole number from 1 to {MOST_THROUGH}")
+    shares, read = _thicknesses(layers), read_surface(surface)
+    number = 3 * max(through, len(shares)) * _area(read) / (np.sqrt(0.1875) * size**2)  # of equilateral triangles
+    if number > LARGEST_MESH:
+        raise LumenError(f"--size {size:g}: makes about {number:.2g} tetrahedra; at most {LARGEST_MESH:g} are made")
+    found = remeshed(read, size)
     depth = _thickness(thickness, shares, found)
     wall = grown(found, depth, shares or {"wall": 1.0}, through)
+    if taken := shares.keys() & wall.faces:
+        raise LumenError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
     names = list(shares) or ["wall"]
     groups = {name: (number, 2) for number, name in enumerate(wall.faces, 1)}
     groups |= {name: (len(wall.faces) + number, 3) for number, name in enumerate(names, 1)}

@@ -66,14 +66,15 @@ def wall(*words: Any) -> int:
     return cli.main(["wall", *map(str, words)])
 
 
-@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "vtp"])
+@pytest.mark.parametrize("ending", ["stl", "STL", "ply", "obj", "vtp"])
 @pytest.mark.parametrize("inwards", [False, True])
 def test_layers_have_their_volumes_whatever_the_file(ending: str, inwards: bool, tmp_path: Path) -> None:
     """Of a straight tube, whichever way its triangles look; one in three looks the other way."""
     points, triangles = tube()
     turned = triangles[:, ::-1] if inwards else triangles.copy()
     turned[::3] = turned[::3, ::-1]
-    file, path = written(tmp_path / f"lumen.{ending}", points, turned), tmp_path / "vessel.msh"
+    file, path = tmp_path / f"lumen.{ending}", tmp_path / "vessel.msh"
+    written(file.with_suffix(file.suffix.lower()), points, turned).rename(file)
     assert wall(file, "--layers", "media=0.3", "adventitia=0.2", "--size", 0.3, "-o", path) == 0
     found = volumes(path)
     assert found["media"] == pytest.approx(ring(1.0, 1.3), rel=0.03)
