@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
+from remodel_fenicsx.body.mesh_file import of_vtk, split_quads, split_wedges, vtk_arrays
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.schema.settings import LARGEST_MESH
@@ -93,24 +94,19 @@ def obj(file: str) -> dict[str, Any]:
 
 def vtp(file: str) -> dict[str, Any]:
     """In the child process: VTK's own file, by VTK."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
     check_xml(Path(file).read_bytes())
-    reader, triangulated = vtkXMLPolyDataReader(), vtkTriangleFilter()
+    reader, numbers = of_vtk("vtkIOXML", "vtkXMLPolyDataReader")(), of_vtk("util.numpy_support", "vtk_to_numpy")
+    triangulated = of_vtk("vtkFiltersCore", "vtkTriangleFilter")()
     reader.SetFileName(file)
     triangulated.SetInputConnection(reader.GetOutputPort())
     triangulated.Update()
     data = triangulated.GetOutput()
     if not data.GetNumberOfPolys():
         raise UnreadableFile("has no polygons")
-    point_data = data.GetPointData()
-    arrays = {point_data.GetArrayName(k): point_data.GetArray(k) for k in range(point_data.GetNumberOfArrays())}
     return {
-        "points": vtk_to_numpy(data.GetPoints().GetData()).astype(float),
-        "triangles": vtk_to_numpy(data.GetPolys().GetData()).reshape(-1, 4)[:, 1:],
-        **{name: vtk_to_numpy(one) for name, one in arrays.items() if one and one.GetNumberOfComponents() == 1},
+        "points": numbers(data.GetPoints().GetData()).astype(float),
+        "triangles": numbers(data.GetPolys().GetData()).reshape(-1, 4)[:, 1:],
+        **{name: values for name, values in vtk_arrays(data.GetPointData()).items() if values.ndim == 1},
     }
 
 
@@ -231,13 +227,13 @@ def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], throu
     shares, ends = np.array(list(layers.values())), np.cumsum([0.0, *layers.values()])
     levels = np.concatenate([[0.0], *(np.linspace(ends[k], ends[k + 1], n + 1)[1:] for k, n in enumerate(counts))])
     levels /= shares.sum()
-    corners = np.sort(surface.triangles, axis=1)  # of neighbours all diagonals go from the smaller to the larger number
-    size, openings = len(surface.points), rims(surface.triangles)
-    tetrahedra = np.concatenate([_prisms(corners, size, level) for level in range(len(levels) - 1)])
+    size, openings, layer = len(surface.points), rims(surface.triangles), np.arange(len(levels) - 1)[:, None, None]
+    wedges = np.concatenate([surface.triangles, surface.triangles + size], axis=1) + size * layer
+    tetrahedra = split_wedges(wedges.reshape(-1, 6)).reshape(-1, 4)
     normals = _normals(surface, openings)
     for _ in range(SMOOTHINGS):
         points = (surface.points + levels[:, None, None] * thickness[:, None] * normals).reshape(-1, 3)
-        folded = _volumes(points, tetrahedra) * np.tile(_parity(surface.triangles), 3 * (len(levels) - 1)) <= 0
+        folded = np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) <= 0
         if not folded.any():
             break
         normals = _smoothed(normals, surface, openings)
@@ -245,9 +241,10 @@ def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], throu
         place = points[tetrahedra[folded][0]].mean(axis=0)
         raise LumenError(f"--thickness: too thick: the wall folds over at {_at(place)}, where the lumen is hollow")
     _check_room(surface.points, points[-size:], thickness)
-    of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(corners))
+    of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(surface.triangles))
     faces = {"inner": surface.triangles, "outer": surface.triangles + size * (len(levels) - 1)}
-    sides = [_side(np.sort(rim, axis=1), size, len(levels) - 1) for rim in openings]
+    quads = [np.concatenate([rim, rim[:, ::-1] + size], axis=1) + size * layer for rim in openings]
+    sides = [split_quads(each.reshape(-1, 4)) for each in quads]
     sides.sort(key=lambda side: float(np.linalg.norm(points[side].mean(axis=(0, 1)))))
     faces |= {"inlet": sides[0]} | {f"outlet_{number}": side for number, side in enumerate(sides[1:], 1)}
     return _of_degree_2(points, tetrahedra, of_layer, faces)
@@ -281,32 +278,6 @@ def _smoothed(normals: Array, surface: Surface, openings: Sequence[Integers]) ->
     return _in_planes(sums / counts[:, None], surface.points, openings)
 
 
-def _prisms(corners: Integers, size: int, level: int) -> Integers:
-    """Three tetrahedra for each triangle between a level and the next one."""
-    (a, b, c), (A, B, C) = corners.T + level * size, corners.T + (level + 1) * size
-    return np.concatenate([np.stack(nodes, axis=1) for nodes in ((a, b, c, C), (a, b, C, B), (a, A, B, C))])
-
-
-def _parity(triangles: Integers) -> Array:
-    """1 where sorted corners go around as the triangle does, -1 where they go back."""
-    order = np.argsort(triangles, axis=1)
-    return np.where((order[:, 1] - order[:, 0]) % 3 == 1, 1.0, -1.0)
-
-
-def _volumes(points: Array, tetrahedra: Integers) -> Array:
-    a, b, c, d = (points[tetrahedra[:, k]] for k in range(4))
-    return np.asarray(np.einsum("ni,ni->n", np.cross(b - a, c - a), d - a) / 6)
-
-
-def _side(rim: Integers, size: int, levels: int) -> Integers:
-    """Triangles between the edges of an opening at all levels."""
-    found = []
-    for level in range(levels):
-        (a, b), (A, B) = rim.T + level * size, rim.T + (level + 1) * size
-        found += [np.stack([a, b, B], axis=1), np.stack([a, B, A], axis=1)]
-    return np.concatenate(found)
-
-
 def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
     """Refuse a wall that reaches into another part of itself, or of the lumen."""
     from scipy.spatial import cKDTree
@@ -319,8 +290,6 @@ def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
 
 def _of_degree_2(points: Array, tetrahedra: Integers, layers: Integers, faces: Mapping[str, Integers]) -> GrownWall:
     """With nodes in the middle of straight edges: curved ones would twist thin elements."""
-    turned = _volumes(points, tetrahedra) < 0
-    tetrahedra = np.where(turned[:, None], tetrahedra[:, [0, 2, 1, 3]], tetrahedra)
     edges = np.sort(np.concatenate([tetrahedra[:, edge] for edge in EDGES]), axis=1)
     distinct, number = np.unique(edges, axis=0, return_inverse=True)
     middles = number.reshape(len(EDGES), -1).T + len(points)

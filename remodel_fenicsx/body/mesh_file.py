@@ -1,4 +1,4 @@
-"""Meshes of one's own, as meshio reads them in a child process with limits: nothing in a file is ever run.
+"""Meshes of one's own, as VTK and meshio read them in a child process with limits: nothing in a file is ever run.
 
 Gmsh itself runs a file that is a script under whatever name, so it never sees one. What meshio passes over in silence
 in Gmsh's own format, MSH 2.2 and 4.1 as text, is refused here:
@@ -96,7 +96,7 @@ def distinct(values: Integers) -> list[int]:
     return list(dict.fromkeys(listed))
 
 
-# ---------------------------------------------------------------- files, by meshio
+# ---------------------------------------------------------------- files, by VTK and meshio
 
 ENDINGS = (".msh", ".vtu", ".vtk", ".xdmf")
 SAVED_OTHERWISE = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
@@ -158,11 +158,7 @@ def _of_vtk(reader: str, module: str, file: str) -> dict[str, Any]:
     import meshio
     from meshio._vtk_common import vtk_to_meshio_type
 
-    try:
-        made = getattr(importlib.import_module(f"vtkmodules.{module}"), reader)()
-        numbers = importlib.import_module("vtkmodules.util.numpy_support").vtk_to_numpy
-    except ImportError:
-        raise UnreadableFile("VTK, which reads such files, is not installed: pip install vtk") from None
+    made, numbers = of_vtk(module, reader)(), of_vtk("util.numpy_support", "vtk_to_numpy")
     made.SetFileName(file)
     for read_all in ("ReadAllScalarsOn", "ReadAllVectorsOn", "ReadAllTensorsOn", "ReadAllFieldsOn"):
         getattr(made, read_all, lambda: None)()
@@ -179,13 +175,24 @@ def _of_vtk(reader: str, module: str, file: str) -> dict[str, Any]:
         rows = nodes[starts[piece.start] : starts[piece.stop]].reshape(piece.stop - piece.start, -1)
         cells.append((vtk_to_meshio_type[int(types[piece.start])], rows))
 
-    def arrays(data: Any) -> dict[str, Any]:
-        found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
-        return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
-
-    of_cells = {name: [values[piece] for piece in pieces] for name, values in arrays(grid.GetCellData()).items()}
+    of_cells = {name: [values[piece] for piece in pieces] for name, values in vtk_arrays(grid.GetCellData()).items()}
     points = numbers(grid.GetPoints().GetData())
-    return _as_arrays(meshio.Mesh(points, cells, arrays(grid.GetPointData()), of_cells))
+    return _as_arrays(meshio.Mesh(points, cells, vtk_arrays(grid.GetPointData()), of_cells))
+
+
+def of_vtk(module: str, name: str) -> Any:
+    """A class or a function of VTK's."""
+    try:
+        return getattr(importlib.import_module(f"vtkmodules.{module}"), name)
+    except ImportError:
+        raise UnreadableFile("VTK, which reads such files, is not installed: pip install vtk") from None
+
+
+def vtk_arrays(data: Any) -> dict[str, Any]:
+    """Arrays of points or cells by name."""
+    numbers = of_vtk("util.numpy_support", "vtk_to_numpy")
+    found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
+    return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
 
 
 def _as_arrays(mesh: Any, group_names: list[tuple[int, int, str]] | None = None) -> dict[str, Any]:
@@ -358,20 +365,30 @@ _SEEN = np.array(
 _SPLIT = np.array([[(0, 1, 2, 4), (0, 4, 2, 5), (0, 4, 5, 3)], [(0, 1, 2, 5), (0, 1, 5, 4), (0, 4, 5, 3)]])
 
 
+def split_wedges(nodes: Integers) -> Integers:
+    """Three tetrahedra for each wedge (n, 6), which go round as it does, (n, 3, 4)."""
+    rows = np.arange(len(nodes))
+    seen = nodes[rows[:, None], _SEEN[nodes.argmin(axis=1)]]
+    other = np.minimum(seen[:, 1], seen[:, 5]) < np.minimum(seen[:, 2], seen[:, 4])
+    return np.asarray(seen[rows[:, None, None], _SPLIT[other.astype(int)]])
+
+
+def split_quads(nodes: Integers) -> Integers:
+    """Two triangles for each quadrilateral (n, 4) that fit wedges beside it, (2 n, 3)."""
+    turned = np.where((nodes.argmin(axis=1) % 2 == 1)[:, None], np.roll(nodes, -1, axis=1), nodes)
+    return turned[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
 def _split(points: Array, block: Block) -> Block:
-    """Wedges of boundary layers as three tetrahedra each, quadrilaterals beside them as two triangles."""
-    nodes, rows = block.nodes, np.arange(len(block.nodes))
+    """Wedges of boundary layers, and quadrilaterals beside them."""
     if block.kind == WEDGE:
-        seen = nodes[rows[:, None], _SEEN[nodes.argmin(axis=1)]]
-        other = np.minimum(seen[:, 1], seen[:, 5]) < np.minimum(seen[:, 2], seen[:, 4])
-        found = seen[rows[:, None, None], _SPLIT[other.astype(int)]]
+        found = split_wedges(block.nodes)
         sides = points[found[:, :, 1:]] - points[found[:, :, :1]]
         turned = np.linalg.det(sides).sum(axis=1) < 0  # all of a wedge or none: one that is twisted stays so
         found[turned] = found[turned][:, :, [0, 2, 1, 3]]
         return Block("tetra", np.repeat(block.groups, 3), found.reshape(-1, 4))
     if block.kind == "quad":
-        turned_by_one = np.where((nodes.argmin(axis=1) % 2 == 1)[:, None], np.roll(nodes, -1, axis=1), nodes)
-        return Block("triangle", np.repeat(block.groups, 2), turned_by_one[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+        return Block("triangle", np.repeat(block.groups, 2), split_quads(block.nodes))
     return block
 
 

@@ -735,8 +735,8 @@ class Shape(_Is):  # type: ignore[misc]
     def check_with(self, scene: Any, key: str) -> None:
         """Mesh and regions that the shape can have; where it is the loaded one, whether the unloaded can be found."""
         self.check_size(scene.mesh)
-        for name, other in ((name, scene.load_kinds[name].instead_of) for name in scene.loads):
-            if other in scene.loads:
+        for name in scene.loads:
+            if (other := scene.load_kinds[name].instead_of) in scene.loads:
                 raise fault(f"not allowed beside loads.{other}: either", f"loads.{name}", scene.loads[name].value)
         if isinstance(self, WithRegions):
             self.check_regions(scene.regions, scene.mesh)

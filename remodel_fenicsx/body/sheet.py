@@ -167,8 +167,7 @@ class Sheet(Shape):
     def check_with(self, scene: Any, key: str) -> None:
         """What all bodies ask, and that the strain is the same everywhere where shear is prescribed."""
         super().check_with(scene, key)
-        made = choice(scene)
-        if "shear" in scene.loads and not KINEMATICS[made.name].homogeneous:
+        if "shear" in scene.loads and not KINEMATICS[(made := choice(scene)).name].homogeneous:
             reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
             rule = f"needs the same strain everywhere, model.kinematics = 'point': {reasons}"
             raise fault(rule, "loads.shear.value", scene.loads["shear"].value)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
+from remodel_fenicsx.model.laws import COMPLEX_STEP
 
 
 # ---------------------------------------------------------------- functions of the radius on panels
@@ -82,7 +83,6 @@ LARGEST_TURN = 0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2
 ITERATIONS = 30
 CLOSED = 1e-9  # of the residual over lambda + 2 mu; the differences of the energy are good to about 1e-11
 STRETCH_DIFFERENCE = 1e-3  # of a logarithm in the five-point rules: their error is of fourth order
-COMPLEX_STEP = 1e-30
 UNSTRETCHED = (1.0, 1.0, 1.0)
 
 

@@ -151,7 +151,8 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 # ---------------------------------------------------------------- the body at the times that a page keeps
 
 CELL = ("cell_dimensions", *AXIS_FIELDS)
-NAMES = ("displacement", "fibre_angle_deformed", "chain_extension", *CELL, *TENSOR_FIELDS, *DIRECTION_FIELDS)
+NAMES = ("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_extension", *CELL)
+OF_WALLS = ("cauchy_stress", *DIRECTION_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -171,12 +172,13 @@ class ShownBody:
     @classmethod
     def of(cls, whole: WholeBody, times: Places) -> ShownBody:
         """What a run has recorded at these times."""
-        names = ("position", "angle", "extension", "edges", "wall_stress")
-        rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in names}
+        shown = ("position", "angle", "extension", "edges", "wall_stress")
+        names = (*NAMES, *(OF_WALLS if whole.recording.scene.geometry.is_a("Walled") else ()))
+        rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in shown}
         volume, is_deformed = _volumes(whole.points[whole.elements]), True
         with whole.recording.kept_open():
             for time in times:
-                displacement, found = whole.fields(float(time), NAMES)
+                displacement, found = whole.fields(float(time), names)
                 is_deformed = displacement is not None
                 moved = 0.0 if displacement is None else displacement
                 rows["position"].append((whole.points + moved).astype(np.float32))
@@ -223,10 +225,12 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
     """Mean stress around, along and across the wall in each layer, (layers, 3); nothing without a wall or fields."""
     shape = whole.recording.scene.geometry
     recorded = DIRECTION_FIELDS if shape.constant_fields else ()  # where axes are no function of the place
-    if not shape.is_a("Walled") or not set(fields) >= {*TENSOR_FIELDS, *recorded}:
+    if not set(fields) >= {*TENSOR_FIELDS, *recorded}:
         return {}
-    found = np.stack([fields[name] for name in recorded], axis=1) if recorded else None
-    axes = shape.axes_at(whole.points[whole.elements].mean(axis=1)) if found is None else found
+    if recorded:
+        axes = np.stack([fields[name] for name in recorded], axis=1)
+    else:
+        axes = shape.axes_at(whole.points[whole.elements].mean(axis=1))
     F, stress = (fields[name].reshape(-1, 3, 3) for name in TENSOR_FIELDS)
     moved = moved_axes(axes, F)
     components = volume[:, None] * np.einsum("nki,nij,nkj->nk", moved, stress, moved)

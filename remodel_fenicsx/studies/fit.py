@@ -355,9 +355,9 @@ class Kept:
         self._may_stay = all(re.fullmatch(CAN_BE_SET, key) for key in keys)
         self._known: dict[Any, tuple[Simulation, Snapshot]] = {}
 
-    def simulation(self, scene: Scene, table: Measured, is_passive: bool) -> Simulation:
+    def simulation(self, scene: Scene, table: Measured, has_own_cells: bool) -> Simulation:
         """At t = 0."""
-        use = id(table), is_passive, scene.model.kinematics, scene.mesh.formulation
+        use = id(table), has_own_cells, scene.model.kinematics, scene.mesh.formulation
         if use in self._known:
             if self._may_stay and begin_again(*self._known[use], scene):
                 return self._known[use][0]
