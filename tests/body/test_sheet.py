@@ -132,3 +132,6 @@ def test_protocols_are_read_as_they_are_published(tmp_path: Path) -> None:
     (tmp_path / "data.toml").write_text(text.format("driven", sd.replace("force_y", "shear")))
     with pytest.raises(SceneError, match=r"measured\[0\].drive = 'shear': allowed are"):
         read_measurements(tmp_path / "data.toml", scene)
+    (tmp_path / "data.toml").write_text(text.format("driven", "sd = { force_x = 1.0, force_y = 1.0 }"))
+    _, (table,) = read_measurements(tmp_path / "data.toml", scene)
+    assert table.loads == ("elongation_x", "elongation_y")  # of a force and a strain along one axis the strain

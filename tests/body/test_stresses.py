@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, SceneError, preset_scene
+from remodel_fenicsx.extend import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from tests.mesh_files import LENGTH, RADII, write_tube
 from tests.reference.radial import AXIAL, CIRCUMFERENTIAL, RADIAL, solve_radial
-from tests.runs import last_row
+from tests.parts import rotation
+from tests.runs import last_row, simulated
 from tests.values import ramped
 
 ELEMENTS, END = 8, 30.0
@@ -78,3 +80,18 @@ def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:
         assert other[name] == pytest.approx(one[name], rel=0.02), name
     with pytest.raises(SceneError, match="output.columns = .*hoop_stress_intima"):
         layered.with_values({"output.columns": ["hoop_stress_intima"]})
+
+
+def test_they_turn_with_the_wall() -> None:
+    """Of a body that is turned about z as a whole: the same stresses, in axes that have turned too."""
+    turned = rotation((0.0, 0.0, 1.0), 30.0)
+    changes = {"model.kinematics": "full", "mesh.degree": 1, "time.end": 2.0}
+    with simulated(artery(**changes)) as (simulation, _):
+        step = simulation.stepper.start()
+        before = Measurement(simulation.observer, step)
+        expected, placed = before.wall_stress, before.position @ turned.T
+        moved = simulation.unknown.x.array.reshape(-1, 3)
+        moved += placed - before.position
+        found = Measurement(simulation.observer, step).wall_stress
+        np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+        assert np.abs(expected[..., 0] - expected[..., 2]).max() > 0.1
