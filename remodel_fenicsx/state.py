@@ -405,29 +405,6 @@ class Numbers:
             self[key] = value
 
 
-class Occasions:
-    """When it is time to look again at what changes with the loads, and slowly without."""
-
-    STEPS = 10  # of unchanged loads, after which one looks all the same: cells remodel
-
-    def __init__(self, state: State, name: str):
-        self.state = state
-        self._loads = Numbers(state, f"{name}_loads", dict.fromkeys(state.loading.values, 0.0))
-        self._steps = Numbers(state, f"{name}_steps", {"since": self.STEPS})
-
-    def due(self) -> bool:
-        """Whether it is, asked once in each step."""
-        loads = self.state.loading.values
-        changed = [name for name, value in loads.items() if self._loads[name] != value]
-        for name in changed:
-            self._loads[name] = loads[name]
-        self._steps["since"] += 1
-        due = bool(changed) or self._steps["since"] >= self.STEPS
-        if due:
-            self._steps["since"] = 0
-        return due
-
-
 class Earlier:
     """The last values of a field, as functions of the state."""
 

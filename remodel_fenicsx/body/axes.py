@@ -58,8 +58,12 @@ def _radial(mesh: Any, degree: int, dx: Any, inner: Facets, outer: Facets, thick
     phi, found = harmonic(mesh, degree, dx, inner, outer), lagrange(mesh, degree, (3,))
     slope, least = ufl.grad(phi), dolfinx.fem.Constant(mesh, np.float64(LEAST_SLOPE / thickness))
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
-    trial, test = _arguments(found)
-    solve_positive(ufl.inner(trial, test) * dx, ufl.inner(direction, test) * dx, found)
+    part, along = lagrange(mesh, degree, ()), dolfinx.fem.Constant(mesh, np.zeros(3))
+    trial, test = _arguments(part)
+    for axis, unit in enumerate(np.eye(3)):  # one by one: their matrix is the same
+        along.value, part.x.array[:] = unit, 0.0
+        solve_positive(trial * test * dx, ufl.inner(direction, along) * test * dx, part)
+        found.x.array[axis::3] = part.x.array
     return found
 
 
@@ -77,7 +81,7 @@ def _axial(radial: Any, dx: Any, starts: Facets, ends: Facets, thickness: float)
     trial, test = _arguments(found)
     across = weight * ufl.inner(trial, normal) * ufl.inner(test, normal)
     bilinear = (ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx
-    solve_positive(bilinear, None, found, [_normal_to_ends(found, starts, ends)])
+    solve_positive(bilinear, None, found, [_normal_to_ends(found, starts, ends)], multigrid=True)
     return found
 
 
@@ -95,7 +99,8 @@ def _potential(direction: Any, dx: Any, facets: Facets, sign: float) -> Any:
     # Lengths along single lines, as through the wall, would differ over the section of a bend.
     found = _scalar(direction)
     _, test = _arguments(found)
-    solve_positive(_stiffness(found, dx), _flux(direction, test, dx, sign), found, [_held(found, facets, 0.0)])
+    bilinear, held = _stiffness(found, dx), [_held(found, facets, 0.0)]
+    solve_positive(bilinear, _flux(direction, test, dx, sign), found, held, multigrid=True)
     return found
 
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import basix.ufl
@@ -103,7 +104,7 @@ class Domain:
         """Communicator of the mesh."""
         return self.mesh.comm
 
-    @property
+    @cached_property
     def size(self) -> float:
         """Largest dimension that is a length: the scale for tolerances on coordinates."""
         return max(value for name, value in self.dimensions.items() if name != "area")

@@ -26,6 +26,8 @@ from remodel_fenicsx.system.interrupts import Paused
 
 log = logging.getLogger(__name__)
 
+SLOWNESS = 5  # steps between two looks of warnings, each of which costs up to a third of a step
+
 
 @dataclass
 class Step:
@@ -55,6 +57,8 @@ class Step:
         Its columns by name, where somebody measures (`results.columns.Observer`).
     case
         Number of the load case that is looked at.
+    findings
+        What watchers say of the step, each a level of logging and a line: it is logged where the step is accepted.
 
     Examples
     --------
@@ -81,6 +85,12 @@ class Step:
     negative_eigenvalues: float = math.nan
     row: dict[str, float] = field(default_factory=dict)
     case: int = 1
+    findings: list[tuple[int, str]] = field(default_factory=list)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time to look at what changes slowly: the first step, the last, and one in five between."""
+        return self.is_last or self.number % SLOWNESS == 1
 
     @property
     def moment(self) -> str:
@@ -276,6 +286,9 @@ class Stepper:
                 state.reach(time, step.number)
                 for watcher in watchers:
                     watcher.completed(step)
+        if state.comm.rank == 0:
+            for level, text in step.findings:
+                log.log(level, "%s", text)
         for watcher in watchers:
             watcher.committed(step)
         return step

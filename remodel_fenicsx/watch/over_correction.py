@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
-from math import prod
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Stepper
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.state import Earlier
@@ -35,13 +32,13 @@ LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
 RESUMED_CHANGE = 0.03
 
 
-def _difference(values: Sequence[Any], times: Sequence[float]) -> Any:
-    """The difference of order ORDER over passes, the newest value first: a - 3 b + 3 c - d."""
+def _weights(times: Array) -> Array:
+    """Of the difference of order ORDER over passes, the newest first: 1, -3, 3, -1."""
     # Of passes that are not equally far from each other it is the divided difference, made as large.
-    used = range(ORDER + 1)
-    weights = [prod(1.0 / (times[age] - times[other]) for other in used if other != age) for age in used]
-    total = sum(map(abs, weights))
-    return sum(GAIN * weights[age] / total * values[age] for age in used)
+    apart = np.subtract.outer(times[: ORDER + 1], times[: ORDER + 1])
+    np.fill_diagonal(apart, 1.0)
+    weights = 1.0 / apart.prod(axis=1)
+    return np.asarray(GAIN * weights / np.abs(weights).sum())
 
 
 @dataclass(frozen=True)
@@ -70,23 +67,19 @@ class OverCorrection(WarnsOnce):
         cells = partial(self.quadrature.function, "", (6,))
         self._cells = Earlier(self.state, "over_correction_cells", cells, ORDER + 1)
         self._body = Earlier(self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1)
-        self.rested = RestedCells(stepper, self) if stepper.remodeling.law.of_absolute_time else Watcher()
+        self.rested = RestedCells(stepper) if stepper.remodeling.law.of_absolute_time else None
 
     @classmethod
     def of(cls, scene: Any, stepper: Any) -> OverCorrection | None:
         return cls(stepper) if stepper.remodeling.law.remodels and not scene.time.is_equilibrium else None
 
-    @property
-    def structures(self) -> list[Array]:
-        """A of the last passes as Mandel components (elements, points, 6), the newest first."""
-        return [self._at_points(values) for values in self._cells.values]
-
     def started(self, step: Step) -> None:
         """The cells before the first pass."""
         for memory in (self._cells, self._body, self._numbers):
             memory.forget()
-        self._keep(step, self._structure())
-        self.rested.started(step)
+        self._keep(step, self._structure(), self.times)
+        if self.rested is not None:
+            self.rested.started(step)
 
     def due(self, step: Step) -> bool:
         """A solved state says nothing: passes do."""
@@ -94,26 +87,19 @@ class OverCorrection(WarnsOnce):
 
     def completed(self, step: Step) -> None:
         """One pass more."""
-        structure, self.swing = self._structure(), None
+        structure, known, self.swing = self._structure(), self.times, None
+        cells, times = np.array([structure, *self._cells.values]), np.array([step.time, *known])
         if self._cells.known > ORDER:
-            cells, body = [structure, *self._cells.values], [self.state.unknown.x.array, *self._body.values]
-            times = [step.time, *self.times]
+            body = np.array([self.state.unknown.x.array, *self._body.values])
             self.swing = swing = self._measured(cells, body, times)
-            tells = not self._loads_jump(step) and not self._rested(cells) and self._evenly(step)
+            tells = not (self._loads_jump(step, times) or _uneven(times) or self._rested(cells))
             self._count("growing", tells and swing.cells_factor < GROWTH)
             self._count("sustained", tells and swing.body_factor < SUSTAINED)
-            if not self.said and self._may_swing and self._suffers(swing):
-                self.find(self._in_words(swing, cells, times))
-        self._keep(step, structure)
-        self.rested.completed(step)
-
-    def undone(self, step: Step) -> None:
-        super().undone(step)
-        self.rested.undone(step)
-
-    def committed(self, step: Step) -> None:
-        super().committed(step)
-        self.rested.committed(step)
+            if self._may_swing and self._suffers(swing) and not self.said:
+                self.find(step, self._in_words(swing, cells, times))
+        self._keep(step, structure, known)
+        if self.rested is not None and not self.rested.said:
+            self.rested.compare(step, self._at_points(cells), times)
 
     def _suffers(self, swing: Swing) -> bool:
         """Whether a swing has begun or lasts, and is large."""
@@ -125,12 +111,11 @@ class OverCorrection(WarnsOnce):
         """Passes in a row."""
         self._numbers[name] = self._numbers[name] + 1 if once_more else 0
 
-    def _keep(self, step: Step, structure: Array) -> None:
+    def _keep(self, step: Step, structure: Array, times: list[float]) -> None:
         self._cells.push(structure)
         self._body.push(self.state.unknown.x.array)
-        for age in range(ORDER, 0, -1):
-            self._numbers[f"time_{age}"] = self._numbers[f"time_{age - 1}"]
-        self._numbers["time_0"] = step.time
+        for age, time in enumerate([step.time, *times[:ORDER]]):
+            self._numbers[f"time_{age}"] = time
 
     @property
     def times(self) -> list[float]:
@@ -141,52 +126,53 @@ class OverCorrection(WarnsOnce):
         """A at all points, six Mandel components after each other."""
         return tensors.to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
 
-    def _at_points(self, components: Any) -> Any:
-        """What stands after each other by points, (elements, points, 6)."""
-        return components.reshape(*self.quadrature.shape, len(tensors.MANDEL))
+    def _at_points(self, components: Array) -> Array:
+        """What stands after each other by points, (..., elements, points, 6)."""
+        return components.reshape(*components.shape[:-1], *self.quadrature.shape, len(tensors.MANDEL))
 
-    def _rested(self, cells: list[Array]) -> bool:
+    def _rested(self, cells: Array) -> bool:
         """Whether one of the passes has left most cells as they were: what goes on after that jumps."""
-        same = [self._at_points(a == b).all(axis=-1) for a, b in pairwise(cells[: ORDER + 1])]
-        return any(self.quadrature.mean(passed.astype(np.float64)) > RESTED_SHARE for passed in same)
+        same: Any = self._at_points(cells[:ORDER] == cells[1 : ORDER + 1]).all(axis=-1)
+        return max([self.quadrature.mean(passed.astype(np.float64)) for passed in same]) > RESTED_SHARE
 
-    def _evenly(self, step: Step) -> bool:
-        """Whether the passes are about as far from each other: of others a single jump looks like a swing."""
-        lengths = [later - earlier for later, earlier in pairwise([step.time, *self.times])]
-        return max(lengths) <= UNEVEN * min(lengths)
+    def _loads_jump(self, step: Step, times: Array) -> bool:
+        earlier = [
+            self.stepper.load_values(time) if time else {} for time in times[1 : ORDER + 1]
+        ]  # it starts unloaded
+        loads = [[one.get(name, 0.0) for name in step.loads] for one in (step.loads, *earlier)]
+        return bool(np.any(np.abs(_weights(times) @ loads) > LOAD_JUMP * GAIN * np.abs(loads[0])))
 
-    def _loads_jump(self, step: Step) -> bool:
-        times = self.times[:ORDER]
-        earlier = [self.stepper.load_values(time) if time else {} for time in times]  # the body starts unloaded
-
-        def jump(name: str, value: float) -> float:
-            return abs(_difference([value, *(loads.get(name, 0.0) for loads in earlier)], [step.time, *times]))
-
-        return any(jump(name, value) > LOAD_JUMP * GAIN * abs(value) for name, value in step.loads.items())
-
-    def _measured(self, cells: list[Array], body: list[Array], times: list[float]) -> Swing:
+    def _measured(self, cells: Array, body: Array, times: Array) -> Swing:
         """Of the last passes, the newest first."""
-        owned = self.state.number_of_owned_unknowns
-
-        def of_cells(a: Array, b: Array) -> float:
-            return self.quadrature.integral(np.einsum("epi,epi->ep", self._at_points(a), self._at_points(b)))
-
-        def of_body(a: Array, b: Array) -> float:
-            return float(over_ranks(self.state.comm, float(np.dot(a[:owned], b[:owned])), MPI.SUM))
-
-        now, last = _difference(cells, times), _difference(cells[1:], times[1:])
-        moved, moved_last, place = _difference(body, times), _difference(body[1:], times[1:]), body[0]
+        pair = np.array([np.append(_weights(times), 0.0), np.append(0.0, _weights(times[1:]))])
+        of_cells = self._products(self._at_points(pair @ cells))
+        of_body = self._products_of_unknowns(np.concatenate([pair @ body, body[:1]]))
         r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
         return Swing(
-            np.sqrt(of_cells(now, now) / self.quadrature.volume) / GAIN / r0**2,
-            _ratio(of_cells(now, last), of_cells(last, last)),
-            np.sqrt(_ratio(of_body(moved, moved), of_body(place, place))) / GAIN,
-            _ratio(of_body(moved, moved_last), of_body(moved_last, moved_last)),
+            np.sqrt(of_cells[0, 0] / self.quadrature.volume) / GAIN / r0**2,
+            _ratio(of_cells[0, 1], of_cells[1, 1]),
+            np.sqrt(_ratio(of_body[0, 0], of_body[2, 2])) / GAIN,
+            _ratio(of_body[0, 1], of_body[1, 1]),
         )
 
+    def _products(self, changes: Array) -> Array:
+        """Integrals of the products of fields at the points, each with each."""
+        volumes, owned = (
+            self.quadrature.owned(self.quadrature.volumes),
+            changes[:, : self.quadrature.number_of_owned_elements],
+        )
+        return self._summed(np.einsum("aepi,bepi,ep->ab", owned, owned, volumes))
+
+    def _products_of_unknowns(self, fields: Array) -> Array:
+        owned = fields[:, : self.state.number_of_owned_unknowns]
+        return self._summed(owned @ owned.T)
+
+    def _summed(self, values: Array) -> Array:
+        return np.asarray(over_ranks(self.state.comm, values, MPI.SUM))
+
     # ------------------------------------------------------------ words
-    def _in_words(self, swing: Swing, cells: list[Array], times: list[float]) -> str:
-        change = np.linalg.norm(self._at_points(_difference(cells, times)), axis=-1)
+    def _in_words(self, swing: Swing, cells: Array, times: Array) -> str:
+        change = np.linalg.norm(self._at_points(_weights(times) @ cells[: ORDER + 1]), axis=-1)
         return (
             "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
             f"changes by {swing.cells:.2g} r0^2 (root mean square; most at "
@@ -210,52 +196,50 @@ def _ratio(value: float, size: float) -> float:
     return value / size if size > 0.0 else 0.0
 
 
+def _uneven(times: Array) -> bool:
+    """Whether the passes are not about as far from each other: of such a single jump looks like a swing."""
+    lengths = -np.diff(times)
+    return bool(lengths.max() > UNEVEN * lengths.min())
+
+
 class RestedCells(WarnsOnce):
     """Warns, once, when cells that had rested change in one pass as much as if they had remodeled all the time."""
 
     name = "rested_cells"
 
-    def __init__(self, stepper: Stepper, passes: OverCorrection):
+    def __init__(self, stepper: Stepper):
         super().__init__(stepper)
-        self.passes = passes
         self._moved = Earlier(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
+        self._nowhere = np.zeros(self.quadrature.shape, dtype=np.bool_)  # where memory begins anew nothing is told
 
     def started(self, step: Step) -> None:
         """No pass yet."""
         self._moved.forget()
         self._numbers.forget()
-        self._moved.push(np.zeros(self.quadrature.shape).ravel())
+        self._moved.push(self._nowhere.astype(np.float64).ravel())
 
-    def completed(self, step: Step) -> None:
-        """One pass more."""
-        if self.said:
-            return
-        cells = self.passes.structures
-        nowhere = np.zeros(self.quadrature.shape, dtype=bool)  # where memory begins anew there is nothing to tell
-        now = _differ(cells[0], cells[1]) if len(cells) > 1 else nowhere
-        moved = self._moved.values[0].reshape(self.quadrature.shape) > 0 if self._moved.known else nowhere
+    def compare(self, step: Step, structures: Array, times: Array) -> None:
+        """One pass more: A of the last ones (passes, elements, points, 6), and their times, the newest first."""
+        now, *before = (structures[:-1] != structures[1:]).any(axis=-1) if len(structures) > 1 else [self._nowhere]
+        moved = self._moved.values[0].reshape(now.shape) > 0 if self._moved.known else self._nowhere
         self._moved.push((now | moved).astype(np.float64).ravel())
         # a rest without loads is the loads', and no matter of steps
-        if len(cells) > 2 and any(self.stepper.load_values(self.passes.times[1]).values()):
-            resumed = now & moved & ~_differ(cells[1], cells[2])
+        if before and any(self.stepper.load_values(times[1]).values()):
             # |change of A|^2 where it was made up for
-            self._judge(np.where(resumed, np.sum((cells[0] - cells[1]) ** 2, axis=-1), 0.0))
+            squares = np.sum((structures[0] - structures[1]) ** 2, axis=-1)
+            self._judge(step, np.where(now & moved & ~before[0], squares, 0.0))
 
-    def _judge(self, squares: Array) -> None:
+    def _judge(self, step: Step, squares: Array) -> None:
         r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
         change = np.sqrt(self.quadrature.mean(squares)) / r0**2
         if change < RESUMED_CHANGE:
             return
         share = self.quadrature.mean((squares > 0).astype(float))
         self.find(
+            step,
             "cells that had rested without tension remodel again, and the law catches up in one pass. In "
             f"{100 * share:.2g} % of the body the structure tensor A changes by {change:.2g} r0^2 (root mean square "
             f"over the body; most at {largest_at(self.quadrature, squares)}). When cells rest "
             'depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a remodeling.law '
-            "that is a rate (docs/theory.md, Stability of the pass)"
+            "that is a rate (docs/theory.md, Stability of the pass)",
         )
-
-
-def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
-    """Where tensors (elements, points, 6) are not the same to the last bit."""
-    return np.any(one != other, axis=-1)

@@ -22,14 +22,12 @@ from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import cofactor
-from remodel_fenicsx.state import Numbers, Occasions, at_points
+from remodel_fenicsx.state import Numbers, at_points
 from remodel_fenicsx.system import NOTICE
 
 
 # ---------------------------------------------------------------- what warnings have in common
 # They follow the steps of a run, and speak once.
-
-log = logging.getLogger(__name__)
 
 
 class WarnsOnce(Watcher):
@@ -75,8 +73,6 @@ class WarnsOnce(Watcher):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature = stepper.state.cells.quadrature
         self._numbers = Numbers(self.state, self.name, {"said": 0} | dict(self.initial))
-        self._occasions = Occasions(self.state, self.name)
-        self._found = ""
 
     @classmethod
     def of(cls, scene: Any, stepper: Any) -> WarnsOnce | None:
@@ -97,14 +93,14 @@ class WarnsOnce(Watcher):
         return bool(self._numbers["said"])
 
     def due(self, step: Step) -> bool:
-        """Whether it is time to look: when loads have changed, and now and then without, for cells remodel.
+        """Whether it is time to look.
 
         Parameters
         ----------
         step
             The step that is solved.
         """
-        return self._occasions.due()
+        return step.is_due
 
     def look(self, step: Step) -> str:
         """What is to be said of the solved state; nothing where all is well.
@@ -118,28 +114,21 @@ class WarnsOnce(Watcher):
 
     def solved(self, step: Step) -> None:
         """Look, until it was said."""
-        if not self.said and self.due(step) and (text := self.look(step)):
-            self.find(text)
+        if self.due(step) and not self.said and (text := self.look(step)):
+            self.find(step, text)
 
-    def find(self, text: str) -> None:
-        """In a solved state: it is said where the step is accepted, and else forgotten.
+    def find(self, step: Step, text: str) -> None:
+        """It is said where the step is accepted, and else forgotten.
 
         Parameters
         ----------
+        step
+            The step that is solved.
         text
             One line, without the time.
         """
-        self._numbers["said"], self._found = True, text
-
-    def undone(self, step: Step) -> None:
-        """Forget what was found."""
-        self._found = ""
-
-    def committed(self, step: Step) -> None:
-        """Say what was found."""
-        if self._found and self.state.comm.rank == 0:
-            log.log(self.level, "%s: %s", step.moment, self._found)
-        self._found = ""
+        self._numbers["said"] = True
+        step.findings.append((self.level, f"{step.moment}: {text}"))
 
 
 # ---------------------------------------------------------------- elements that hold a body back
@@ -462,16 +451,14 @@ class VolumeLoss(WarnsOnce):
     name = "volume"
     initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0} | dict.fromkeys("xyz", 0.0)
 
-    def due(self, step: Step) -> bool:
-        return super().due(step) or step.is_last
-
     def solved(self, step: Step) -> None:
-        """Look at J, also when it was said: the most that is lost is said at the end."""
-        if self.due(step):
-            self._measure(step)
+        """Look at every J, also when it was said: the most that is lost is said at the end."""
+        self._measure(step)
         numbers = self._numbers
         if not self.said and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
-            self.find(f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
+            self.find(step, f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
+        elif step.is_last and 1 - numbers["mean"] >= NOTED:
+            step.findings.append((logging.INFO, self._in_words()))
 
     def _measure(self, step: Step) -> None:
         numbers, look = self._numbers, self.stepper.coupling.equilibrium.look()
@@ -488,12 +475,6 @@ class VolumeLoss(WarnsOnce):
             for name, value in zip("xyz", self.quadrature.place_of_largest(-jacobians), strict=True):
                 numbers[name] = value
 
-    def committed(self, step: Step) -> None:
-        """Say what there is to say."""
-        if step.is_last and not self._found and 1 - self._numbers["mean"] >= NOTED and self.state.comm.rank == 0:
-            log.info("%s", self._in_words())
-        super().committed(step)
-
     def _in_words(self) -> str:
         found = {name: self._numbers[name] for name in self.initial}
         return (
@@ -507,14 +488,14 @@ class WeakTension(WarnsOnce):
 
     name = "weak_tension"
 
-    def committed(self, step: Step) -> None:
+    def completed(self, step: Step) -> None:
         """Look at the end, when the pass of the last stress is made."""
         if step.is_last and not self.said and (weakness := self.stepper.remodeling.weakness()) > WEAK:
             self.find(
+                step,
                 f"the loads are weak: a tension of {weakness:.2g} times the largest stress of the body counts by half, "
-                "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains"
+                "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains",
             )
-        super().committed(step)
 
 
 class MuchGrowth(WarnsOnce):
@@ -586,9 +567,6 @@ class RadialChains(WarnsOnce):
     @classmethod
     def of(cls, scene: Any, stepper: Any) -> RadialChains:
         return cls(stepper, scene.geometry.radial_share)
-
-    def due(self, step: Step) -> bool:
-        return super().due(step) or step.is_last
 
     def look(self, step: Step) -> str:
         """Measure their share."""
