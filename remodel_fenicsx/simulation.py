@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from remodel_fenicsx.evolution.stepper import OtherCase, OtherCaseWatcher, Step,
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.energy import MATRICES, Tissue, mixed
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.fem.assembly import agreed
@@ -38,6 +38,7 @@ from remodel_fenicsx.watch.stability import EquilibriumStability
 log = logging.getLogger(__name__)
 
 TIME_ERROR = "time_error"  # the column
+NEVER_LOCKED = 1e12  # link lengths: contour length of chains that are not there; infinity times zero is no number
 BEYOND = 0.5
 """Widths of the innermost layer: points that lie so far inside of a thin wall have rounding for stretches, for
 polynomials of degree 24 grow by T_24(1 + 2 BEYOND) = 3e13 up to there."""
@@ -403,12 +404,36 @@ def check_files(scene: Scene) -> str:
 
 def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple[Tissue, Any]:
     """Tissue and kappa of a scene's regions: numbers where these agree, DG0 Functions where they differ."""
-    tissues = {name: one.tissue for name, one in properties.items()}
-    kappas = {name: one.kappa for name, one in properties.items()}
+    tissues, kappas = _tissues(properties), {name: one.kappa for name, one in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
     if any(other != tissue for other in tissues.values()):
         tissue = tissue.map(lambda key, _: by_region(domain, {name: t.parameters[key] for name, t in tissues.items()}))
     return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
+
+
+def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
+    """Of the regions, all of one chain law and one matrix: where there are no chains, none locks."""
+    found = {name: one.tissue for name, one in properties.items()}
+    chain = next((tissue.chain for tissue in found.values() if tissue.chain is not None), None)
+    matrices = list(dict.fromkeys(one.material.matrix for one in properties.values()))
+    for name, tissue in found.items():
+        if chain is not None and tissue.chain is None:
+            length = NEVER_LOCKED if chain.locks else tissue.contour_length
+            found[name] = replace(tissue, chain=chain, contour_length=length)
+    return found if len(matrices) == 1 else _with_one_matrix(found, properties, matrices)
+
+
+def _with_one_matrix(
+    tissues: Mapping[str, Tissue], properties: Mapping[str, Properties], matrices: Sequence[str]
+) -> dict[str, Tissue]:
+    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # `Properties.check_with` asks
+    defaults = {name: number.default for name, number in mixture.parameters.items()}
+    found = {}
+    for name, tissue in tissues.items():
+        share = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
+        own = getattr(tissue.matrix, "values", {})
+        found[name] = replace(tissue, matrix=mixture.of({**defaults, **own, **share}))
+    return found
 
 
 def with_choices(scene: Scene, domain: Domain | None = None) -> Scene:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -489,7 +489,14 @@ class Parameters:
 
     def largest(self) -> Tissue:
         """The largest value of each in the body, numbers. Collective."""
-        return self._largest(lambda: self.tissue.map(lambda name, value: assembly.largest(value, self.quadrature.mesh)))
+
+        def found() -> Tissue:
+            whole = self.tissue.map(lambda name, value: assembly.largest(value, self.quadrature.mesh))
+            lengths = self.at_points().contour_length.reshape(self.quadrature.shape)
+            of_chains = self.quadrature.maximum(np.where(self.has_chains(), lengths, 0.0))
+            return replace(whole, contour_length=of_chains or whole.contour_length)
+
+        return self._largest(found)
 
     def at_points(self) -> Tissue:
         """`at_points`; not to be written into."""
@@ -500,4 +507,12 @@ class Parameters:
         length = self.at_points().locking_length
         if length is None:
             return np.full(self.quadrature.shape, np.inf)
-        return length.reshape(self.quadrature.shape)
+        return np.where(self.has_chains(), length.reshape(self.quadrature.shape), np.inf)
+
+    def has_chains(self) -> NDArray[np.bool_]:
+        """Whether there are any at a point, (elements, points)."""
+        return np.asarray(self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
+
+    def where_chains(self, values: Array) -> Array:
+        """Values at all points (elements, points), NaN where there are no chains of which they would be."""
+        return np.where(self.has_chains(), values, np.nan)

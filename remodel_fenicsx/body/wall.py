@@ -262,7 +262,7 @@ class Walled(Shape):
             "radial_share",
             "",
             "share of the chains that points out of the wall, the volume mean of A_rr / tr A: 0 none, 1 all",
-            lambda m: m.quadrature.mean(m.radial_share),
+            lambda m: m.quadrature.mean_of_known(m.radial_share),
             by_case=False,
         ),
     )

@@ -11,7 +11,7 @@ Stresses, drivers, residual and tangent follow by differentiation. Per reference
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -134,6 +134,34 @@ neo_hookean = Matrix(
     compiled="NEO_HOOKEAN",
 )
 """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
+
+
+def mixed(matrices: Sequence[Matrix]) -> Matrix:
+    """Matrices of parts of a body as one: each times its share there, `share_0` and so on, numbers of its own."""
+    shares = [f"share_{number}" for number in range(len(matrices))]
+    numbers = {name: number for matrix in matrices for name, number in matrix.parameters.items()}
+    numbers |= {share: Parameter(0.0, "Where it is this one: 1, else 0.") for share in shares}
+
+    def parts(values: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
+        for share, matrix in zip(shares, matrices, strict=True):
+            yield values[share], matrix.of({name: values[name] for name in matrix.parameters})
+
+    def derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second: bool, **values: Any) -> tuple[Any, Any]:
+        stress: Any = 0.0
+        tangent: Any = 0.0
+        for share, matrix in parts(values):
+            its_stress, its_tangent = matrix.derivatives(squared, lame_lambda, lame_mu, second)
+            stress = stress + np.reshape(share, (-1, 1, 1)) * its_stress
+            tangent = tangent + np.reshape(share, (-1, 1, 1)) * its_tangent if second else None
+        return stress, tangent
+
+    return Matrix(
+        lambda J, lam, mu, **values: sum(share * matrix.volumetric(J, lam, mu) for share, matrix in parts(values)),
+        lambda F, lam, mu, **values: sum(share * matrix.distortional(F, lam, mu) for share, matrix in parts(values)),
+        derivatives=derivatives,
+        parameters=numbers,
+    )
+
 
 MATRICES: dict[str, Term] = {"neo-hookean": neo_hookean}
 """Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I; those

@@ -172,27 +172,32 @@ class Measurement:
     def fibre_angle(self) -> Array:
         """Reference fibre angle at all points (elements, points), degrees; NaN where there is none."""
         cells = self.state.cells
-        return self.observer.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+        return self._angle(cells.axis_values, cells.local_axes.axes)
 
     @cached_property
     def fibre_angle_unloaded(self) -> Array:
         """Of the cells in the unloaded body, at all points (elements, points), degrees."""
         cells = self.state.cells
         axes = self.state.elastic_axes(cells.axis_values)
-        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.axes)
+        return self._angle(axes, cells.local_axes.axes)
 
     @cached_property
     def fibre_angle_deformed(self) -> Array:
         """Of the cells in the deformed body, at all points (elements, points), degrees."""
         cells = self.state.cells
         axes = self.state.elastic_axes(cells.axis_values, self.F)
-        return self.observer.shape.fibre_angle(cells.dimension_values, axes, cells.local_axes.deformed(self.F))
+        return self._angle(axes, cells.local_axes.deformed(self.F))
 
     @cached_property
     def radial_share(self) -> Array:
         """Of the chains at all points (elements, points)."""
         cells = self.state.cells
-        return self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+        share = self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+        return self.equilibrium.parameters.where_chains(share)
+
+    def _angle(self, axes: Array, local: Array) -> Array:
+        found = self.observer.shape.fibre_angle(self.state.cells.dimension_values, axes, local)
+        return self.equilibrium.parameters.where_chains(found)
 
     @cached_property
     def chain_extension(self) -> Array:

@@ -82,7 +82,7 @@ class ElementFields:
 
         def angle(axes: Array, local: Array) -> Array:
             found = self.shape.fibre_angle(cells.dimension_values, axes, local)
-            return self.quadrature.element_mean_of_known(found)
+            return self.quadrature.element_mean_of_known(self._parameters.where_chains(found))
 
         def mean_axis(i: int) -> Array:
             return np.asarray(mean_cells()[1][:, i])
@@ -124,7 +124,8 @@ class ElementFields:
         squared, axes = cells.kernels.principal(
             self.quadrature.element_mean(cells.structure_tensor()), cells.axis_values[:, 0]
         )
-        return np.sqrt(np.maximum(squared, 0.0)), axes
+        chains = self._parameters.has_chains()[:, :1]  # of regions: all points of an element, or none
+        return np.sqrt(np.maximum(squared, 0.0)) * chains, axes
 
 
 class Fields(Watcher, ClosedAtEnd):

@@ -352,8 +352,12 @@ class Scene(Table):
         found = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
         if self.regions and isinstance(self.geometry, RoundWall):
             del found[""]
-        speed = self.remodeling.speed
-        return {name: one._replace(kappa=speed(one.kappa, one.material.temperature)) for name, one in found.items()}
+        has_chains = any(one.material.chain_density for one in found.values())
+        for name, one in found.items():
+            stays = has_chains and not one.material.chain_density  # cells that hold no collagen
+            kappa = 0.0 if stays else self.remodeling.speed(one.kappa, one.material.temperature)
+            found[name] = one._replace(kappa=kappa)
+        return found
 
     @property
     def has_random_cells(self) -> bool:

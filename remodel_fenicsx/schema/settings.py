@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, create_model, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, create_model, model_validator
 
 from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
@@ -37,7 +37,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
-from remodel_fenicsx.schema.tables import IN_A_LIST, OneOf, Table, fault, named, quoted, refuse, shown
+from remodel_fenicsx.schema.tables import IN_A_LIST, KeysOfParts, OneOf, Table, fault, named, quoted, refuse, shown
 from remodel_fenicsx.schema import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
@@ -286,7 +286,7 @@ class Material(Table):
     def _part(self, part: Any) -> Any:
         """With the values of its own keys."""
         own = getattr(part, "parameters", None)
-        return part.of({name: getattr(self, name) for name in own}) if own else part
+        return part.of({name: getattr(self, name, own[name].default) for name in own}) if own else part
 
     def summary(self, loads: Mapping[str, float]) -> str:
         """Stiffness of network and matrix and the loads, in one unit and on one line.
@@ -610,14 +610,16 @@ def missing_for_steps_of_cells(scene: Scene) -> str | None:
     material, remodeling = scene.material, scene.remodeling
     if scene.formulation != "displacement":
         return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
-    if not material.chain_density:
+    properties = scene.properties().values()
+    if not any(one.material.chain_density for one in properties):
         return "chains: material.chain_density above 0"
     if scene.cases[1:]:
         return "a scene without [[cases]]: it finds the cells for the stress of one load case"
     if remodeling.has_set_point:
         return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
     parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
-    return refused(*parts, MATRICES[material.matrix], REPULSIONS[material.repulsion])
+    matrices = [MATRICES[one.material.matrix] for one in properties]
+    return next(filter(None, (refused(*parts, matrix, REPULSIONS[material.repulsion]) for matrix in matrices)), None)
 
 
 COUPLINGS = {
@@ -848,15 +850,17 @@ class Properties(NamedTuple):
             raise fault(length, f"{region}cells.initial", cells.initial)
         if cells.initial == MEASURED_CELLS and cells.fibres is None:
             raise fault("needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial)
-        if bool(material.chain_density) != bool(scene.material.chain_density):
-            rule = "must be above 0 in every region, or 0 in all of the body (material.chain_density)"
-            raise fault(rule, f"{region}material.chain_density", material.chain_density)
+        differ = material.matrix != scene.material.matrix
+        if differ and not (material.tells_volume_apart and scene.material.tells_volume_apart):
+            rule = f"allowed beside {scene.material.matrix!r} are those that are made as a Matrix, if it is one"
+            raise fault(rule, f"{region}material.matrix", material.matrix)
         plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
         if self.kappa != plain and law.remodels and not law.asks_kappa:
-            raise fault(f"the law {scene.remodeling.law!r} has no kappa", f"{region}remodeling.kappa", self.kappa)
+            key, value = ("remodeling.kappa", self.kappa) if material.chain_density else ("material.chain_density", 0.0)
+            raise fault(f"the law {scene.remodeling.law!r} has no kappa", f"{region}{key}", value)
         turnover, longest = scene.remodeling.turnover, material.contour_length / cells.end_to_end_length
         if turnover.is_on and not material.chain_density:
-            raise fault("needs chains: material.chain_density above 0", "remodeling.turnover", None)
+            raise fault(f"needs chains: {region}material.chain_density above 0", "remodeling.turnover", None)
         if turnover.is_on and CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
             rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
             raise fault(rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch)
@@ -870,7 +874,11 @@ def _as_in(table: type[Table], name: str, key: str) -> Any:
 
 
 class RegionMaterial(Table):
-    """Keys of `[material]` that differ in the region. The other keys of `[material]` hold for the whole body."""
+    """Keys of `[material]` that differ in the region. The other keys of `[material]` hold for the whole body.
+
+    With `chain_density = 0` the region has no collagen: its angles are empty, and its cells stay. A region that has own
+    numbers for a matrix of an extension names `matrix` too.
+    """
 
     lame_lambda: float | None = _as_in(Material, "lame_lambda", "material")
     lame_mu: float | None = _as_in(Material, "lame_mu", "material")
@@ -880,6 +888,7 @@ class RegionMaterial(Table):
     initial_stiffness: float | None = _as_in(Material, "initial_stiffness", "material")
     locking_stretch: float | None = _as_in(Material, "locking_stretch", "material")
     temperature: float | None = _as_in(Material, "temperature", "material")
+    matrix: str | None = _as_in(Material, "matrix", "material")
 
 
 class RegionCells(Table):
@@ -910,7 +919,7 @@ class Region(Table):
     outer_radius: Annotated[float | None, LENGTH] = Field(default=None, gt=0)
     """For a tube: the outer radius of the layer, in the scene's unit of length. The layer begins where the one inside
     of it ends. The outermost layer may leave it out."""
-    material: RegionMaterial = RegionMaterial()
+    material: Annotated[SerializeAsAny[RegionMaterial], KeysOfParts({"matrix": MATRICES}, True)] = RegionMaterial()
     cells: RegionCells = RegionCells()
     remodeling: RegionRemodeling = RegionRemodeling()
 
@@ -1122,15 +1131,17 @@ class Time(Table):
         if not self.is_equilibrium:
             return
         remodeling, laws = scene.remodeling, named(LAWS, lambda law: law.has_limit)
-        still = [f"{in_region(name)}remodeling.kappa" for name, one in scene.properties().items() if one.kappa == 0]
+        parts = scene.properties().items()
+        bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
+        still = [f"{in_region(name)}remodeling.kappa" for name, one in parts if one.kappa == 0]
         later = "set time.end to a late time"
         reasons = {
             f"remodeling.law = {remodeling.law!r} has no limit that is the same on every path; allowed are the laws "
             + laws: not LAWS[remodeling.law].has_limit,
             f"remodeling.threshold is above 0: where cells rest depends on the path; {later}": remodeling.threshold,
             f"remodeling.exponent is not 2: derivatives of its target are not known; {later}": remodeling.has_set_point,
+            f"needs chains: {', '.join(bare)} above 0": bare,
             f"{', '.join(still)} = 0: the cells never change": still,
-            "needs chains: material.chain_density above 0": not scene.material.chain_density,
         }
         refuse(f"{key}.end", self.end, reasons)
 

@@ -189,6 +189,7 @@ class KeysOfParts:
     """Annotation of a field that is a table: with the keys too that the parts chosen in it bring (`parameters`)."""
 
     registries: Mapping[str, Mapping[str, Any]]  # by the key that names the part
+    optional: bool = False  # whether the keys may be left out, as those of regions
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(functools.partial(self._table, source), handler(source))
@@ -201,7 +202,7 @@ class KeysOfParts:
         own = {name: number for part in parts for name, number in getattr(part, "parameters", {}).items()}
         if not own:
             return value
-        wide = _widened(table, tuple(own.items()))
+        wide = _widened(table, tuple(own.items()), self.optional)
         try:
             return wide.model_validate(dict(value))
         except ValidationError as error:
@@ -209,18 +210,19 @@ class KeysOfParts:
 
 
 @functools.cache
-def _widened(table: type[Table], own: tuple[tuple[str, Any], ...]) -> type[Table]:
+def _widened(table: type[Table], own: tuple[tuple[str, Any], ...], optional: bool) -> type[Table]:
     """A table with further numbers: one class, so that scenes with them can be equal."""
+    kind = float | None if optional else float
     fields: dict[str, Any] = {
-        name: (float, Field(default=number.default, gt=number.above, description=number.meaning))
+        name: (kind, Field(default=None if optional else number.default, gt=number.above, description=number.meaning))
         for name, number in own
     }
     wide = create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
-    wide.widened = table, own
+    wide.widened = table, own, optional
     return wide
 
 
-def _unpickled(widened: tuple[type[Table], tuple[tuple[str, Any], ...]], state: Any) -> Table:
+def _unpickled(widened: tuple[type[Table], tuple[tuple[str, Any], ...], bool], state: Any) -> Table:
     """A table whose class is made, and so has no place from which it could be imported."""
     kind = _widened(*widened)
     made = kind.__new__(kind)
