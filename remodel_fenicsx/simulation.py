@@ -219,7 +219,8 @@ def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
     tissue, kappa = parameters_of(scene.properties(), simulation.domain)
     known, stepper, kinematics = simulation.stepper.tissue.parameters, simulation.stepper, simulation.state.kinematics
     varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
-    watched = simulation.control or simulation.rest or scene.solver.unstable == "stop"  # by who knows numbers
+    # by who knows numbers
+    watched = simulation.control or simulation.rest or kinematics.grows or scene.solver.unstable == "stop"
     if watched or any(varies[name] and not isinstance(known[name], Function) for name in varies):
         return False
     for name, value in tissue.parameters.items():
@@ -266,11 +267,15 @@ def _states(scene: Scene, domain: Domain) -> list[State]:
     quadrature = Quadrature(domain.mesh, scene.mesh.degree, made[0].weight(domain.mesh))
     properties, local_axes = scene.properties(), scene.geometry.local_axes(domain, quadrature)
     own = {name: properties[name].cells for name in scene.regions}
-    if not scene.natural.is_of_the_mesh:
-        values, closed = natural_gradient(scene, quadrature, domain, local_axes)
-        function = quadrature.function("natural_gradient", (3, 3))
-        quadrature.values(function, (3, 3))[:] = values
-        made = [NaturalConfiguration(one, function, closed) for one in made]
+    grows = scene.remodeling.turnover.grows
+    if grows or not scene.natural.is_of_the_mesh:
+        values, closed = np.eye(3), None
+        if not scene.natural.is_of_the_mesh:
+            values, closed = natural_gradient(scene, quadrature, domain, local_axes)
+        present, initial = (quadrature.function(f"{name}_gradient", (3, 3)) for name in ("natural", "initial"))
+        for function in (present, initial):
+            quadrature.values(function, (3, 3))[:] = values
+        made = [NaturalConfiguration(one, present, closed, initial if grows else None) for one in made]
     cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, measured_fibres(scene, domain))
     return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 

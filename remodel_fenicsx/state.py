@@ -227,6 +227,7 @@ class State:
         self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
         F = kinematics.deformation_gradient(unknown)
         self._natural = getattr(kinematics, "gradient", None)  # G, of a body that is free of stress elsewhere
+        self._initial = getattr(kinematics, "initial", None)  # that of the start, where it grows
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.others: Sequence[State] = ()
@@ -283,12 +284,12 @@ class State:
         return self.elastic(F.reshape(*self.cells.quadrature.shape, 3, 3)).reshape(-1, 3, 3)
 
     def per_mesh_volume(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values per volume of tissue that is free of stress, as values per volume of the mesh, (elements, points)."""
+        """Values per volume of tissue that is free of stress at the start, per volume of the mesh, (elements, points)."""
         quadrature = self.cells.quadrature
         values = values.reshape(quadrature.shape)
         if self._natural is None:
             return values
-        return values / np.linalg.det(quadrature.values(self._natural, (3, 3)))
+        return values / np.linalg.det(quadrature.values(self._initial, (3, 3)))
 
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name, those of further load cases with their mark ("@2")."""

@@ -21,7 +21,7 @@ from remodel_fenicsx.model import implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.implicit import StepOfCells
-from remodel_fenicsx.model.laws import TurnoverRule, relaxed
+from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
 from remodel_fenicsx.model.tensors import det
 from remodel_fenicsx.schema.settings import Solver
@@ -68,7 +68,7 @@ class AnsweringCells:
         drive, cells = self.remodeling.drive(residual), self.state.cells.point_cells
         old = UnitCell(cells.dimensions.copy(), cells.axes.copy())
         given = self.remodeling.settings.turnover
-        rule = TurnoverRule(given.time, given.deposition_stretch, given.gain) if given.time else None
+        rule = given.rule if given.is_on else None
         step = StepOfCells(self.remodeling.law, drive, old, structure_tensor(*old[:2]), self.state.time, time, rule)
         self._points = condensed_points(self._kernels, at_points(self.tissue, self.quadrature), step)
         self.accepted = self._points.with_cells(drive.deformation_gradient, old).driving_tensor

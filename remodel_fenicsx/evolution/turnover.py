@@ -10,12 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
-from remodel_fenicsx.model.laws import TurnoverRates, turnover_rates
+from remodel_fenicsx.model.laws import TurnoverRates
 from remodel_fenicsx.schema.settings import Turnover
+from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.diagnosis import Refusal
 from remodel_fenicsx.state import Earlier, Numbers, Parameters, State, on_mesh
 
 Array = NDArray[np.float64]
 
+LEAST_VOLUME = 0.05  # of that at the start, below which a step is refused: then hardly anything is left
+GONE = Refusal("lost tissue", "take a smaller remodeling.turnover.volume or gain, or higher loads")
 LARGEST_TURNOVER = 0.5  # largest |change of ln rho| in a step: the prototype's; it does not act at rest
 MUCH = 10.0  # factor of content or natural length that is said
 
@@ -33,6 +37,46 @@ def changed(start: Array, rates: Array, duration: float) -> Array:
     """ln m and ln rho (2, n) after a time with rates (2, n)."""
     content, length = rates * duration
     return start + [content, np.clip(length, -LARGEST_TURNOVER, LARGEST_TURNOVER)]
+
+
+class Growth:
+    """The room that collagen takes: G at all points, whose direction across the wall follows the content."""
+
+    def __init__(self, state: State, settings: Turnover):
+        self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
+        kinematics, shape = state.kinematics, (3, 3)
+        self._gradient, self._initial = (
+            self.quadrature.values(function, shape) for function in (kinematics.gradient, kinematics.initial)
+        )
+        normal = state.cells.local_axes.axes[..., 2, :]
+        self._across = np.einsum("...ij,...j,...k->...ik", self._initial, normal, normal)  # G_0 N (x) N
+        reference = self.quadrature.function("reference_content", ())
+        reference.x.array[:] = 1.0
+        for function in (kinematics.gradient, reference):
+            state.remember(function)
+        self._reference = self.quadrature.values(reference, ())
+
+    @property
+    def ratio(self) -> Array:
+        """J_g, by what the volume has grown, (elements, points)."""
+        return np.asarray(np.linalg.det(self._initial) / np.linalg.det(self._gradient))
+
+    def share(self, content: Array) -> Array:
+        """Of the present volume that is collagen, (elements, points); content likewise."""
+        return self.settings.volume * content / self._reference / self.ratio
+
+    def follow(self, content: Array) -> None:
+        """J_g = 1 + phi (m/m_ref - 1) of the content (elements, points), and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
+        if self.state.time < getattr(self.settings, "from"):
+            self._reference[:] = content
+        ratio = 1.0 + self.settings.volume * (content / self._reference - 1.0)
+        if self.quadrature.shape[1] > 1:
+            # as much as the strain of an element can follow: more of it alternates from point to point
+            ratio = ratio - self.quadrature.beyond(self.quadrature.element_degree - 1, ratio[..., None])[..., 0]
+        if (least := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
+            text = f"after time {self.state.time:g} less than {100 * LEAST_VOLUME:g} % of the tissue's volume is left"
+            raise StepFailure(self.state.time, f"{text}: J_g = {least:.3g}", GONE)
+        self._gradient[:] = self._initial - (1.0 - 1.0 / ratio)[..., None, None] * self._across
 
 
 class Slowing:
@@ -64,6 +108,7 @@ class TurnoverPass:
         self._earlier = Earlier(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
         self.weights: Sequence[float] = (1.0,)  # of the load cases, that of `state` first
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
+        self.growth = Growth(state, settings) if state.kinematics.grows else None
         self._start = self._before = self.row = self.better = self.logarithms()  # before: of the last solved state
         self._start_rates: Array | None = None  # where those of both ends together are better
 
@@ -126,6 +171,8 @@ class TurnoverPass:
         """Other m and rho."""
         for name, values in zip(TURNED_OVER, np.exp(logarithms), strict=True):
             getattr(self.tissue, name).x.array[:] = values
+        if self.growth is not None:
+            self.growth.follow(self._values("content"))
 
     def rates(self, present: bool = False) -> Array:
         """d ln m / dt and d ln rho / dt of the solved state (2, n), of several load cases the weighted mean."""
@@ -137,8 +184,8 @@ class TurnoverPass:
         """In one load case."""
         cells = state.cells if present else state.equilibrium_cells
         squared = cells.kernels.squared_length(state.elastic_gradient(), cells.point_cells)
-        given = self.settings.time or np.inf, self.settings.deposition_stretch, self.settings.gain
-        return turnover_rates(self._parameters.at_points(), np.sqrt(squared), *given)
+        tissue = self._parameters.at_points()
+        return self.settings.rule.rates(tissue, tissue.relative(np.sqrt(squared)) / tissue.end_to_end_length)
 
     def power(self) -> float:
         """Stored energy per time that turnover releases in the solved state, at its F and cells."""

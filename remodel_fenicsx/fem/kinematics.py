@@ -42,6 +42,8 @@ class Kinematics(ABC):
         Whether algebraic multigrid solves for these unknowns.
     closing
         Of which sector a tube is made (`model.closing.Closing`), where it has residual stress.
+    grows
+        Whether the tissue's volume changes in time (`volume_ratio`).
     cost
         Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
 
@@ -62,6 +64,7 @@ class Kinematics(ABC):
     suits_multigrid: ClassVar[bool] = True
     cost: ClassVar[float] = 1.0
     closing: Any = None
+    grows: ClassVar[bool] = False
 
     def element(self, kind: str) -> str:
         """Kind of the mesh's elements where the scene asks for elements of the body of this kind."""
@@ -379,18 +382,26 @@ class _Around:
 
 
 class NaturalConfiguration(_Around):
-    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G."""
+    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G.
 
-    def __init__(self, kinematics: Any, gradient: Any, closing: Any = None):
+    Tissue that grows has another G in time; `initial` is that of the start, whose volume all amounts belong to.
+    """
+
+    def __init__(self, kinematics: Any, gradient: Any, closing: Any = None, initial: Any = None):
         self.field, self.gradient, self.closing = kinematics, gradient, closing
+        self.initial, self.grows = (gradient, False) if initial is None else (initial, True)
 
     def elastic(self, deformation_gradient: Any) -> Any:
         """F G."""
         return ufl.dot(deformation_gradient, self.gradient)
 
     def stress_free_weight(self, mesh: Any) -> Any:
-        """The mesh's weight over det G."""
-        return self.field.weight(mesh) / ufl.det(self.gradient)
+        """The mesh's weight over det G of the start."""
+        return self.field.weight(mesh) / ufl.det(self.initial)
+
+    def volume_ratio(self) -> Any:
+        """J_g, by what the tissue has grown; UFL."""
+        return ufl.det(self.initial) / ufl.det(self.gradient)
 
 
 # ---------------------------------------------------------------- the length as an unknown

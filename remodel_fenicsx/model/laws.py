@@ -488,16 +488,20 @@ MEANS_OF_CASES: dict[str, Mean] = {
 
 
 # ---------------------------------------------------------------- turnover
-# Collagen is removed in time and deposited under a stretch. m is the density of the chains and rho their natural
-# length, each over that at the start. With lambda_e = r/(rho r0), lambda_h the stretch of deposition and
-# tau(lambda) = g(lambda r0) lambda, proportional to the force of a chain,
+# Collagen is removed in time and deposited under a stretch. m is the amount of the chains and rho their natural
+# length, each over that at the start; lambda_e = r/(rho r0), and lambda_h is the stretch of deposition. The rates
+# `cauchy` are those of Cyron, Aydin and Humphrey (2016): with S(lambda) = g(lambda r0) lambda^2, proportional to the
+# Cauchy stress of a chain, s = S(lambda_e)/S(lambda_h), a = d ln S / d ln lambda and p = max(1 + k (s - 1), 0), the
+# production over the removal,
+#     dm/dt / m = (p - 1)/T,    drho/dt / rho = p (1 - 1/s)/(a T).
+# The rates `tension` are those of version 0.3.0: with tau(lambda) = g(lambda r0) lambda, proportional to its force,
 #     dm/dt / m = k/T (tau(lambda_e)/tau(lambda_h) - 1), limited to k/T,
 #     drho/dt / rho = (1/T + (dm/dt / m)^+) (lambda_e/lambda_h - 1).
-# The idea is that of Cyron, Aydin and Humphrey 2016, whose rates are others (docs/turnover.md, Limits).
 
 STRETCH_ITERATIONS = 60  # of Newton's method for one number; halved brackets alone reach a last digit from any start
 COMPLEX_STEP = 1e-30  # its square vanishes beside 1: derivatives are exact to rounding
 LOCKING_MARGIN = 1e-9  # of ln lambda_e: nearer to the locking stretch nothing is looked for
+STEEPNESS_DIFFERENCE = 1e-6  # of ln lambda_e, for the derivative of a, which only a tangent needs
 
 
 class TurnoverRates(NamedTuple):
@@ -508,25 +512,61 @@ class TurnoverRates(NamedTuple):
 
 
 class TurnoverRule(NamedTuple):
-    """How collagen is turned over: T, lambda_h and k."""
+    """How collagen is turned over: T, lambda_h, k, and one of `TURNOVER_RATES`."""
 
     time: float
     deposition_stretch: float
     gain: float
+    of: Callable[[TurnoverRule, Callable[[Any], Any], Any], TurnoverRates]
 
     def rates(self, tissue: Tissue, stretch: Any) -> TurnoverRates:
         """Where chains have a stretch lambda_e (n,); complex for a derivative by a complex step."""
         chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
+        return self.of(self, lambda some: chain.stiffness(some * r0, contour) * some, stretch)
 
-        def tension(some: Any) -> Any:
-            return chain.stiffness(some * r0, contour) * some
+    def rest(self, tissue: Tissue) -> tuple[float, float]:
+        """k a, which must be above 2 for a wall to come to rest, and the time in which it does so by a factor of e."""
+        # The time of a small change near rest: E T/(k a - 2), E = d ln(g - g0/lambda^2)/d ln lambda at lambda_h, where
+        # chains and repulsion act together. Of a tissue of numbers.
+        deposited: Any = self.deposition_stretch * (1.0 + 1j * COMPLEX_STEP)
+        chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+        assert chain is not None
+        secant = chain.stiffness(deposited * r0, contour)
+        both = secant - chain.stiffness(r0, contour) / deposited**2
+        power = 2 if self.of is by_stress else 1
+        steep, stiff = (float(np.log(some).imag) / COMPLEX_STEP for some in (secant * deposited**power, both))
+        return self.gain * steep, stiff * self.time / (self.gain * steep - 2)
 
-        relative = tension(stretch) / tension(self.deposition_stretch) - 1.0
-        limited = np.where(np.abs(np.real(relative)) < 1.0, relative, np.sign(np.real(relative)))
-        content = self.gain / self.time * limited
-        turned_over = 1.0 / self.time + np.where(np.real(content) > 0.0, content, 0.0)
-        return TurnoverRates(content, turned_over * (stretch / self.deposition_stretch - 1.0))
+
+def by_stress(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) -> TurnoverRates:
+    """Rates `cauchy`."""
+
+    def steepness(some: Any) -> Any:
+        return 1.0 + np.log(tension(some * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
+
+    present: Any = np.real(stretch)
+    steep, h = steepness(present), STEEPNESS_DIFFERENCE
+    if np.iscomplexobj(stretch):
+        slope = (steepness(present * (1 + h)) - steepness(present * (1 - h))) / (2 * h * present)
+        steep = steep + 1j * np.imag(stretch) * slope
+    relative = tension(stretch) * stretch / (tension(rule.deposition_stretch) * rule.deposition_stretch)
+    produced = 1.0 + rule.gain * (relative - 1.0)
+    produced = np.where(np.real(produced) > 0.0, produced, 0.0)
+    return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (steep * rule.time))
+
+
+def by_tension(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) -> TurnoverRates:
+    """Rates `tension`."""
+    relative = tension(stretch) / tension(rule.deposition_stretch) - 1.0
+    limited = np.where(np.abs(np.real(relative)) < 1.0, relative, np.sign(np.real(relative)))
+    content = rule.gain / rule.time * limited
+    turned_over = 1.0 / rule.time + np.where(np.real(content) > 0.0, content, 0.0)
+    return TurnoverRates(content, turned_over * (stretch / rule.deposition_stretch - 1.0))
+
+
+TURNOVER_RATES = {"cauchy": by_stress, "tension": by_tension}
+"""By the name that `remodeling.turnover.rates` has."""
 
 
 class TurnedOver(NamedTuple):
@@ -536,12 +576,6 @@ class TurnedOver(NamedTuple):
     natural_length: Array
     content_slope: Array
     natural_length_slope: Array
-
-
-def turnover_rates(tissue: Tissue, length: Array, time: float, deposition_stretch: float, gain: float) -> TurnoverRates:
-    """How fast content and natural length change where chains have a length."""
-    stretch = tissue.relative(length) / tissue.end_to_end_length
-    return TurnoverRule(time, deposition_stretch, gain).rates(tissue, stretch)
 
 
 def turned_over_at_the_end(rule: TurnoverRule, tissue: Tissue, length: Array, duration: float) -> TurnedOver:

@@ -298,6 +298,8 @@ class Scene(Table):
             return f"remodeling.coupling = {self.remodeling.coupling!r}"
         if not self.natural.is_of_the_mesh:
             return "[natural]"
+        if self.remodeling.turnover.grows:
+            return "remodeling.turnover.volume above 0"
         if not self.material.tells_volume_apart:
             return f"material.matrix = {self.material.matrix!r}"
         return "a body of one F" if KINEMATICS[choice(self).name].homogeneous else ""
@@ -395,7 +397,8 @@ class Scene(Table):
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
         end = self.last_time
         times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < end}
-        return sorted({*times, *self.output.times, end})
+        growth = {getattr(self.remodeling.turnover, "from")} - {0.0}
+        return sorted({*times, *growth, *self.output.times, end})
 
     @property
     def load_kinds(self) -> dict[str, LoadKind]:
@@ -513,7 +516,16 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
     if written > FORMAT:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
-    return {**_without_columns(values, COLUMNS_THAT_WENT), "format": FORMAT}
+    return {**_without_columns(_with_rates(values), COLUMNS_THAT_WENT), "format": FORMAT}
+
+
+def _with_rates(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Turnover as it was run by version 0.3.0, which wrote neither rates nor volume: by tension, without room."""
+    remodeling = values.get("remodeling")
+    turnover = remodeling.get("turnover") if isinstance(remodeling, Mapping) else None
+    if not isinstance(turnover, Mapping) or not turnover or "rates" in turnover:
+        return values
+    return {**values, "remodeling": {**remodeling, "turnover": {"rates": "tension", "volume": 0.0, **turnover}}}
 
 
 def _without_columns(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:

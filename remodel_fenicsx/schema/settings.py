@@ -35,7 +35,7 @@ from remodel_fenicsx.model.axes import AXES
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
-from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
+from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES, TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import IN_A_LIST, KeysOfParts, OneOf, Table, fault, named, quoted, refuse, shown
 from remodel_fenicsx.schema import is_multiple, same_time
@@ -615,6 +615,8 @@ def missing_for_steps_of_cells(scene: Scene) -> str | None:
         return "chains: material.chain_density above 0"
     if scene.cases[1:]:
         return "a scene without [[cases]]: it finds the cells for the stress of one load case"
+    if remodeling.turnover.grows:
+        return "remodeling.turnover.volume = 0: room is shared by the points of an element"
     if remodeling.has_set_point:
         return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
     parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
@@ -657,7 +659,16 @@ COUPLINGS = {
 """Couplings by the name that a scene gives them."""
 
 
-class Turnover(Table):
+_start: Any = {  # `from` is a word of Python
+    "from": (
+        float,
+        Field(default=0.0, ge=0, description="Time from which what is made takes room; a step ends there. 0: always."),
+    )
+}
+_WithStart: Any = create_model("_WithStart", __base__=Table, **_start)
+
+
+class Turnover(_WithStart):  # type: ignore[misc]
     """How collagen is removed, and deposited again under a stretch (docs/turnover.md). Without `time` it is not.
 
     For the law `tensor`.
@@ -668,7 +679,25 @@ class Turnover(Table):
     deposition_stretch: float = Field(default=1.1, gt=1)
     """Stretch lambda_h, over r0, under which new chains are deposited."""
     gain: float = Field(default=1.0, ge=0)
-    """Gain k: how fast the amount of collagen follows the tension of the chains. 0 means that the amount stays."""
+    """Gain k: how fast the amount of collagen follows the stress of the chains. 0 means that the amount stays."""
+    rates: Annotated[str, OneOf(TURNOVER_RATES)] = "cauchy"
+    """What amount and natural length follow. 'cauchy': the stress that a chain makes. 'tension': its force, as in
+    version 0.3.0."""
+    volume: float = Field(default=0.3, ge=0, le=1)
+    """Share phi of the wall that collagen is at the start, or at `from`: what is made takes room. 0: it does not."""
+    growth: Literal["normal"] = "normal"
+    """Where the room is made: across the wall."""
+
+    @property
+    def grows(self) -> bool:
+        """Whether what is made takes room."""
+        return self.is_on and self.volume > 0
+
+    @property
+    def rule(self) -> TurnoverRule:
+        """For arrays."""
+        assert self.time is not None
+        return TurnoverRule(self.time, self.deposition_stretch, self.gain, TURNOVER_RATES[self.rates])
 
     @property
     def is_on(self) -> bool:
@@ -677,7 +706,7 @@ class Turnover(Table):
 
     @model_validator(mode="after")
     def _says_its_time(self) -> Turnover:
-        if self.time is None and (self.deposition_stretch, self.gain) != (1.1, 1.0):
+        if self.time is None and self != Turnover.model_construct():
             raise fault("missing; turnover needs its time", "time", None)
         return self
 
@@ -797,6 +826,9 @@ class Remodeling(Table):
         if self.turnover.is_on and not coupling.takes_turnover:
             able = named(COUPLINGS, lambda kind: kind.takes_turnover)
             raise fault(f"with remodeling.turnover must be one of: {able}", "coupling", self.coupling)
+        if self.turnover.grows and coupling.solves_cells:
+            rule = f"must be 0 with remodeling.coupling = {self.coupling!r}: room is shared by the points of an element"
+            raise fault(rule, "turnover.volume", self.turnover.volume)
         if coupling.needs_a_target and law.target is None:
             rule = f"needs a remodeling.law with a target that can be extrapolated: {_laws_with_a_target()}"
             raise fault(rule, "coupling", self.coupling)
@@ -809,11 +841,29 @@ class Remodeling(Table):
             raise fault(f"needs {missing}", f"{key}.coupling", self.coupling)
         if self.mean != "tensor" and not scene.cases:
             raise fault("needs [[cases]]", f"{key}.mean", self.mean)
+        if self.turnover.grows:
+            self._check_growth(scene, f"{key}.turnover")
         if MEANS_OF_CASES[self.mean].of_targets and LAWS[self.law].target is None:
             raise fault(f"needs a remodeling.law with a target: {_laws_with_a_target()}", f"{key}.mean", self.mean)
         if scene.cases[1:] and not coupling.takes_cases:
             able = named(COUPLINGS, lambda kind: kind.takes_cases)
             raise fault(f"with [[cases]] must be one of: {able}", f"{key}.coupling", self.coupling)
+
+    def _check_growth(self, scene: Scene, key: str) -> None:
+        """What bodies grow, and when."""
+        if not scene.geometry.is_a("Walled"):
+            walled = scene.shapes_that(lambda kind: kind.is_a("Walled"))
+            rule = f"must be 0 unless geometry.shape is {walled.replace(', ', ' or ')}"
+            raise fault(rule, f"{key}.volume", self.turnover.volume)
+        if scene.formulation != "displacement":
+            raise fault("must be 0 unless mesh.formulation is 'displacement'", f"{key}.volume", self.turnover.volume)
+        start = getattr(self.turnover, "from")
+        if start and scene.time.is_equilibrium:
+            raise fault("must be 0 with time.end = 'equilibrium', which has no times", f"{key}.from", start)
+        if start and start >= scene.time.end:
+            raise fault(f"must be smaller than time.end = {shown(scene.time.end)}", f"{key}.from", start)
+        if start:
+            scene.time.check_hit(start, f"{key}.from")
 
 
 def _laws_with_a_target() -> str:
