@@ -284,7 +284,7 @@ class State:
         return self.elastic(F.reshape(*self.cells.quadrature.shape, 3, 3)).reshape(-1, 3, 3)
 
     def per_mesh_volume(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values per volume of tissue that is free of stress at the start, per volume of the mesh, (elements, points)."""
+        """Values per volume of the start's stress-free tissue as values per volume of the mesh, (elements, points)."""
         quadrature = self.cells.quadrature
         values = values.reshape(quadrature.shape)
         if self._natural is None:

@@ -18,3 +18,7 @@ def isotropic(preset: str | None = PAPER, kinematics: str = "radial", **tables: 
     values: dict[str, Any] = {"preset": preset, "geometry": {"shape": "tube"}, "model": {"kinematics": kinematics}}
     values |= {"cells": {"initial": "isotropic"}, "output": {"fields": False}, **tables}
     return {name: table for name, table in values.items() if table is not None}
+
+
+TENSION = {"rates": "tension", "volume": 0.0}
+"""Turnover as version 0.3.0 has it."""

@@ -241,9 +241,24 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
         ),
         Column(
+            "growth",
+            "",
+            "volume of the tissue free of stress over that at the start; mean over the volume at the start",
+            lambda m: float(m.quadrature.mean(m.observer.stepper.turnover.growth.ratio)),
+            by_case=False,
+        ),
+        Column(
+            "collagen_share",
+            "",
+            "share of the tissue's volume that is collagen, mean over the volume at the start",
+            lambda m: m.observer.stepper.turnover.collagen_share(),
+            by_case=False,
+        ),
+        Column(
             TURNOVER_POWER,
             "stress length^3 / time",
-            "power that turnover releases in the state of the row; for scenes with remodeling.turnover",
+            "power that turnover releases in the state of the row, at its F and without growth; for scenes with "
+            "remodeling.turnover",
             lambda m: m.observer.stepper.turnover.power(),
             by_case=False,
         ),

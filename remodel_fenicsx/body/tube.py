@@ -224,7 +224,9 @@ def _opening_angle(m: Any) -> float:
     squared = np.einsum("nia,nab,nib->ni", axes, structure, axes)  # around, along and across the wall
     radius = np.linalg.norm(local.coordinates.reshape(-1, 3)[:, :2], axis=1)
     points = m.observer.stepper.remodeling.parameters.at_points()
+    turnover = m.observer.stepper.turnover
     turned = [getattr(points, name) for name in TURNED_OVER]
+    turned += [turnover.growth.ratio.reshape(-1)] if turnover is not None and turnover.growth is not None else []
     squared = np.column_stack([squared, *(values for values in turned if values is not None)])
     parts = comm.allgather((radius, squared, m.quadrature.volumes.reshape(-1)))
     radius, squared, volumes = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -326,6 +328,12 @@ class Tube(RoundWall):
             "stress",
             "Cauchy stress around the wall, mean over the deformed thickness: by the law of Laplace p r_i / h",
             _mean_hoop_stress,
+        ),
+        Column(
+            "wall_thickness",
+            "length",
+            "mean distance of the deformed outer face from the axis, less that of the inner face",
+            lambda m: _mean_radius("outer")(m) - _mean_radius("inner")(m),
         ),
         *RoundWall.columns_on_request,
     )

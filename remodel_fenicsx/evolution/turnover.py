@@ -44,7 +44,8 @@ class Growth:
 
     def __init__(self, state: State, settings: Turnover):
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
-        kinematics, shape = state.kinematics, (3, 3)
+        kinematics: Any = state.kinematics
+        shape = (3, 3)
         self._gradient, self._initial = (
             self.quadrature.values(function, shape) for function in (kinematics.gradient, kinematics.initial)
         )
@@ -61,9 +62,10 @@ class Growth:
         """J_g, by what the volume has grown, (elements, points)."""
         return np.asarray(np.linalg.det(self._initial) / np.linalg.det(self._gradient))
 
-    def share(self, content: Array) -> Array:
-        """Of the present volume that is collagen, (elements, points); content likewise."""
-        return self.settings.volume * content / self._reference / self.ratio
+    @property
+    def taken(self) -> Array:
+        """m_ref J_g, the content over which the volume is that of the start, (elements, points)."""
+        return self._reference * self.ratio
 
     def follow(self, content: Array) -> None:
         """J_g = 1 + phi (m/m_ref - 1) of the content (elements, points), and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
@@ -184,8 +186,7 @@ class TurnoverPass:
         """In one load case."""
         cells = state.cells if present else state.equilibrium_cells
         squared = cells.kernels.squared_length(state.elastic_gradient(), cells.point_cells)
-        tissue = self._parameters.at_points()
-        return self.settings.rule.rates(tissue, tissue.relative(np.sqrt(squared)) / tissue.end_to_end_length)
+        return self.settings.rule.at_length(self._parameters.at_points(), np.sqrt(squared))
 
     def power(self) -> float:
         """Stored energy per time that turnover releases in the solved state, at its F and cells."""
@@ -196,6 +197,12 @@ class TurnoverPass:
     def mean(self, name: str) -> float:
         """Volume mean of `content` or `natural_length`."""
         return float(self.quadrature.mean(self._values(name)))
+
+    def collagen_share(self) -> float:
+        """Volume mean of phi m/(m_ref J_g), where tissue grows."""
+        growth = self.growth
+        assert growth is not None
+        return float(self.quadrature.mean(growth.settings.volume * self._values("content") / growth.taken))
 
     def _values(self, name: str) -> Array:
         return self.quadrature.values(getattr(self.tissue, name), ())

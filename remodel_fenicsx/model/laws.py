@@ -525,6 +525,10 @@ class TurnoverRule(NamedTuple):
         assert chain is not None
         return self.of(self, lambda some: chain.stiffness(some * r0, contour) * some, stretch)
 
+    def at_length(self, tissue: Tissue, length: Array) -> TurnoverRates:
+        """Where chains have a length."""
+        return self.rates(tissue, tissue.relative(length) / tissue.end_to_end_length)
+
     def rest(self, tissue: Tissue) -> tuple[float, float]:
         """k a, which must be above 2 for a wall to come to rest, and the time in which it does so by a factor of e."""
         # The time of a small change near rest: E T/(k a - 2), E = d ln(g - g0/lambda^2)/d ln lambda at lambda_h, where

@@ -185,7 +185,7 @@ def _balanced(near: Closing, loads: Loads) -> Closing:
 
 
 def _stiffness(tissues: Sequence[Tissue]) -> float:
-    return max(tissue.lame_lambda + 2 * tissue.lame_mu for tissue in tissues)
+    return max(float(np.max(tissue.lame_lambda + 2 * tissue.lame_mu)) for tissue in tissues)
 
 
 def _through(
@@ -268,6 +268,7 @@ def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | Non
 #     F = diag(k rho/R, e, drho/dR),    F_e = F G,
 # without pressure, axial force and bending moment; its opening angle is 360 (1 - k). The cells stay.
 
+MODULI = ("lame_lambda", "lame_mu", "network_modulus")
 CUT_DEGREE = 32  # of rho(R): angles of remodeled walls, whose cells have a front, change by less than 0.1 degrees to 48
 
 
@@ -280,7 +281,7 @@ class Cut(NamedTuple):
 
 
 def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_dimensions: Array) -> Cut:
-    """Cut an unloaded tube: squared dimensions of its cells, and what turnover changes, at radii."""
+    """Cut an unloaded tube: squared dimensions of its cells, and m, rho and J_g of turnover, at radii."""
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], CUT_DEGREE)
     squared = np.empty((*panels.places.shape, squared_dimensions.shape[1]))
     panel = panels.of(radius)
@@ -297,6 +298,10 @@ def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_
     tissues = []
     for number, layer in enumerate(layers):
         changes: dict[str, Any] = dict(zip(TURNED_OVER, turned[:, number], strict=False))  # none without turnover
+        if len(turned) > len(TURNED_OVER):  # what has grown across is longer there, and as much as before in all
+            growth = turned[-1, number]
+            natural[number, :, 2] /= growth
+            changes |= {key: getattr(layer.tissue, key) / growth for key in MODULI}
         tissues.append(replace(layer.tissue, **changes))
 
     def opened(values: Array) -> tuple[Array, Array]:

@@ -138,6 +138,7 @@ FORMAT = 2  # of recorded scenes: raised where a reader of the one before would 
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
 COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
+SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
 FORGOTTEN_AFTER = (
     1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
 )
@@ -445,7 +446,7 @@ class Scene(Table):
             for case in self.each_case():
                 lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
                 found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
-        return [*found, *self.turned_away(), *self._too_long_for_turnover(), *self.remodeling.warnings()]
+        return [*found, *self.turned_away(), *self._of_turnover(), *self.remodeling.warnings()]
 
     def turned_away(self) -> list[str]:
         """Whether rows leave the loaded shape that is given, for its cells turn; with the way out."""
@@ -463,16 +464,29 @@ class Scene(Table):
             f"loads rise and afterwards, so rows have another one; {way}"
         ]
 
-    def _too_long_for_turnover(self) -> list[str]:
-        """Explicit steps of turnover that are longer than its time: content then swings about its rest."""
-        turnover, step = self.remodeling.turnover, self.time.step
+    def _of_turnover(self) -> list[str]:
+        """Gains that do not rest, or slowly; explicit steps longer than its time, in which content overshoots."""
+        turnover, step, found = self.remodeling.turnover, self.time.step, dict[str, None]()
+        if not turnover.is_on:
+            return []
+        for name, properties in self.properties().items():
+            power, slowly = turnover.rule.rest(properties.tissue)
+            says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
+            least = 2 * turnover.gain / power if turnover.gain else math.inf
+            if power <= 2:
+                found[
+                    f"{says}: does not come to rest with this deposition_stretch; rest needs more than {least:.3g}"
+                ] = None
+            elif power < SLOW_REST:
+                found[f"{says}: comes to rest slowly, by a factor of e in a time of {slowly:.3g}"] = None
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
         if chosen or COUPLINGS[self.remodeling.coupling].solves_cells or step <= (turnover.time or math.inf):
-            return []
+            return [*found]
         return [
+            *found,
             f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
             "length overshoot in each step; set a shorter time.step, time.tolerance, or remodeling.coupling = "
-            "'implicit'"
+            "'implicit'",
         ]
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:
@@ -521,7 +535,7 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _with_rates(values: Mapping[str, Any]) -> Mapping[str, Any]:
     """Turnover as it was run by version 0.3.0, which wrote neither rates nor volume: by tension, without room."""
-    remodeling = values.get("remodeling")
+    remodeling: Any = values.get("remodeling")
     turnover = remodeling.get("turnover") if isinstance(remodeling, Mapping) else None
     if not isinstance(turnover, Mapping) or not turnover or "rates" in turnover:
         return values

@@ -1311,6 +1311,7 @@ FIELDS_BY_NAME = (
 """What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
 REGION = "region"  # the field of bodies with regions
 TURNOVER_POWER = "turnover_power"  # the column of bodies with turnover, beside means of what is turned over
+GROWTH_COLUMNS = ("growth", "collagen_share")  # of bodies whose volume changes with turnover
 UNLOADED = "fibre_angle_unloaded"  # the field of bodies whose tissue is free of stress in another configuration
 CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")
 """What it may name beside: local axes of the elements, their depth and station, which do not change."""
@@ -1376,6 +1377,8 @@ class Output(Table):
             raise fault(f"{name!r} is for bodies of one tissue; the scene has regions", key, name)
         if name in (*TURNED_OVER, TURNOVER_POWER) and not scene.remodeling.turnover.is_on:
             raise fault(f"{name!r} changes only with remodeling.turnover, which is not set", key, name)
+        if name in GROWTH_COLUMNS and not scene.remodeling.turnover.grows:
+            raise fault(f"{name!r} needs remodeling.turnover with a volume above 0", key, name)
         if name not in known:
             names = ", ".join(map(repr, known))
             raise fault(f"no such column on request; allowed for shape {shape.name!r} are {names}", key, name)

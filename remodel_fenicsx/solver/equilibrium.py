@@ -111,8 +111,9 @@ class PointStresses:
         self.ufl: Stresses = state.dilatation.stresses(tissue, F, [state.cells.ufl_cell])
         if self._repulsion is not None:
             self.ufl = self.ufl.plus(F, self._repulsion.stress)
-        if state.kinematics.grows:  # amounts belong to the volume of the start, stresses to the present one
-            self.ufl = Stresses(*(stress / state.kinematics.volume_ratio() for stress in self.ufl))
+        kinematics: Any = state.kinematics
+        if kinematics.grows:  # amounts belong to the volume of the start, stresses to the present one
+            self.ufl = Stresses(*(stress / kinematics.volume_ratio() for stress in self.ufl))
 
     def refresh(self) -> None:
         """Take what the expressions need beside F from the present unknowns and cells."""

@@ -22,9 +22,9 @@ from remodel_fenicsx.studies.fit import fit
 from remodel_fenicsx.studies.stability import stability
 from tests.reference.radial import CIRCUMFERENTIAL, RadialMaterial, Tube, cauchy_stress, structure
 from tests.runs import goes_on, made, rows_of, simulated
-from tests.values import ANGLES, ramped, isotropic
+from tests.values import ANGLES, TENSION, ramped, isotropic
 
-TURNOVER = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
+TURNOVER = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0} | TENSION
 GROWING = [{"law": "tensor", "coupling": coupling, "turnover": TURNOVER} for coupling in ("staggered", "extrapolated")]
 LAWS = [("tensor", "extrapolated"), ("tensor", "relaxed"), ("explicit", "staggered")]
 HALVES = [{"weight": 0.5}, {"weight": 0.5}]

@@ -14,13 +14,13 @@ from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.model import residual_stress as closing
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.laws import turnover_rates
+from remodel_fenicsx.model.laws import TurnoverRule, by_tension
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
 from tests.runs import goes_on, last_row, made, taylor_orders
-from tests.values import ANGLES, ramped, isotropic
+from tests.values import ANGLES, TENSION, ramped, isotropic
 
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLUMNS = ["content", "natural_length"]
@@ -32,7 +32,7 @@ def wall(end: float, step: float, turnover: dict[str, float] | None, columns: li
         "consistent",
         geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0},
         mesh={"refinement": 2, "degree": 2},
-        remodeling=({"turnover": turnover} if turnover else {}) | changes,
+        remodeling=({"turnover": TENSION | turnover} if turnover else {}) | changes,
         loads=ramped(24.0, pressure=1.2, elongation=0.1),
         time={"end": end, "step": step},
         output={"fields": False, "columns": [*ANGLES, "outer_radius", "stored_energy", *columns]},
@@ -229,7 +229,7 @@ def test_rates_against_their_equation() -> None:
     chain, r0, contour, time = CHAINS["wormlike"], 1.0, 1.594, 40.0
     tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(4), natural_length=np.array([1.0, 1.3, 1.3, 1.0]))
     stretches = np.array([1.1, 1.15, 0.9, 1.4])
-    found = turnover_rates(tissue, stretches * tissue.natural_length, time, 1.1, 1.0)
+    found = TurnoverRule(time, 1.1, 1.0, by_tension).at_length(tissue, stretches * tissue.natural_length)
     tension = stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
     assert found.content == pytest.approx(np.clip(tension - 1, -1, 1) / time, abs=1e-15)
     growth = (1 / time + np.maximum(found.content, 0)) * (stretches / 1.1 - 1)

@@ -20,11 +20,11 @@ from tests.conftest import Cases
 from tests.evolution.test_load_cases import CUBE
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import simulated
-from tests.values import ramped, isotropic
+from tests.values import TENSION, ramped, isotropic
 
 SELF = MPI.COMM_SELF
 TURNED = ["content", "natural_length"]
-TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0}
+TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0} | TENSION
 WALL = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0}
 
 

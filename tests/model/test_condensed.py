@@ -16,7 +16,7 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import REPULSIONS, Tissue
 from remodel_fenicsx.model import implicit
-from remodel_fenicsx.model.laws import LAWS, Drive, TurnoverRule, turned_over_at_the_end, turnover_rates
+from remodel_fenicsx.model.laws import LAWS, Drive, TURNOVER_RATES, TurnoverRule, turned_over_at_the_end
 
 Array = NDArray[np.float64]
 
@@ -260,7 +260,7 @@ def test_a_long_step_is_followed_where_newtons_method_does_not_find_its_end() ->
 
 
 # ---------------------------------------------------------------- turnover
-RULE = TurnoverRule(40.0, 1.1, 1.0)
+RULE = TurnoverRule(40.0, 1.1, 1.0, TURNOVER_RATES["tension"])
 
 
 def turning_over(repulsion: str, driver: str, duration: float) -> implicit.CondensedPoints:
@@ -298,7 +298,7 @@ def test_content_and_natural_length_belong_to_the_end_of_the_step() -> None:
     C, tissue = np.swapaxes(F, 1, 2) @ F, some.tissue
     r = np.sqrt(np.einsum("nij,nij->n", found.structure, C))
     end = replace(tissue, content=m, natural_length=rho)
-    content, length = turnover_rates(end, r, *RULE)
+    content, length = RULE.at_length(end, r)
     np.testing.assert_allclose(np.log(m / tissue.content), 4.0 * content, atol=1e-12)
     np.testing.assert_allclose(np.log(rho / tissue.natural_length), 4.0 * length, atol=1e-12)
     assert np.ptp(content) > 0.02  # some fall, some grow as fast as they can
