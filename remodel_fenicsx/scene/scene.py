@@ -478,7 +478,8 @@ class Scene(Table):
                     f"{says}: does not come to rest with this deposition_stretch; rest needs more than {least:.3g}"
                 ] = None
             elif power < SLOW_REST:
-                found[f"{says}: comes to rest slowly, by a factor of e in a time of {slowly:.3g}"] = None
+                words = "by a factor of e where collagen alone bears the loads, and sooner with a matrix"
+                found[f"{says}: comes to rest slowly, in a time of {slowly:.3g} {words}"] = None
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
         if chosen or COUPLINGS[self.remodeling.coupling].solves_cells or step <= (turnover.time or math.inf):
             return [*found]

@@ -860,8 +860,8 @@ class Remodeling(Table):
         start = getattr(self.turnover, "from")
         if start and scene.time.is_equilibrium:
             raise fault("must be 0 with time.end = 'equilibrium', which has no times", f"{key}.from", start)
-        if start and start >= scene.time.end:
-            raise fault(f"must be smaller than time.end = {shown(scene.time.end)}", f"{key}.from", start)
+        if start and start > scene.time.end:
+            raise fault(f"must be at most time.end = {shown(scene.time.end)}", f"{key}.from", start)
         if start:
             scene.time.check_hit(start, f"{key}.from")
 

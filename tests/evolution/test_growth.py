@@ -1,0 +1,241 @@
+"""remodeling.turnover.volume: what is made takes room; figures of an independent program on one radius."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from remodel_fenicsx import Recording, cli
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.running import run
+from remodel_fenicsx.scene import Scene, scene_from_dict
+from remodel_fenicsx.solver.continuation import StepFailure
+from tests.mesh_files import LENGTH, RADII, write_tube
+from tests.runs import goes_on, last_row, made, rows_of, simulated
+from tests.values import ANGLES, isotropic, ramped
+
+SELF = MPI.COMM_SELF
+GROWN = ["content", "natural_length", "growth", "collagen_share", "wall_thickness", "mean_hoop_stress"]
+PLACES = [f"hoop_stress_{place}" for place in ("inner", "middle", "outer")]
+THICK = {"geometry": {"outer_radius": 3.0}, "loads": ramped(24.0, pressure=4.8, elongation=0.1)}
+
+
+def wall(volume: float, end: float | str = 1440.0, tolerance: float | None = 1.0, **tables: Any) -> Scene:
+    """A tube of 1 to 1.3 under a pressure of 1.2 and an elongation of 10 %, with the rates `cauchy`."""
+    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0, "volume": volume} | tables.pop("turnover", {})
+    values = isotropic(
+        "consistent",
+        geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0}
+        | tables.pop("geometry", {}),
+        remodeling={"turnover": turnover} | tables.pop("remodeling", {}),
+        time={"end": end} | ({} if end == "equilibrium" else {"step": 4.0, "tolerance": tolerance}),
+        output={"fields": False, "report": False},
+    )
+    scene = scene_from_dict(values | {"mesh": {"refinement": 2, "degree": 2}, "loads": raised(1.0)} | tables)
+    columns = [*ANGLES, "inner_radius", "outer_radius", *PLACES, *GROWN]
+    kept = [name for name in columns if volume or name not in ("growth", "collagen_share")]
+    return scene.with_values({"output.columns": kept})
+
+
+def raised(factor: float, at: float = 1600.0) -> Any:
+    """The loads, and a pressure that rises by a factor when the wall rests."""
+    loads = ramped(24.0, pressure=1.2, elongation=0.1)
+    loads["pressure"]["ramp"] += [] if factor == 1.0 else [[at, 1.0], [at + 24.0, factor]]
+    return loads
+
+
+@pytest.mark.parametrize(
+    ("volume", "turnover", "tables", "end", "expected"),
+    [
+        (0.0, {}, {}, 1440.0, (1.3885, 0.2170, 7.68, 2.647, 1.174)),
+        (0.3, {}, {}, 1440.0, (1.3315, 0.3203, 4.99, 2.624, 1.176)),
+        (1.0, {}, {}, 1440.0, (1.2365, 0.5589, 2.66, 2.673, 1.179)),
+        (0.3, {"gain": 2.0}, {}, 1440.0, (1.2390, 0.3333, 4.46, 2.554, 1.109)),
+        (0.5, {"deposition_stretch": 1.15}, {}, 1440.0, (1.2457, 0.2833, 5.28, 1.454, 1.048)),
+        (0.3, {}, THICK, 2400.0, (1.3878, 1.9024, 3.50, 1.849, 1.087)),
+        (0.3, {}, {"loads": raised(1.5)}, 4000.0, (1.5190, 0.4547, 6.01, 6.122, 1.378)),
+        (0.3, {"from": 1600.0}, {"loads": raised(1.5)}, 4000.0, (1.6128, 0.2580, 11.25, 6.075, 1.370)),
+    ],
+    ids=["none", "0.3", "1", "gain 2", "stretch 1.15", "thick", "pressure x 1.5", "from rest"],
+)
+def test_walls_rest_where_an_independent_program_says(
+    volume: float, turnover: Any, tables: Any, end: float, expected: tuple[float, ...]
+) -> None:
+    """Radius, thickness, mean hoop stress, content and natural length."""
+    row = last_row(wall(volume, end, turnover=turnover, **tables))
+    names = ("inner_radius", "wall_thickness", "mean_hoop_stress", "content", "natural_length")
+    for name, value, tolerance in zip(names, expected, (0.005, 0.01, 0.01, 0.01, 0.01), strict=True):
+        assert row[name] == pytest.approx(value, rel=tolerance), name
+
+
+def test_stress_angles_and_a_cut_of_a_wall_at_rest(caplog: pytest.LogCaptureFixture) -> None:
+    """Growth makes the hoop stress uniform; the rest that is asked for at once is that of the way."""
+    scene = wall(0.3, "equilibrium")
+    row = last_row(scene.with_values({"output.columns": [*scene.output.columns, "opening_angle"]}))
+    assert [row[name] for name in PLACES] == pytest.approx([4.9, 5.0, 5.0], abs=0.1)
+    assert [row[name] for name in ANGLES] == pytest.approx([3.0, 10.4, 16.1], abs=0.5)
+    assert row["opening_angle"] == pytest.approx(127.6, abs=2.0)
+    assert row["growth"] == pytest.approx(1 + 0.3 * (row["content"] - 1), rel=1e-3)
+    assert row["collagen_share"] == pytest.approx(0.53, abs=0.01)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
+def membrane(volume: float, gain: float, factor: float = 1.0, end: float = 3600.0) -> Scene:
+    """A thin wall that collagen alone bears."""
+    loads = raised(factor)
+    loads["pressure"]["value"] = 0.04
+    bulk = {"lame_lambda": 100.0, "lame_mu": 0.01}
+    thin: Any = {"geometry": {"outer_radius": 1.01}, "turnover": {"gain": gain}, "material": bulk, "loads": loads}
+    return wall(volume, end, None, **thin)
+
+
+@pytest.mark.parametrize("gain", [1.0, 2.0])
+def test_a_membrane_that_is_all_collagen_keeps_its_hoop_stress(gain: float) -> None:
+    """m/rho^2 follows the pressure, the radius rho, and the thickness m: the closed limits of a thin wall."""
+    rows = rows_of(membrane(1.0, gain, 1.5))
+    before = next(row for row in rows if row["time"] >= 1600.0)
+    factor = {name: rows[-1][name] / before[name] for name in (*GROWN, "inner_radius")}
+    assert factor["content"] / factor["natural_length"] ** 2 == pytest.approx(1.5, rel=0.01)
+    assert factor["inner_radius"] == pytest.approx(factor["natural_length"], rel=0.01)
+    assert factor["mean_hoop_stress"] == pytest.approx(1.0, rel=0.01)
+
+
+def test_the_wall_is_as_large_as_its_tissue() -> None:
+    """Volume between the deformed faces: the integral of J_e J_g."""
+    with simulated(wall(0.5, 400.0)) as (simulation, rows):
+        F, quadrature = simulation.state.elastic_gradient(), simulation.quadrature
+        growth = simulation.stepper.turnover.growth.ratio
+        volume = quadrature.integral(np.linalg.det(F).reshape(growth.shape) * growth)
+    inner, outer = rows[-1]["inner_radius"], rows[-1]["outer_radius"]
+    assert volume == pytest.approx(np.pi * (outer**2 - inner**2) * 2.0 * 1.1, rel=1e-6)
+    assert np.mean(growth) > 1.2
+
+
+def test_growth_does_not_alternate_from_point_to_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As much of it as the strain of an element can follow: with all of it J_e swings within every element."""
+
+    def swing() -> float:
+        stiff = {"material": {"lame_lambda": 300.0}, "mesh": {"degree": 2, "formulation": "displacement"}}
+        with simulated(wall(0.5, 400.0, **stiff)) as (simulation, _):
+            J = np.linalg.det(simulation.state.elastic_gradient()).reshape(-1, 3)
+        return float(np.abs(J[:, 0] - 2 * J[:, 1] + J[:, 2]).max() / np.ptp(J.mean(axis=1)))
+
+    projected = swing()
+    monkeypatch.setattr(Quadrature, "beyond", lambda self, degree, values: np.zeros_like(values))
+    assert swing() > 3 * projected
+
+
+# ---------------------------------------------------------------- bodies
+SHORT: Any = {"turnover": {"time": 10.0}, "loads": ramped(8.0, pressure=1.2, elongation=0.1)}
+
+
+def test_kinematics_agree() -> None:
+    """One radius, a half-plane, a piece of the ring in three dimensions."""
+    rows = [
+        last_row(wall(0.5, 12.0, None, **SHORT, model={"kinematics": name}, mesh={"degree": 2}))
+        for name in ("radial", "axisymmetric", "sector")
+    ]
+    assert rows[0]["growth"] > 1.1
+    for row in rows[1:]:
+        for name in ("inner_radius", *GROWN):
+            assert row[name] == pytest.approx(rows[0][name], rel=1e-4), name
+
+
+def test_whole_tubes_and_their_files_agree(tmp_path: Path) -> None:
+    """Linear elements; the file's wall grows along the radial axis that is found in it."""
+    loads = ramped(8.0, pressure=4.0, elongation=0.1)
+    tables: Any = SHORT | {
+        "loads": loads,
+        "mesh": {"degree": 1},
+        "model": {"kinematics": "full"},
+        "solver": {"method": "direct"},
+    }
+    tables["geometry"] = {"inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
+    names = ["growth", "content", "collagen_share"]
+    whole = last_row(wall(0.5, 12.0, None, **tables).with_values({"output.columns": names}))
+    body = {"shape": "mesh", "file": str(write_tube(tmp_path / "tube.msh"))}
+    plain: Any = {"preset": None, "material": {"repulsion": "log"}, "output": {"columns": names, "fields": False}}
+    one = isotropic("consistent", kinematics="full", mesh={"degree": 1}, loads=loads, time={"end": 12.0, "step": 4.0})
+    turnover = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0, "volume": 0.5}
+    file = last_row(scene_from_dict(one | plain | {"geometry": body, "remodeling": {"turnover": turnover}}))
+    assert whole["growth"] > 1.1
+    for name in names:
+        assert file[name] == pytest.approx(whole[name], rel=0.1), name
+
+
+def test_a_run_goes_on_across_the_start_of_growth(tmp_path: Path) -> None:
+    """Before `from` the volume stays."""
+    scene = wall(0.5, 40.0, None, turnover={"time": 10.0, "from": 16.0}, loads=SHORT["loads"])
+    history = goes_on(scene, tmp_path, 16.0, 20.0).history
+    early = history["time"] <= 16.0
+    np.testing.assert_allclose(history["growth"][early], 1.0, rtol=1e-14)
+    np.testing.assert_allclose(history["collagen_share"][early], 0.5, rtol=1e-14)
+    assert history["growth"][-1] > 1.05 and history["content"][early][-1] > 1.05
+
+
+def test_load_cases_grow_alike() -> None:
+    """Two cases of the same loads are one."""
+    values: Any = {"mesh": {"degree": 2}, "loads": SHORT["loads"], "turnover": {"time": 10.0}}
+    plain = last_row(wall(0.5, 12.0, None, **values))
+    cases = [{"weight": 0.5, "loads": {"pressure": 1.0}}, {"weight": 0.5, "loads": {"pressure": 1.0}}]
+    twice = last_row(wall(0.5, 12.0, None, **values, cases=cases))
+    for name in ("inner_radius", *GROWN):
+        assert twice[name] == pytest.approx(plain[name], rel=1e-8), name
+
+
+def test_a_folder_of_an_earlier_version_goes_on_as_it_was(tmp_path: Path) -> None:
+    """Its scene as run has turnover without rates and volume: those of tension, which takes no room."""
+    scene = wall(0.0, 8.0, None, turnover={"rates": "tension", "time": 10.0}, loads=SHORT["loads"])
+    folder = run(scene, tmp_path / "run", SELF)
+    text = (folder / "scene.toml").read_text()
+    lines = [line for line in text.splitlines() if not line.startswith(("rates =", "volume =", "from =", "growth ="))]
+    assert len(lines) < len(text.splitlines())
+    (folder / "scene.toml").write_text("\n".join(lines) + "\n")
+    turnover = Recording(folder).scene.remodeling.turnover
+    assert (turnover.rates, turnover.volume) == ("tension", 0.0)
+
+
+# ---------------------------------------------------------------- what is said
+def test_tissue_that_is_lost_is_refused() -> None:
+    """All of a wall is collagen, which goes where nothing pulls."""
+    slack = {"turnover": {"time": 1.0, "deposition_stretch": 1.3}, "loads": ramped(4.0, pressure=0.01, elongation=0.0)}
+    with pytest.raises(StepFailure, match="less than 5 % of the tissue's volume is left"):
+        rows_of(wall(1.0, 200.0, None, **slack))
+
+
+@pytest.mark.parametrize(
+    ("turnover", "says"),
+    [
+        ({"gain": 0.35}, "gain = 0.35: does not come to rest with this deposition_stretch; rest needs more than 0.397"),
+        ({"gain": 0.45}, "gain = 0.45: comes to rest slowly"),
+        ({"gain": 0.45, "rates": "tension"}, "rest needs more than 0.496"),
+        ({"gain": 0.45, "deposition_stretch": 1.2}, "comes to rest slowly"),
+        ({"gain": 1.0}, ""),
+    ],
+)
+def test_validate_says_which_gains_rest(
+    turnover: Any, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """2/a, closed, for both kinds of rates."""
+    (tmp_path / "scene.toml").write_text(wall(0.3, turnover=turnover).to_toml())
+    assert cli.main(["validate", str(tmp_path / "scene.toml")]) == 0
+    printed = capsys.readouterr()
+    found = [line for line in (printed.out + printed.err).splitlines() if "come" in line and "rest" in line]
+    assert says in found[0] if says else not found
+
+
+def test_the_time_to_rest_is_that_of_the_formula() -> None:
+    """E T/(k a - 2) for a membrane without a matrix, from the fall of its rates; a matrix makes it rest sooner."""
+    for gain in (1.0, 2.0):
+        rates: list[float] = []
+        with made(membrane(0.0, gain, end=700.0)) as simulation:
+            turnover = simulation.stepper.turnover
+            for step in simulation.steps():
+                rates += [np.abs(turnover.rates()).max()] if step.time in (600.0, 700.0) else []
+            tissue = simulation.stepper.remodeling.parameters.largest()
+        _, slowly = turnover.settings.rule.rest(tissue)
+        assert 100.0 / np.log(rates[0] / rates[1]) == pytest.approx(slowly, rel=0.03), gain
