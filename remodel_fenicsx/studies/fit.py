@@ -30,10 +30,9 @@ from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
 from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.tables import Table, fault, shown
-from remodel_fenicsx.schema.toml import read_toml
+from remodel_fenicsx.schema.text import TableFileError, read_columns, read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
 from remodel_fenicsx.simulation import Simulation, begin_again, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
