@@ -39,7 +39,7 @@ from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation, in_region
 from remodel_fenicsx.schema.tables import shown
-from remodel_fenicsx.schema.toml import read_toml
+from remodel_fenicsx.schema.text import read_toml
 from remodel_fenicsx.simulation import Simulation, checked_domain, mesh_of, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import interrupts

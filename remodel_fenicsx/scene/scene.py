@@ -63,7 +63,7 @@ from remodel_fenicsx.schema.tables import (
     quoted,
     shown,
 )
-from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
+from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
 
 

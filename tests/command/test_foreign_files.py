@@ -32,7 +32,7 @@ from remodel_fenicsx.results.run_folder import choose_folder
 from remodel_fenicsx.results.vtkhdf import check_file
 from remodel_fenicsx.running import resume, run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
-from remodel_fenicsx.schema.toml import LARGEST, MOST_PARTS
+from remodel_fenicsx.schema.text import LARGEST, MOST_PARTS
 from remodel_fenicsx.studies.study import Run
 from tests.command.test_run import demo, refusal_of, run
 from tests.conftest import slowly
