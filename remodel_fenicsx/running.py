@@ -259,13 +259,14 @@ def _record(
             log.info("%d unknowns: one rank is faster than %d (docs/speed.md, Ranks)", unknowns, comm.size)
         for warning in simulation.scene.warnings():  # the one whose files have places
             log.warning("%s", warning)
-        followers = list(watchers)
+        followers, kept = list(watchers), [record.flush]
         if scene.output.fields:
             names = field_names(scene.output.fields, scene.lacking_fields, scene.geometry.constant_fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
-            followers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))
-        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
+            fields = stack.enter_context(agreed(comm, lambda: Fields(*parts, times)))
+            followers, kept = [*followers, fields], [*kept, fields.publish]
+        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, kept)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
         followers += [record, _Report(scene, progress), checkpoints, pause]
         leave_report = partial(_leave_report, place) if wants_report else lambda: None

@@ -68,8 +68,7 @@ def read_regular(path: Path, most: int) -> bytes:
 
 def check_regular(path: Path) -> None:
     """Raise ForeignFileError if what stands there is no regular file, nor a link to one: opening it might wait."""
-    if path.exists() and not path.is_file():
-        raise ForeignFileError(errno.EINVAL, NO_FILE, str(path))
+    os.close(_regular(path, os.O_RDONLY)[0])
 
 
 def open_own(path: Path, flags: int) -> int:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx import Recording, RecordingError, cli, preset_scene, run as run_scene
-from remodel_fenicsx.results.recording import RunLock
+from remodel_fenicsx import cli, preset_scene, run as run_scene
 from remodel_fenicsx.system.files import write_new
 from remodel_fenicsx.system.files import temporary_folder
 
@@ -85,21 +82,3 @@ def test_the_temporary_folder_of_a_killed_process_goes(tmp_path: Path, monkeypat
     finally:
         alive.kill()
         alive.wait()
-
-
-@pytest.mark.parametrize("name", ["history.csv", "fields.vtkhdf"])
-def test_a_recording_waits_for_the_step_that_is_being_written(name: str, quarter: Path, tmp_path: Path) -> None:
-    """Where a run is at work; what is damaged for good is refused."""
-    folder = shutil.copytree(quarter, tmp_path / "run")
-    whole = (folder / name).read_bytes()
-    (folder / name).write_bytes(whole[: len(whole) // 2 - 1])
-    with RunLock(folder):
-        (folder / "whole").write_bytes(whole)
-        timer = threading.Timer(0.2, lambda: (folder / "whole").replace(folder / name))
-        timer.start()
-        found = Recording(folder)
-        assert (found.times if name == "fields.vtkhdf" else found.history["time"]).tolist() == [0.0, 1.0]
-        timer.join()
-    (folder / name).write_bytes(whole[: len(whole) // 2 - 1])
-    with pytest.raises(RecordingError):
-        _ = Recording(folder).times, Recording(folder).history
