@@ -870,7 +870,7 @@ class Fit(Answer):
     def _cards(self) -> list[Card]:
         """All that was found, for a page like a run's report: it has title and verdict as text."""
         with rc_context(STYLE):
-            self.figure().savefig(plain := io.BytesIO(), dpi=DOTS_PER_INCH["png"])
+            self.figure().savefig(plain := io.BytesIO(), dpi=DOTS_PER_INCH)
         picture = base64.b64encode(plain.getvalue()).decode("ascii")
         image = f'<img alt="measured and fitted" width="100%" src="data:image/png;base64,{picture}">'
         note = f'<p class="note">{escape(self.verdict())}</p>'
