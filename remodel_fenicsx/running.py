@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ from remodel_fenicsx.simulation import Simulation, checked_domain, mesh_of, with
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
-from remodel_fenicsx.system.files import TakenError, part_of, read_regular, temporary_folder
+from remodel_fenicsx.system.files import TakenError, part_of, read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 from remodel_fenicsx.unloading import as_unloaded, unloaded
@@ -363,8 +364,8 @@ def write_unloaded(scene: Scene, folder: Path) -> str:
     """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found."""
     if folder.exists():
         raise TakenError(folder, "folder")
-    with temporary_folder() as temporary:
-        found = unloaded(scene, MPI.COMM_SELF, temporary, quiet=False)
+    with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
+        found = unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False)
         kept, files = with_files_kept(found)
         part = part_of(folder)
         shutil.rmtree(part, ignore_errors=True)  # of one that was killed

@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -48,7 +49,7 @@ from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lin
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.system.children import environment_of_child, last_line
-from remodel_fenicsx.system.files import TakenError, temporary_folder, write_new
+from remodel_fenicsx.system.files import TakenError, write_new
 
 if TYPE_CHECKING:
     import pyvista
@@ -229,7 +230,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Panels:
+class PictureSheet:
     """Bodies beside each other, each with what stands above and below it; what stands below all of them."""
 
     grids: Sequence[pyvista.UnstructuredGrid]
@@ -240,10 +241,10 @@ class Panels:
     notes: str
 
 
-def render(sheets: Sequence[Panels], view: View) -> list[Pixels]:
+def render(sheets: Sequence[PictureSheet], view: View) -> list[Pixels]:
     """Draw sheets off-screen, each (rows, columns, 3)."""
-    with temporary_folder() as folder:
-        job = folder / "job"
+    with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
+        job = Path(folder) / "job"
         job.write_bytes(pickle.dumps((list(sheets), view)))
         command = [sys.executable, "-m", __name__, str(job)]
         if shutil.which("xvfb-run"):
@@ -268,7 +269,7 @@ def main(job: str) -> None:
     np.save(f"{job}.npy", [_drawn(sheet, view) for sheet in sheets])
 
 
-def _drawn(sheet: Panels, view: View) -> Pixels:
+def _drawn(sheet: PictureSheet, view: View) -> Pixels:
     """Twice as large, then made smaller: smooth edges with every VTK."""
     rows, (wide, tall) = math.ceil(len(sheet.grids) / sheet.columns), view.pixels
     head, foot = 4 * LETTER, 3 * LETTER * (1 + sheet.loads[0].count("\n"))
@@ -485,7 +486,9 @@ def draw_animation(
     return _write(path, sight, [times[0], times[-1]], path.suffix.lower() if path else ".gif", images, "animate")
 
 
-def _sheets(sight: Sight, times: Sequence[float], box: tuple[int, int], columns: int) -> tuple[list[Panels], View]:
+def _sheets(
+    sight: Sight, times: Sequence[float], box: tuple[int, int], columns: int
+) -> tuple[list[PictureSheet], View]:
     """One of so many columns for all times, or one for each; all of one view."""
     grids = sight.grids(times)
     view, parts = sight.view(grids, box), [slice(None)] if columns else [slice(k, k + 1) for k in range(len(times))]
@@ -494,7 +497,7 @@ def _sheets(sight: Sight, times: Sequence[float], box: tuple[int, int], columns:
     wide = max(NARROWEST, max(1, columns) * view.pixels[0])
     notes = textwrap.fill(" ".join([f"{sight.recording.scene.name}:", *sight.notes()]), int(wide / NOTE_LETTER))
     scale = f"angle of the collagen, deformed: 0 {along}, 90 {across} (degrees)"
-    return [Panels(grids[p], titles[p], loads[p], max(1, columns), scale, notes) for p in parts], view
+    return [PictureSheet(grids[p], titles[p], loads[p], max(1, columns), scale, notes) for p in parts], view
 
 
 def _encoded(sight: Sight, images: Sequence[Pixels], ending: str, command: str) -> bytes:

@@ -391,7 +391,7 @@ def test_a_body_is_really_drawn(tiny_run: Recording) -> None:
     without.cell_data.remove("cell_dimensions")
     length = float((grid.points + grid.point_data["displacement"])[:, 2].max())
     view = bodies.View((0.3, -1.0, 0.14), (0.0, 0.0, length / 2), 14.0, (120, 320))
-    both, bare = bodies.render([bodies.Panels([each], ["t"], [""], 1, "", "") for each in (grid, without)], view)
+    both, bare = bodies.render([bodies.PictureSheet([each], ["t"], [""], 1, "", "") for each in (grid, without)], view)
     head = 4 * bodies.LETTER
     both, bare = (image[head : head + 320] for image in (both, bare))
     assert np.all(both[0, 0] == 255)
