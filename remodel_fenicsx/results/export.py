@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import Any
 
@@ -15,7 +16,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS
-from remodel_fenicsx.system.files import temporary_folder, write_new
+from remodel_fenicsx.system.files import write_new
 
 
 def write_vtu(
@@ -32,9 +33,10 @@ def write_vtu(
 
     of_elements = {name: [np.asarray(values)] for name, values in cell_data.items()}
     mesh = meshio.Mesh(points, [(vtk_to_meshio_type[cell_type], cells)], dict(point_data), of_elements)
-    with temporary_folder() as folder:
-        meshio.write(folder / "grid.vtu", mesh)
-        write_new(path, (folder / "grid.vtu").read_bytes())
+    with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
+        file = Path(folder) / "grid.vtu"
+        meshio.write(file, mesh)
+        write_new(path, file.read_bytes())
 
 
 # ---------------------------------------------------------------- cells as fibres of other programs

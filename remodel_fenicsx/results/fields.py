@@ -196,6 +196,7 @@ class Fields(Watcher, ClosedAtEnd):
         points, elements = domain.gather_mesh()
         self._grid: TransientGrid | None = None
         self._chains: TransientGrid | None = None
+        self._solved: dict[str, Array] | None = None  # fields of a step that is not committed yet
         if points is not None and elements is not None:
             geometry = domain.mesh.geometry.cmap
             cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), geometry.degree, elements)
@@ -211,29 +212,36 @@ class Fields(Watcher, ClosedAtEnd):
     def started(self, step: Step) -> None:
         """Write the start."""
         self.append(step.time)
+        self.publish()
 
     def solved(self, step: Step) -> None:
-        """Write the solved state, if it is its turn."""
+        """Note the solved state, if it is its turn."""
         asked = any(same_time(time, step.time) for time in self.times)
-        if step.number % self.every == 0 or step.is_last or asked:
-            self.append(step.time)
+        is_due = step.number % self.every == 0 or step.is_last or asked
+        self._solved = self._gathered() if is_due else None
 
-    def undone(self, step: Step) -> None:
-        """Take back what was written of it."""
-        for grid in (self._grid, self._chains):
-            if grid is not None and grid.last_time == step.time:
-                grid.drop_last()
+    def committed(self, step: Step) -> None:
+        """Write what was noted."""
+        if self._solved is not None:
+            self._write(step.time, self._solved)
 
     # ------------------------------------------------------------ writing
     def append(self, time: float) -> None:
         """Write the present state as the state of `time`. Collective."""
-        displacement = self._displacement()
-        gathered = {name: self.domain.gather_elements(values) for name, values in self._element_fields().items()}
-        if self._grid is None or displacement is None:
+        self._write(time, self._gathered())
+
+    def _gathered(self) -> dict[str, Array]:
+        """The fields of the present state on rank 0, nothing on others. Collective."""
+        local = {name: self.domain.gather_elements(values) for name, values in self._element_fields().items()}
+        found = local | {"displacement": self._displacement()}
+        return {name: values for name, values in found.items() if values is not None}
+
+    def _write(self, time: float, fields: dict[str, Array]) -> None:
+        if self._grid is None:
             return
-        fields = {name: values for name, values in gathered.items() if values is not None}
+        displacement = fields["displacement"]
         at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
-        changing = {name: fields[name] for name in fields if name in self.names}
+        changing = {name: fields[name] for name in fields if name in self.names and name != "displacement"}
         constant = {name: values for name, values in self._constant.items() if values is not None}
         self._grid.append(time, at_nodes, changing, constant=constant)
         if "chains" in self.names:
@@ -241,6 +249,12 @@ class Fields(Watcher, ClosedAtEnd):
                 axis=1
             )
             self._chains = append_chains(grid, time, self._centres, self._scale, middle, fields)
+
+    def publish(self) -> None:
+        """Let readers see all that is written so far, and a run go on with it that is killed from here on."""
+        for grid in (self._grid, self._chains):
+            if grid is not None:
+                grid.publish()
 
     def close(self) -> None:
         """Close the files."""

@@ -17,7 +17,6 @@ from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
-from remodel_fenicsx.system.files import part_of
 
 spatial = Late("scipy.spatial")  # most runs show no reduction
 Array = NDArray[np.float64]
@@ -208,23 +207,17 @@ def revolve(folder: Path | str) -> list[Path]:
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     image = _Image(recording, recording.scene.geometry.reductions[name].turn)
-    parts = [part_of(path) for path in paths]
-    for part in parts:
-        part.unlink(missing_ok=True)  # of one that was killed
-    with TransientGrid(parts[0], image.points, image.cells, image.cell_type) as grid:
-        chains: TransientGrid | None = None
-        for time in recording.times:
-            displacement, fields = image(recording.fields(float(time)))
-            grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
-            if displacement is not None and set(OF_CHAINS) <= set(fields):
-                middle = displacement[image.elements].mean(axis=1)
-                chains = append_chains(chains or parts[1], float(time), image.centres, image.scale, middle, fields)
-        if chains is not None:
-            chains.close()
-    written = [path for part, path in zip(parts, paths, strict=True) if part.exists()]
-    for path in reversed(written):  # the body last: where it is, all are
-        part_of(path).rename(path)
-    return written
+    grid, chains = TransientGrid(paths[0], image.points, image.cells, image.cell_type), None
+    for time in recording.times:
+        displacement, fields = image(recording.fields(float(time)))
+        grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
+        if displacement is not None and set(OF_CHAINS) <= set(fields):
+            middle = displacement[image.elements].mean(axis=1)
+            chains = append_chains(chains or paths[1], float(time), image.centres, image.scale, middle, fields)
+    for each in (chains, grid):  # the body last: where it is, all are
+        if each is not None:
+            each.close()
+    return [path for path in paths if path.exists()]
 
 
 class _Image(TurnedFields):
