@@ -117,7 +117,10 @@ def test_what_is_refused(first: tuple[Path, Path], tmp_path: Path) -> None:
     for keys, line in (
         ({"cells": {"initial": "isotropic"}}, "natural.fibres = true: needs cells.fibres"),
         ({"natural": {"fibres": True, "layers": LAYERS}}, "natural.fibres = true: natural.opening_angle or layers ar"),
-        ({"mesh": {"formulation": "selective-integration"}}, "natural.fibres = true: must be false unless mesh.form"),
+        (
+            {"mesh": {"degree": 2, "formulation": "selective-integration"}},
+            "natural.fibres = true: must be false unless mesh.form",
+        ),
     ):
         with pytest.raises(SceneError, match=f"^{line}"):
             again(mesh, file, 1.0, **keys)  # type: ignore[arg-type]
