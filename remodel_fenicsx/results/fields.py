@@ -18,11 +18,11 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
-from remodel_fenicsx.model.axes import LocalAxes
+from remodel_fenicsx.model.axes import NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION, UNLOADED
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, NO_PRESTRETCH, REGION, UNLOADED
 from remodel_fenicsx.schema import SAME_TIME, same_time
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state import State
@@ -31,12 +31,12 @@ from remodel_fenicsx.system.files import ClosedAtEnd
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
+OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains", NATURAL_GRADIENT))
 
 
 def field_names(
     asked: bool | Sequence[str],
-    lacking: Collection[str] = (REGION, UNLOADED, *TURNED_OVER),
+    lacking: Collection[str] = (REGION, *NO_PRESTRETCH, *TURNED_OVER),
     constant: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks."""
@@ -190,6 +190,9 @@ class Fields(Watcher, ClosedAtEnd):
         self._displacement = NodalGather(domain, self.state)
         quadrature, local_axes = self.state.cells.quadrature, self.state.cells.local_axes
         constant = local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
+        G = self.state.natural_gradient
+        if NATURAL_GRADIENT in self.names and G is not None:
+            constant[NATURAL_GRADIENT] = quadrature.element_mean(G).reshape(-1, 9)
         self._constant = {
             name: domain.gather_elements(values) for name, values in constant.items() if name in self.names
         }

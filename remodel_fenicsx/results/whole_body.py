@@ -15,6 +15,7 @@ from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.axes import NATURAL_GRADIENT
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
 
@@ -56,7 +57,7 @@ class TurnedFields:
         found = {name: values[self.sources] for name, values in fields.items() if name != "displacement"}
         for name in set(found) & {*AXIS_FIELDS, *DIRECTION_FIELDS}:
             found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
-        for name in set(found) & set(TENSOR_FIELDS):
+        for name in set(found) & {*TENSOR_FIELDS, NATURAL_GRADIENT}:
             tensors = found[name].reshape(-1, 3, 3)
             turned = self.element_turns @ tensors @ np.swapaxes(self.element_turns, 1, 2)
             found[name] = turned.reshape(-1, 9)
