@@ -380,9 +380,8 @@ def _report(options: argparse.Namespace) -> None:
     alone=True,
 )
 def _picture(options: argparse.Namespace) -> None:
-    """Draw the body of the run in DIR: PNG, SVG or PDF."""
-    from remodel_fenicsx.pictures.bodies import Viewing
-    from remodel_fenicsx.pictures.files import draw_picture
+    """Draw the body of the run in DIR: PNG or PDF."""
+    from remodel_fenicsx.pictures.bodies import Viewing, draw_picture
 
     viewing = Viewing(options.layers, options.cut, options.view)
     _say(str(draw_picture(options.folder, options.time, viewing, options.output)))
@@ -402,9 +401,8 @@ def _picture(options: argparse.Namespace) -> None:
     alone=True,
 )
 def _animate(options: argparse.Namespace) -> None:
-    """Draw the body of the run in DIR as it moves: GIF, WebP, or MP4 with ffmpeg."""
-    from remodel_fenicsx.pictures.bodies import Viewing
-    from remodel_fenicsx.pictures.files import draw_animation
+    """Draw the body of the run in DIR as it moves: GIF or WebP."""
+    from remodel_fenicsx.pictures.bodies import Viewing, draw_animation
 
     viewing = Viewing(options.layers, options.cut, options.view)
     _say(str(draw_animation(options.folder, options.frames, viewing, options.output)))

@@ -171,7 +171,7 @@ class Recording(RecordedRun):
         Parameters
         ----------
         path
-            A new file: .png, .svg or .pdf; default: NAME-tTIME.png in the folder, numbered when taken.
+            A new file: .png or .pdf; default: NAME-tTIME.png in the folder, numbered when taken.
         times
             To show beside each other; the nearest recorded ones are taken. Default: the last.
         layers, cut
@@ -195,8 +195,7 @@ class Recording(RecordedRun):
         OSError
             If the file cannot be written.
         """
-        from remodel_fenicsx.pictures.files import draw_picture
-        from remodel_fenicsx.pictures.bodies import Viewing
+        from remodel_fenicsx.pictures.bodies import Viewing, draw_picture
 
         return draw_picture(self.path, times, Viewing(layers, cut, view), None if path is None else Path(path))
 

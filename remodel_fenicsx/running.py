@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -39,12 +40,12 @@ from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation, in_region
 from remodel_fenicsx.schema.tables import shown
-from remodel_fenicsx.schema.toml import read_toml
+from remodel_fenicsx.schema.text import read_toml
 from remodel_fenicsx.simulation import Simulation, checked_domain, mesh_of, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
-from remodel_fenicsx.system.files import TakenError, part_of, read_regular, temporary_folder
+from remodel_fenicsx.system.files import TakenError, part_of, read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE
 from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
 from remodel_fenicsx.unloading import as_unloaded, unloaded
@@ -259,13 +260,14 @@ def _record(
             log.info("%d unknowns: one rank is faster than %d (docs/speed.md, Ranks)", unknowns, comm.size)
         for warning in simulation.scene.warnings():  # the one whose files have places
             log.warning("%s", warning)
-        followers = list(watchers)
+        followers, kept = list(watchers), [record.flush]
         if scene.output.fields:
             names = field_names(scene.output.fields, scene.lacking_fields, scene.geometry.constant_fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
-            followers.append(stack.enter_context(agreed(comm, lambda: Fields(*parts, times))))
-        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, record.flush)
+            fields = stack.enter_context(agreed(comm, lambda: Fields(*parts, times)))
+            followers, kept = [*followers, fields], [*kept, fields.publish]
+        checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, kept)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
         followers += [record, _Report(scene, progress), checkpoints, pause]
         leave_report = partial(_leave_report, place) if wants_report else lambda: None
@@ -362,8 +364,8 @@ def write_unloaded(scene: Scene, folder: Path) -> str:
     """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found."""
     if folder.exists():
         raise TakenError(folder, "folder")
-    with temporary_folder() as temporary:
-        found = unloaded(scene, MPI.COMM_SELF, temporary, quiet=False)
+    with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
+        found = unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False)
         kept, files = with_files_kept(found)
         part = part_of(folder)
         shutil.rmtree(part, ignore_errors=True)  # of one that was killed

@@ -22,8 +22,8 @@ from remodel_fenicsx.evolution.stepper import OtherCase, OtherCaseWatcher, Step,
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.model.energy import MATRICES, Tissue, mixed
-from remodel_fenicsx.model.axes import LocalAxes
+from remodel_fenicsx.model.energy import MATRICES, TURNED_OVER, Tissue, mixed
+from remodel_fenicsx.model.axes import NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
@@ -38,6 +38,10 @@ from remodel_fenicsx.watch.stability import EquilibriumStability
 log = logging.getLogger(__name__)
 
 TIME_ERROR = "time_error"  # the column
+Fibres = Mapping[str, Mapping[str, Any]]  # measured: by region and name, a row for each element of the mesh
+NO_FIBRES: Fibres = {}
+# what files of fibres may have beside the fibres, as it is at the start of a run
+UNCHANGED: Mapping[str, Any] = {NATURAL_GRADIENT: np.eye(3), "content": 1.0, "natural_length": 1.0}
 NEVER_LOCKED = 1e12  # link lengths: contour length of chains that are not there; infinity times zero is no number
 BEYOND = 0.5
 """Widths of the innermost layer: points that lie so far inside of a thin wall have rounding for stretches, for
@@ -166,14 +170,17 @@ class Parts:
 def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: Maker | None = None) -> Parts:
     """The parts of a scene in their order. Collective."""
     scene, domain = _meshed(scene, comm, domain)
-    state, *others = _states(scene, domain)
+    fibres = measured_fibres(scene, domain)
+    state, *others = _states(scene, domain, fibres)
     if others and coupling is not None:
         raise SceneError("cases: a coupling of your own solves one load case; leave out [[cases]]")
     tissue, kappa = parameters_of(scene.properties(), domain)
     if scene.remodeling.turnover.is_on:
         from remodel_fenicsx.evolution.turnover import turned_over
 
-        tissue = turned_over(tissue, state)
+        tissue, quadrature = turned_over(tissue, state), state.cells.quadrature
+        for name in TURNED_OVER:
+            quadrature.values(getattr(tissue, name), ())[:] = in_files(fibres, name, quadrature, domain)
     at_once, solver, settings = scene.time.is_equilibrium, scene.solver, scene.remodeling
     if (at_once or scene.time.tolerance is not None) and solver.predictor != "none":
         solver = solver.model_copy(update={"predictor": "responsive"})  # steps have all lengths
@@ -229,7 +236,7 @@ def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
     stepper.load_values = partial(values_of_loads, scene.loads)
     stepper.remodeling.set_kappa(kappa)
     simulation.state.restore(start)
-    if isinstance(kinematics, NaturalConfiguration):
+    if isinstance(kinematics, NaturalConfiguration) and not scene.natural.fibres:
         cells, quadrature = simulation.cells, simulation.quadrature
         values, kinematics.closing = natural_gradient(scene, quadrature, simulation.domain, cells.local_axes)
         quadrature.values(kinematics.gradient, (3, 3))[:] = values
@@ -260,7 +267,7 @@ def _meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[S
     return scene, checked_domain(mesh_of(scene, comm) if domain is None else domain, scene)
 
 
-def _states(scene: Scene, domain: Domain) -> list[State]:
+def _states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
     """One for each load case; made in the order of those of the first, so that all have the same kernels."""
     made = [on_mesh_alone(scene, domain) for _ in scene.each_case()]
     unknowns = [one.unknown(domain.mesh, scene.mesh.degree) for one in made]
@@ -271,12 +278,12 @@ def _states(scene: Scene, domain: Domain) -> list[State]:
     if grows or not scene.natural.is_of_the_mesh:
         values, closed = np.eye(3), None
         if not scene.natural.is_of_the_mesh:
-            values, closed = natural_gradient(scene, quadrature, domain, local_axes)
+            values, closed = natural_gradient(scene, quadrature, domain, local_axes, fibres)
         present, initial = (quadrature.function(f"{name}_gradient", (3, 3)) for name in ("natural", "initial"))
         for function in (present, initial):
             quadrature.values(function, (3, 3))[:] = values
         made = [NaturalConfiguration(one, present, closed, initial if grows else None) for one in made]
-    cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, measured_fibres(scene, domain))
+    cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, fibres)
     return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 
 
@@ -315,12 +322,16 @@ def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells
     return State(unknown, kinematics, cells, loading, FORMULATIONS[scene.mesh.formulation])
 
 
-def natural_gradient(scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes) -> tuple[Any, Any]:
+def natural_gradient(
+    scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes, fibres: Fibres = NO_FIBRES
+) -> tuple[Any, Any]:
     """G (elements, points, 3, 3) of a body whose tissue is free of stress elsewhere; what closes to it, if anything."""
     from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing
 
     natural, shape, found = scene.natural, scene.geometry, None
+    if natural.fibres:
+        return in_files(fibres, NATURAL_GRADIENT, quadrature, domain), None
     for index, layer in enumerate(natural.layers):
         if layer.region is not None and layer.region not in domain.regions:
             known = ", ".join(map(repr, domain.regions))
@@ -356,10 +367,35 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
         found = {}
         for name, cells in scene.measured_cells.items():
             chosen = regions == domain.regions[name] if name else np.ones(len(regions), dtype=np.bool_)
-            found[name] = _fibres_of(cells, name, points[elements], chosen)
+            measured = _fibres_of(cells, name, points[elements], chosen)
+            found[name] = _with_prestretch(measured, f"{in_region(name)}cells.fibres = {cells.fibres!r}", scene)
         return found
 
     return domain.comm.bcast(agreed(domain.comm, read)) or {}
+
+
+def _with_prestretch(measured: dict[str, Any], key: str, scene: Scene) -> dict[str, Any]:
+    """Measured fibres, with prestretch, content and natural length where the scene begins with those of the file."""
+    wanted, held = scene.natural.fibres, [name for name in UNCHANGED if name in measured]
+    changed = [name for name in held if not np.allclose(measured[name], np.reshape(UNCHANGED[name], -1))]
+    if changed and wanted is None:
+        rule = "set natural.fibres = true to begin with them, or false to leave them out"
+        raise SceneError(f"{key}: has {', '.join(changed)} of an earlier run; {rule}")
+    of_turnover = [name for name in TURNED_OVER if name in changed]
+    if wanted and of_turnover and not scene.remodeling.turnover.is_on:
+        raise SceneError(f"{key}: has {' and '.join(of_turnover)}, which only remodeling.turnover knows; it is not set")
+    return {name: values for name, values in measured.items() if wanted or name not in held}
+
+
+def in_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Any:
+    """An array of files of fibres at the points, (elements, points, ...); `UNCHANGED` where they have none."""
+    plain = np.asarray(UNCHANGED[name])
+    found = np.tile(plain, (*quadrature.shape, *(1 for _ in plain.shape)))
+    for region, measured in fibres.items():
+        if name in measured:
+            chosen = domain.element_region == domain.regions[region] if region else np.ones(len(found), dtype=np.bool_)
+            found[chosen] = measured[name][domain.element_number[chosen]].reshape(-1, 1, *plain.shape)
+    return found
 
 
 def _fibre_file(cells: Cells, region: str) -> Any:

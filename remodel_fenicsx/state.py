@@ -260,23 +260,22 @@ class State:
         """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3)."""
         return self.cells.quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3)
 
+    @property
+    def natural_gradient(self) -> NDArray[np.float64] | None:
+        """G at all points, (elements, points, 3, 3); None where the mesh is free of stress."""
+        return None if self._natural is None else self.cells.quadrature.values(self._natural, (3, 3))
+
     def elastic(self, deformation_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """F_e of F at all points, (elements, points, 3, 3): F itself where the mesh is free of stress."""
-        if self._natural is None:
-            return deformation_gradient
-        return deformation_gradient @ self.cells.quadrature.values(self._natural, (3, 3))
+        G = self.natural_gradient
+        return deformation_gradient if G is None else deformation_gradient @ G
 
     def elastic_axes(
         self, axes: NDArray[np.float64], deformation_gradient: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """Where F_e carries axes, rows (elements, points, 3, 3); without an F where G does, to the unloaded body."""
-        if deformation_gradient is None:
-            if self._natural is None:
-                return axes
-            gradient = self.cells.quadrature.values(self._natural, (3, 3))
-        else:
-            gradient = self.elastic(deformation_gradient)
-        return axes @ np.swapaxes(gradient, -1, -2)
+        gradient = self.natural_gradient if deformation_gradient is None else self.elastic(deformation_gradient)
+        return axes if gradient is None else axes @ np.swapaxes(gradient, -1, -2)
 
     def elastic_gradient(self) -> NDArray[np.float64]:
         """F_e of the present unknowns at all points in one row, (elements * points, 3, 3)."""
@@ -287,9 +286,7 @@ class State:
         """Values per volume of the start's stress-free tissue as values per volume of the mesh, (elements, points)."""
         quadrature = self.cells.quadrature
         values = values.reshape(quadrature.shape)
-        if self._natural is None:
-            return values
-        return values / np.linalg.det(quadrature.values(self._initial, (3, 3)))
+        return values if self._initial is None else values / np.linalg.det(quadrature.values(self._initial, (3, 3)))
 
     def functions(self) -> dict[str, Any]:
         """Every dolfinx function of the state by its name, those of further load cases with their mark ("@2")."""
@@ -493,6 +490,8 @@ class Parameters:
 
         def found() -> Tissue:
             whole = self.tissue.map(lambda name, value: assembly.largest(value, self.quadrature.mesh))
+            if not isinstance(self.tissue.contour_length, dolfinx.fem.Function):
+                return whole
             lengths = self.at_points().contour_length.reshape(self.quadrature.shape)
             of_chains = self.quadrature.maximum(np.where(self.has_chains(), lengths, 0.0))
             return replace(whole, contour_length=of_chains or whole.contour_length)

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import dolfinx.fem
@@ -34,7 +35,6 @@ from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import mandel_vector
-from remodel_fenicsx.system.files import temporary_folder
 from remodel_fenicsx.system.terminal import Line, unsaid
 
 log = logging.getLogger(__name__)
@@ -48,8 +48,8 @@ def as_unloaded(scene: Scene, comm: MPI.Intracomm, quiet: bool = True) -> Iterat
         return
     for line in scene.turned_away() if comm.rank == 0 else ():
         log.warning("%s", line)
-    with temporary_folder() as folder:
-        yield unloaded(scene, comm, comm.bcast(folder), quiet)
+    with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
+        yield unloaded(scene, comm, comm.bcast(Path(folder)), quiet)
 
 
 def unloaded(

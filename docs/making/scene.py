@@ -11,7 +11,7 @@ from remodel_fenicsx.extend import SHAPES, Dimension, markdown_reference
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES, RANDOM_CELLS
 from remodel_fenicsx.schema.tables import paragraphs
-from remodel_fenicsx.schema.toml import merged
+from remodel_fenicsx.schema.text import merged
 from remodel_fenicsx.schema.units import keys_with_units
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from remodel_fenicsx.body.mesh_file import read_exchange_file
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
-from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
+from remodel_fenicsx.schema.text import TableFileError, read_columns
 from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE, UnreadableFile
 

@@ -17,6 +17,7 @@ from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gms
 from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
     ENDINGS,
+    SURFACES,
     TAGS,
     Block,
     MeshFile,
@@ -57,7 +58,8 @@ def _faces(value: Any) -> Any:
     for name, entry in value.items():
         entries = entry if isinstance(entry, (list, tuple)) else [entry]
         if not entries or not all(isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries):
-            raise fault("must be a name or a number in the file, or a list of them", str(name), entry)
+            rule = "must be a name or a number in the file, or a list of them; a face may be { file = 'surface.vtp' }"
+            raise fault(rule, str(name), entry)
         found[str(name)] = tuple(entries)
     return found
 
@@ -66,10 +68,36 @@ def _is_mesh(value: Any) -> TypeGuard[str]:
     return isinstance(value, str) and "\x00" not in value and Path(value).suffix.lower() in ENDINGS
 
 
+def _is_surface(value: Any) -> TypeGuard[str]:
+    return isinstance(value, str) and "\x00" not in value and Path(value).suffix.lower() in SURFACES
+
+
+def _listed(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, (list, tuple)) else [value]
+
+
 def _file(value: Any) -> Any:
-    if not _is_mesh(value):
+    mesh, *surfaces = _listed(value) or [None]
+    if not _is_mesh(mesh):
         raise fault(f"must be the path of a mesh ({', '.join(ENDINGS)}), relative to the scene's folder")
-    return value
+    if not all(map(_is_surface, surfaces)):
+        raise fault(f"what follows the mesh must be paths of its surfaces ({', '.join(SURFACES)})")
+    return tuple([mesh, *surfaces]) if surfaces else mesh
+
+
+def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys with surfaces that faces give as files, inner = { file = "lumen.vtp" }, after the mesh."""
+    faces = geometry.get("faces")
+    entries = faces.items() if isinstance(faces, Mapping) else ()
+    own = {face: one["file"] for face, one in entries if isinstance(one, Mapping) and _is_surface(one.get("file"))}
+    if not own:
+        return dict(geometry)
+    names = {face: Path(file).stem for face, file in own.items()}
+    return {
+        **geometry,
+        "file": [*dict.fromkeys([*_listed(geometry.get("file")), *own.values()])],
+        "faces": {**dict(entries), **names},
+    }
 
 
 def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], there: set[int]) -> list[int]:
@@ -135,12 +163,13 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
     supported_faces: ClassVar[tuple[str, ...] | None] = None
 
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
-    file: Annotated[str, BeforeValidator(_file)] = Field(
+    file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
         description=(
             "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one of VTK or meshio "
-            "(`.vtu`, `.vtk`, `.xdmf`). Its path is relative to the scene's folder."
+            "(`.vtu`, `.vtk`, `.xdmf`). Its path is relative to the scene's folder. In a list, surfaces of its "
+            "triangles may follow (`.vtp`, `.stl`, `.ply`, `.obj`), faces by the names of their files."
         ),
-        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf"},
+        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"},
     )
     tags: str | None = Field(
         default=None,
@@ -159,7 +188,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         description=(
             "Names of faces, each with the name or number of a face in the file, or a list of them. "
             "`inner`, `outer`, `inlet` and `outlet` are needed where the file has other names. Further "
-            "faces are for supports and loads."
+            'faces are for supports and loads. A surface of its own is a face too: `{ file = "lumen.vtp" }`.'
         ),
         json_schema_extra=_GROUPS,
     )
@@ -181,9 +210,14 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
     sha256: str | None = Field(
         default=None,
         pattern="^[0-9a-f]{64}$",
-        description="SHA-256 of the file. A scene as run has it, and refuses another file.",
+        description="SHA-256 of the file, of several files together. A scene as run has it, and refuses others.",
         json_schema_extra={"allowed": "64 hexadecimal digits"},
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _surfaces_of_faces(cls, values: Any) -> Any:
+        return _together(values) if isinstance(values, Mapping) else values
 
     @model_validator(mode="after")
     def _units_are_both_there(self) -> MeshBody:
@@ -194,28 +228,37 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
     @classmethod
     def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """The keys as they were read, with the place of the file."""
-        file = geometry.get("file")
-        return {**geometry, **({"file": str(folder.absolute() / file)} if _is_mesh(file) else {})}
+        found = _together(geometry)
+        files = _listed(found.get("file"))
+        if not _is_mesh(files[0] if files else None) or not all(map(_is_surface, files[1:])):
+            return found
+        places = [str(folder.absolute() / file) for file in files]
+        return {**found, "file": places if places[1:] else places[0]}
 
     @classmethod
     def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
         """Element and degree of the file, where the scene does not say them."""
-        mesh, file = own.get("mesh", {}), own["geometry"].get("file")
+        mesh, files = own.get("mesh", {}), _listed(_together(own["geometry"]).get("file"))
         said = isinstance(mesh, Mapping) and "element" in mesh and "degree" in mesh
-        if said or not _is_mesh(file):
+        if said or not files or not _is_mesh(files[0]) or not all(map(_is_surface, files[1:])):
             return cls.defaults
         try:
-            tags = own["geometry"].get("tags")
-            found = read_mesh(Path(file), tags if isinstance(tags, str) else None)
+            tags, (file, *surfaces) = own["geometry"].get("tags"), map(Path, files)
+            found = read_mesh(file, tags if isinstance(tags, str) else None, surfaces)
         except MeshFileError as error:
-            raise fault(str(error), "geometry.file", Path(file).name) from None
+            raise fault(str(error), "geometry.file", file.name) from None
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
 
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
         """The file under its own name beside the scene as run, which has its SHA-256."""
         file = self._read()
-        name = Path(self.file).name
-        return {"geometry.file": name, "geometry.sha256": file.sha256}, {name: file.data}
+        kept = {self._name: file.data, **file.surfaces}
+        names = [*kept] if file.surfaces else self._name
+        return {"geometry.file": names, "geometry.sha256": file.sha256}, kept
+
+    @property
+    def _name(self) -> str:
+        return Path(_listed(self.file)[0]).name
 
     @property
     def number_of_elements(self) -> int:  # type: ignore[override]
@@ -271,14 +314,15 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             file = refined(file, mesh.refinement, mesh.degree)
         except MeshFileError as error:
             asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}"
-            raise SceneError(f"{asked}: {Path(self.file).name} {error}") from None
+            raise SceneError(f"{asked}: {self._name} {error}") from None
         words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
         return file, mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
 
     def _read(self) -> MeshFile:
         try:
-            file = read_mesh(Path(self.file), self.tags)
+            mesh, *surfaces = map(Path, _listed(self.file))
+            file = read_mesh(mesh, self.tags, surfaces)
         except MeshFileError as error:
             raise self._fault(str(error)) from None
         if self.sha256 not in (None, file.sha256):
@@ -286,7 +330,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         return file
 
     def _fault(self, rule: str) -> SceneError:
-        return SceneError(f"geometry.file = {shown(Path(self.file).name)}: {rule}")
+        return SceneError(f"geometry.file = {shown(self._name)}: {rule}")
 
     def _asked(self, face: str) -> Any:
         """As the scene says it, or by default."""
@@ -342,7 +386,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
     def _say(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
         counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
-        log.info("%s: %s, SHA-256 %s", Path(self.file).name, counts, file.sha256)
+        log.info("%s: %s, SHA-256 %s", ", ".join([self._name, *file.surfaces]), counts, file.sha256)
         if mesh_faces.through_the_wall(boundary):
             log.warning(
                 "the wall is one element thick in places: bending, and how the fibre angle changes through it, are "

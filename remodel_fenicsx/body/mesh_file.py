@@ -15,9 +15,10 @@ import json
 import logging
 import re
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,6 +70,7 @@ class MeshFile:
     names: dict[int, dict[str, int]]
     data: bytes
     sha256: str
+    surfaces: Mapping[str, bytes] = MappingProxyType({})
 
     @property
     def corners(self) -> Integers:
@@ -204,15 +206,16 @@ def _as_arrays(mesh: Any, group_names: list[tuple[int, int, str]] | None = None)
     return found | {f"cell_data{n}_{m}": values for n, listed in blocks for m, values in enumerate(listed)}
 
 
-def read_mesh(path: Path, tags: str | None = None) -> MeshFile:
-    """Read a mesh file."""
+def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()) -> MeshFile:
+    """Read a mesh file, with its faces in files of their own, each under the name of its file."""
     try:
-        found = path.stat()
-        if path.is_dir():
+        stats = [file.stat() for file in (path, *surfaces)]
+        if any(file.is_dir() for file in (path, *surfaces)):
             raise MeshFileError("is a folder; a mesh is a file")
-        return _read(path, tags, found.st_mtime_ns, found.st_size)
-    except FileNotFoundError:
-        raise MeshFileError(f"no such file: {path}") from None
+        changed = tuple((found.st_mtime_ns, found.st_size) for found in stats)
+        return _read(path, tags, tuple(surfaces), changed)
+    except FileNotFoundError as error:
+        raise MeshFileError(f"no such file: {error.filename}") from None
     except OSError as error:
         raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
     except UnreadableFile as error:
@@ -220,7 +223,7 @@ def read_mesh(path: Path, tags: str | None = None) -> MeshFile:
 
 
 @functools.lru_cache(maxsize=1)
-def _read(path: Path, tags: str | None, _changed: int, _size: int) -> MeshFile:
+def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tuple[Any, ...]) -> MeshFile:
     mesh = read_exchange_file(path)
     points = np.asarray(mesh.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -230,14 +233,56 @@ def _read(path: Path, tags: str | None, _changed: int, _size: int) -> MeshFile:
         names.setdefault(dimension, {})[name] = number
     blocks = [
         Block(kind, groups, np.asarray(rows, dtype=np.int64)[:, ORDERS.get(kind, slice(None))])
-        for (kind, rows), groups in zip(mesh.cells, _tags(mesh.cell_data, tags), strict=True)
+        for (kind, rows), groups in zip(mesh.cells, _tags(mesh, tags, bool(surfaces)), strict=True)
     ]
-    return assembled(points, blocks, {dimension: names[dimension] for dimension in (2, 3)}, mesh.data)
+    found = assembled(points, blocks, {dimension: names[dimension] for dimension in (2, 3)}, mesh.data)
+    for surface in surfaces:
+        found = _with_surface(found, surface)
+    return found
 
 
-def _tags(arrays: dict[str, Any], asked: str | None) -> list[Integers]:
-    """Numbers of faces and volumes, block by block."""
+SURFACES = (".vtp", ".stl", ".ply", ".obj")  # endings of surfaces, which `body.lumen` reads
+SAME_NODE = 1e-3  # of the shortest side of a triangle: files may have 7 digits
+
+
+def _with_surface(file: MeshFile, path: Path) -> MeshFile:
+    """The mesh with the triangles of a surface for a face, whose corners are nodes of it."""
+    from scipy.spatial import cKDTree  # most meshes are one file
+
+    if file.kind != "tetrahedron":
+        raise MeshFileError(f"{path.name}: surfaces are of triangles, so the mesh must be of tetrahedra")
+    if path.stem in file.names[2]:
+        raise MeshFileError(f"{path.name}: there is a face {path.stem!r} already; give the surface another name")
+    try:
+        arrays, data = read_guarded(path, f"remodel_fenicsx.body.lumen:{path.suffix[1:].lower()}")
+    except UnreadableFile as error:
+        raise MeshFileError(f"{path.name}: {error}") from None
+    corners = np.asarray(arrays["points"], dtype=np.float64)[arrays["triangles"]]
+    if not corners.size or not np.isfinite(corners).all():
+        raise MeshFileError(f"{path.name}: has no triangles with corners at finite places")
+    away, nodes = cKDTree(file.points).query(corners)
+    far = away > SAME_NODE * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1, keepdims=True)
+    if far.any():
+        place, distance = ", ".join(f"{x:.4g}" for x in corners[far][0]), away[far][0]
+        rule = f"at ({place}), the nearest is {distance:.3g} away: is it the surface of this mesh, in its unit?"
+        raise MeshFileError(f"{path.name}: {far.sum()} corners of triangles are no nodes of the mesh, the first {rule}")
+    number = 1 + max([*distinct(file.facet_groups), *file.names[2].values()], default=0)
+    return replace(
+        file,
+        facets=np.concatenate([file.facets, nodes]),
+        facet_groups=np.append(file.facet_groups, np.full(len(nodes), number)),
+        names={**file.names, 2: {**file.names[2], path.stem: number}},
+        surfaces={**file.surfaces, path.name: data},
+        sha256=hashlib.sha256(f"{file.sha256} {hashlib.sha256(data).hexdigest()}".encode()).hexdigest(),
+    )
+
+
+def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> list[Integers]:
+    """Numbers of faces and volumes, block by block; 0 where there are none, if there may be none."""
+    arrays = mesh.cell_data
     name = next((name for name in ((asked,) if asked else TAGS) if name in arrays), None)
+    if name is None and asked is None and may_be_none:
+        return [np.zeros(len(rows), dtype=np.int64) for _, rows in mesh.cells]
     if name is None:
         wanted = repr(asked) if asked else " or ".join(map(repr, TAGS))
         there = ", ".join(map(repr, arrays)) or "none"

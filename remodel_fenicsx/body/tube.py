@@ -389,12 +389,6 @@ class Tube(RoundWall):
         """Regions are layers of the wall, from the lumen outwards by their outer radii."""
         check_layers(self.inner_radius, self.outer_radius, _counts(mesh)[1], regions)
 
-    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
-        """Of the wall."""
-        wall = _wall(self, max(1, len(regions)), regions)
-        areas = np.diff(np.square(wall.radii)) * math.pi / self.section_area
-        return dict(zip(wall.names if regions else [""], map(float, areas), strict=True))
-
     def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
         """Of the layers, from the inside outwards."""
         wall = _wall(self, max(1, len(regions)), regions)
@@ -452,7 +446,7 @@ class Tube(RoundWall):
             return np.asarray(np.square(places[:, :2]).sum(axis=1) / 2, dtype=np.float64)
 
         radii, factor = (self.inner_radius, self.outer_radius), 0.5 if ends == "clamped" else 1.0
-        return reduced.Strut(self.length, factor, reduced.about_z, squared_distances, radii, capped=ends == "closed")
+        return reduced.Strut(self.length, factor, reduced.about_z, squared_distances, radii)
 
     def depth(self, coordinates: Array) -> Array:
         """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""

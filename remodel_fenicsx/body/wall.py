@@ -295,10 +295,6 @@ class RoundWall(Walled, WithRegions, Unloads):
     def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
         """Where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
 
-    @abstractmethod
-    def section_shares(self, regions: Mapping[str, Region]) -> dict[str, float]:
-        """Share of every section across z that is in a region, by its name; "" is what is beside them."""
-
     def fills(self, regions: Collection[str]) -> bool:
         """The outermost ends at the outer radius."""
         return bool(regions)

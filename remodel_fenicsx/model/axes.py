@@ -149,7 +149,9 @@ AXES: dict[str, Callable[[LocalAxes], Array]] = {
 # Structure tensors, fibre directions or fibre angles.
 
 # name of what is measured: numbers that a row of it may have
+NATURAL_GRADIENT = "natural_gradient"
 MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
+MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,)}  # beside one of SOURCES
 SOURCES = ("structure_tensor", "fibre", "angle")  # one of these is needed
 SYMMETRIC = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
 # eigenvalue below zero, over the trace, that may be rounding of files with 7 digits
@@ -177,6 +179,12 @@ def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:
     weight = measured.get("weight", np.zeros((1, 1)))[:, 0]
     if not (fine := (weight >= 0) & (weight <= 1)).all():
         return _row("weight", fine, "is not from 0 to 1")
+    for name in ("content", "natural_length"):
+        if name in measured and not (fine := measured[name][:, 0] > 0).all():
+            return _row(name, fine, "is not above 0")
+    if NATURAL_GRADIENT in measured:
+        if not (fine := np.linalg.det(measured[NATURAL_GRADIENT].reshape(-1, 3, 3)) > 0).all():
+            return _row(NATURAL_GRADIENT, fine, "has no determinant above 0")
     if source == "structure_tensor":
         eigenvalues = np.linalg.eigvalsh(_tensors(measured[source]))
         trace = eigenvalues.sum(axis=1)

@@ -1,4 +1,4 @@
-"""The body of a run in PyVista: a grid with its fields, a plotter with colours and chains, and pictures of it.
+"""The body of a run in PyVista: a grid with its fields, a plotter with colours and chains, pictures and animations.
 
 Pictures are drawn by a child process, ``python3 -m remodel_fenicsx.pictures.bodies JOB``: a VTK that knows only X
 (Debian 13's) kills its process where there is no display, so the child gets one of its own from xvfb-run. A VTK that
@@ -7,22 +7,30 @@ can draw without (EGL) gets by without that program.
 
 from __future__ import annotations
 
+import io
+import itertools
 import math
+import os
 import pickle
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
-from matplotlib.figure import Figure
+from matplotlib.colors import to_rgb
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
+from remodel_fenicsx._version import __version__
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -32,6 +40,7 @@ from remodel_fenicsx.results.recording import (
     RecordedRun,
     RecordingError,
     VIEWS,
+    kept_times,
     unit_of,
     with_unit,
     words,
@@ -40,7 +49,7 @@ from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lin
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.system.children import environment_of_child, last_line
-from remodel_fenicsx.system.files import temporary_folder
+from remodel_fenicsx.system.files import TakenError, write_new
 
 if TYPE_CHECKING:
     import pyvista
@@ -48,7 +57,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
-SAMPLES = 2  # pictures are drawn this much larger and made smaller: smooth edges with every VTK
+SAMPLES = 2  # pictures are drawn this much larger and made smaller
+LETTER, NOTE, FOOT, NARROWEST = 9, 6, 150, 800  # letters; pixels: what stands below all bodies, a sheet
 ANGLE = "fibre_angle_deformed"  # by which bodies are coloured
 ANGLES = ("fibre_angle", ANGLE)  # fields in degrees, from 0 to 90
 OF_RIBBONS = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)  # fields that chains are drawn of
@@ -61,36 +71,15 @@ NOTHING_KNOWN = (0.6, 0.62, 0.65)  # where chains have no angle
 # ---------------------------------------------------------------- colours
 
 
-def scale() -> tuple[Colormap, BoundaryNorm]:
-    """Colours from red (0 degrees, aligned) over yellow to blue (90 degrees, orthogonal), in equal steps."""
-    return ListedColormap(ANGLE_COLOURS), BoundaryNorm(np.linspace(0.0, 90.0, LEVELS + 1), LEVELS, clip=True)
-
-
 def coloured(angle: Array) -> Array:
-    """Colours (m, 3) of angles in degrees (m,); NaN is grey."""
-    colours, steps = scale()
-    return np.where(np.isnan(angle)[:, None], NOTHING_KNOWN, colours(steps(np.nan_to_num(angle)))[:, :3])
-
-
-def scale_colours() -> Array:
-    """Every colour of the scale, also as a face shows it that is turned away from the eye, (n, 3) in 0..1."""
-    return np.concatenate([share * coloured(_middles()) for share in np.linspace(1.0, AMBIENT, 5)])
+    """Colours (m, 3) of angles in degrees (m,), from red (0, aligned) over yellow to blue (90); NaN is grey."""
+    step = np.clip(np.nan_to_num(angle) * LEVELS / 90.0, 0, LEVELS - 1).astype(int)
+    return np.where(np.isnan(angle)[:, None], NOTHING_KNOWN, np.array([to_rgb(c) for c in ANGLE_COLOURS])[step])
 
 
 def _middles() -> Array:
     """Of the steps of the scale, in degrees."""
     return (np.arange(LEVELS) + 0.5) * (90.0 / LEVELS)
-
-
-def angle_scale(figure: Figure, place_at: tuple[float, float, float, float], label: str) -> None:
-    """The scale of all angles: 0 to 90 degrees, red to blue; `label` says from which direction to which."""
-    axes = figure.add_axes(place_at)
-    colours, steps = scale()
-    bar: Any = figure.colorbar(ScalarMappable(steps, colours), cax=axes, orientation="horizontal")
-    bar.set_ticks(range(0, 91, 15), labels=[f"{angle}°" for angle in range(0, 91, 15)])
-    bar.ax.tick_params(length=2.5, labelsize=8, pad=2)
-    bar.outline.set_linewidth(0.5)
-    bar.set_label(label, fontsize=8.5, labelpad=2)
 
 
 # ---------------------------------------------------------------- in PyVista
@@ -144,15 +133,16 @@ def new_plotter(**options: Any) -> pyvista.Plotter:
 
     plotter = pyvista.Plotter(lighting="none", **options)
     plotter.background_color = "white"
-    plotter.add_light(pyvista.Light(light_type="headlight", intensity=1.0))
+    for renderer in plotter.renderers:
+        renderer.add_light(pyvista.Light(light_type="headlight", intensity=1.0))
     return plotter
 
 
 def add_body(
     plotter: pyvista.Plotter, found: pyvista.UnstructuredGrid, name: str, with_chains: bool, towards: Array | None,
     **options: Any,
-) -> None:  # fmt: skip
-    """A deformed body by a field, and its chains, as far as they were recorded."""
+) -> Any:  # fmt: skip
+    """A deformed body by a field, and its chains, as far as they were recorded; gives what knows its colours."""
     import pyvista
 
     light: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular": 0.0}
@@ -163,9 +153,10 @@ def add_body(
         table.scalar_range, table.nan_color = (0.0, 90.0), NOTHING_KNOWN
         looks["cmap"] = table
     is_deformed = "displacement" in found.point_data
-    plotter.add_mesh(found.warp_by_vector("displacement") if is_deformed else found, **{**looks, **options})
+    body = plotter.add_mesh(found.warp_by_vector("displacement") if is_deformed else found, **{**looks, **options})
     if with_chains and set(OF_RIBBONS) <= set(found.cell_data):
         plotter.add_mesh(chains(found, towards), color=CHAIN_LOOK["colour"], culling="back", **light)
+    return body.mapper
 
 
 def chains(found: pyvista.UnstructuredGrid, towards: Array | None) -> pyvista.PolyData:
@@ -238,11 +229,23 @@ class View:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
-def render(grids: Sequence[pyvista.UnstructuredGrid], view: View) -> list[Pixels]:
-    """Draw bodies off-screen by their angle, each (rows, columns, 3)."""
-    with temporary_folder() as folder:
-        job = folder / "job"
-        job.write_bytes(pickle.dumps((list(grids), view)))
+@dataclass(frozen=True)
+class PictureSheet:
+    """Bodies beside each other, each with what stands above and below it; what stands below all of them."""
+
+    grids: Sequence[pyvista.UnstructuredGrid]
+    titles: Sequence[str]
+    loads: Sequence[str]
+    columns: int
+    scale: str
+    notes: str
+
+
+def render(sheets: Sequence[PictureSheet], view: View) -> list[Pixels]:
+    """Draw sheets off-screen, each (rows, columns, 3)."""
+    with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
+        job = Path(folder) / "job"
+        job.write_bytes(pickle.dumps((list(sheets), view)))
         command = [sys.executable, "-m", __name__, str(job)]
         if shutil.which("xvfb-run"):
             command = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24", *command]
@@ -260,26 +263,50 @@ def render(grids: Sequence[pyvista.UnstructuredGrid], view: View) -> list[Pixels
 
 
 def main(job: str) -> None:
-    """Draw the bodies of a job file and save the pictures beside it."""
+    """Draw the sheets of a job file and save the pictures beside it."""
     with open(job, "rb") as file:
-        grids, view = pickle.load(file)
-    np.save(f"{job}.npy", [_drawn(found, view) for found in grids])
+        sheets, view = pickle.load(file)
+    np.save(f"{job}.npy", [_drawn(sheet, view) for sheet in sheets])
 
 
-def _drawn(found: pyvista.UnstructuredGrid, view: View) -> Pixels:
-    columns, rows = (SAMPLES * pixels for pixels in view.pixels)
-    plotter: Any = new_plotter(off_screen=True, window_size=[columns, rows])
-    direction = np.array(view.direction) / np.linalg.norm(view.direction)
-    add_body(plotter, found, ANGLE, True, direction, line_width=0.5 * SAMPLES, show_scalar_bar=False)
-    camera = plotter.camera
+def _drawn(sheet: PictureSheet, view: View) -> Pixels:
+    """Twice as large, then made smaller: smooth edges with every VTK."""
+    rows, (wide, tall) = math.ceil(len(sheet.grids) / sheet.columns), view.pixels
+    head, foot = 4 * LETTER, 3 * LETTER * (1 + sheet.loads[0].count("\n"))
+    whole = head + tall + foot
+    size = [SAMPLES * max(NARROWEST, wide * sheet.columns), SAMPLES * (rows * whole + FOOT)]
+    parts: dict[str, Any] = {"row_weights": [*[whole] * rows, FOOT], "groups": [(rows, slice(None))], "border": False}
+    plotter: Any = new_plotter(off_screen=True, window_size=size, shape=(rows + 1, sheet.columns), **parts)
+    direction, mapper = np.array(view.direction) / np.linalg.norm(view.direction), None
+    for number, found in enumerate(sheet.grids):
+        plotter.subplot(*divmod(number, sheet.columns))
+        mapper = add_body(plotter, found, ANGLE, True, direction, line_width=0.5 * SAMPLES, show_scalar_bar=False)
+        _look(plotter.camera, view, direction, whole / tall)
+        plotter.renderer.reset_camera_clipping_range()
+        _letters(plotter, sheet.titles[number], 1 - head / whole, LETTER)
+        _letters(plotter, sheet.loads[number], 0.0, LETTER)
+    plotter.subplot(rows, 0)
+    look = {"n_labels": 7, "fmt": "%.0f", "color": "black", "label_font_size": 2 * SAMPLES * LETTER}
+    plotter.add_scalar_bar("", mapper=mapper, width=0.6, position_x=0.2, position_y=0.5, height=0.45, **look)
+    _look(plotter.camera, view, direction, 1.0)
+    plotter.add_axes(viewport=(0.84, 0.3, 1.0, 1.0), color="black")
+    _letters(plotter, sheet.scale, 0.3, LETTER)
+    _letters(plotter, sheet.notes, 0.05, NOTE)
+    image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True))[..., :3])
+    plotter.close()
+    return np.asarray(image.reduce(SAMPLES))
+
+
+def _letters(plotter: Any, text: str, height: float, size: int) -> None:
+    """Letters in the middle of the present part, so far above its lower edge."""
+    look: dict[str, Any] = {"color": "black", "viewport": True, "font_size": SAMPLES * size}
+    plotter.add_text(text, position=(0.5, height), **look).prop.justification_horizontal = "center"
+
+
+def _look(camera: Any, view: View, direction: Array, room: float) -> None:
     camera.focal_point, camera.up = view.centre, view.up
     camera.position = tuple(np.array(view.centre) + 10 * view.height * direction)
-    camera.parallel_projection, camera.parallel_scale = True, view.height / 2
-    plotter.reset_camera_clipping_range()
-    image = np.asarray(plotter.screenshot(return_img=True))[..., :3]
-    plotter.close()
-    smaller = image.reshape(rows // SAMPLES, SAMPLES, columns // SAMPLES, SAMPLES, 3).mean(axis=(1, 3))
-    return np.rint(smaller).astype(np.uint8)
+    camera.parallel_projection, camera.parallel_scale = True, room * view.height / 2
 
 
 # ---------------------------------------------------------------- what is seen, at which times and from where
@@ -378,15 +405,15 @@ class Sight:
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(towards, right), towards])
 
-    def view(self, grids: Sequence[pyvista.UnstructuredGrid], box: tuple[float, float], dots: float) -> View:
-        """All of what is seen, at all of these times, as large as a box (width, height) in inches holds it."""
+    def view(self, grids: Sequence[pyvista.UnstructuredGrid], box: tuple[int, int]) -> View:
+        """All of what is seen, at all of these times, as large as a box (width, height) in pixels holds it."""
         axes, moved = self.axes(), [found.point_data.get("displacement", 0.0) for found in grids]
         places = np.concatenate([(found.points + by) @ axes.T for found, by in zip(grids, moved, strict=True)])
         low, high = places.min(axis=0), places.max(axis=0)
         wide, tall, _ = high - low
         aspect = float(np.clip(wide / max(tall, 1e-9 * wide), *ASPECT))
         height = min(box[1], box[0] / aspect)
-        pixels = round(dots * height * aspect), round(dots * height)
+        pixels = round(height * aspect), round(height)
         x, y, z = ((low + high) / 2) @ axes
         up = axes[1] if abs(axes[2, 2]) >= 0.9999 else np.array([0.0, 0.0, 1.0])
         return View(tuple(axes[2]), (x, y, z), VIEW_MARGIN * max(tall, wide / aspect), pixels, tuple(up))
@@ -407,13 +434,121 @@ class Sight:
         scene, count = self.recording.scene, len(self.whole.depth)
         number = len(self.whole.elements)
         kind = "hexahedr" if self.whole.elements.shape[1] == 8 else "tetrahedr"
-        first = [f"{scene.geometry.name}, {number:,} {kind}{'on' if number == 1 else 'a'}"]
+        size = " x ".join(f"{length:.3g}" for length in np.ptp(self.whole.points, axis=0))
+        first = [f"{scene.geometry.name} of {size} {scene.geometry.length_unit or ''}".rstrip()]
+        first.append(f"{number:,} {kind}{'on' if number == 1 else 'a'}")
         if self.viewing.layers not in (None, count):
             first.append(f"{self.viewing.layers} of {count} layers, from the {scene.geometry.depth_in_words[1]}")
         if self.viewing.cut:
             first.append(CUT_IN_WORDS[self.viewing.cut])
         chains = "Black: the four chains of each element's mean cell, deformed, projected on its face."
-        return ["; ".join(first), *self.whole.notes(self.is_deformed), *([chains] if self.has_chains else [])]
+        return ["; ".join(first) + ".", *self.whole.notes(self.is_deformed), *([chains] if self.has_chains else [])]
+
+
+# ---------------------------------------------------------------- pictures and animations as files
+# Sheets of bodies at some times, with scale and axes; nothing is overwritten.
+
+PICTURES, ANIMATIONS = (".png", ".pdf"), (".gif", ".webp")
+MOST_PANELS, MOST_COLUMNS = 12, 4
+FRAMES, FEWEST_FRAMES, MOST_FRAMES = 60, 2, 500  # by default; an animation of one is a picture; all are in memory
+FRAME_TIME, LAST_TIME = 80, 1600  # ms that a frame stands; multiples of 10, as GIF counts
+ALONE, BESIDE, FRAME = (1000, 880), (500, 600), (600, 530)  # pixels of a body: alone, beside others, in an animation
+NOTE_LETTER = 6.3  # pixels, mean width
+
+
+def draw_picture(
+    folder: str | os.PathLike[str], times: Sequence[float] | None = None, viewing: Viewing | None = None,
+    path: Path | None = None,
+) -> Path:  # fmt: skip
+    """Draw the body of a run at some of its times, beside each other."""
+    _check_new(path, PICTURES)
+    sight = Sight(RecordedRun(folder), viewing or Viewing())
+    shown = sight.times(times)
+    if len(shown) > MOST_PANELS:
+        raise FigureError(f"times: {len(shown)} times; allowed are {MOST_PANELS} in a picture (animate shows more)", 2)
+    sheets, view = _sheets(sight, shown, BESIDE if len(shown) > 1 else ALONE, min(len(shown), MOST_COLUMNS))
+    return _write(path, sight, shown, path.suffix.lower() if path else ".png", render(sheets, view), "picture")
+
+
+def draw_animation(
+    folder: str | os.PathLike[str], frames: int = FRAMES, viewing: Viewing | None = None, path: Path | None = None
+) -> Path:
+    """Draw the body of a run as it moves through time."""
+    _check_new(path, ANIMATIONS)
+    if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
+        raise FigureError(f"--frames {frames}: allowed is a whole number from {FEWEST_FRAMES} to {MOST_FRAMES}", 2)
+    sight = Sight(RecordedRun(folder), viewing or Viewing())
+    if len(sight.recording.times) < FEWEST_FRAMES:
+        raise FigureError(f"{sight.recording.path}: fields of one time alone are recorded, so nothing moves", 2)
+    times = [float(time) for time in kept_times(sight.history, sight.recording.times, frames)]
+    sheets, view = _sheets(sight, times, FRAME, 0)
+    images = render(sheets, view)
+    return _write(path, sight, [times[0], times[-1]], path.suffix.lower() if path else ".gif", images, "animate")
+
+
+def _sheets(
+    sight: Sight, times: Sequence[float], box: tuple[int, int], columns: int
+) -> tuple[list[PictureSheet], View]:
+    """One of so many columns for all times, or one for each; all of one view."""
+    grids = sight.grids(times)
+    view, parts = sight.view(grids, box), [slice(None)] if columns else [slice(k, k + 1) for k in range(len(times))]
+    titles, loads = [f"t = {time:g}" for time in times], ["\n".join(sight.loads(time)) for time in times]
+    along, across = sight.recording.scene.geometry.angle_in_words
+    wide = max(NARROWEST, max(1, columns) * view.pixels[0])
+    notes = textwrap.fill(" ".join([f"{sight.recording.scene.name}:", *sight.notes()]), int(wide / NOTE_LETTER))
+    scale = f"angle of the collagen, deformed: 0 {along}, 90 {across} (degrees)"
+    return [PictureSheet(grids[p], titles[p], loads[p], max(1, columns), scale, notes) for p in parts], view
+
+
+def _encoded(sight: Sight, images: Sequence[Pixels], ending: str, command: str) -> bytes:
+    """Pictures as a file, with what it shows and what it was made with."""
+    scene, versions = sight.recording.scene, sight.recording.versions
+    about = {
+        "Title": f"{scene.name}: angle of the collagen", "Software": f"remodel_fenicsx {__version__}",
+        "Description": " ".join(sight.notes()), "Comment": f"remodel-fenicsx {command}",
+        "Source": "; ".join(f"{name} {version}" for name, version in versions.items()),
+    }  # fmt: skip
+    texts, file, durations = PngInfo(), io.BytesIO(), [FRAME_TIME] * (len(images) - 1) + [LAST_TIME]
+    for key, value in about.items():
+        texts.add_text(key, value)
+    first, *others = map(Image.fromarray, images)
+    moving: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0, "duration": durations}
+    kinds: dict[str, dict[str, Any]] = {
+        ".png": {"pnginfo": texts, "optimize": True}, ".pdf": {"title": about["Title"], "resolution": 200},
+        ".gif": {**moving, "comment": about["Comment"].encode()}, ".webp": {**moving, "quality": 90},
+    }  # fmt: skip
+    first.save(file, ending[1:], **kinds[ending])
+    return file.getvalue()
+
+
+# ---------------------------------------------------------------- names
+def _check_new(path: Path | None, endings: Sequence[str]) -> None:
+    """Before anything is drawn."""
+    if path is None:
+        return
+    if path.suffix.lower() not in endings:
+        raise FigureError(f"path {path}: allowed is a name that ends in {', '.join(endings)}", 2)
+    if os.path.lexists(path):
+        raise TakenError(path)
+    if not path.parent.is_dir():
+        raise FigureError(f"path {path}: there is no folder {path.parent}", 2)
+
+
+def _write(
+    path: Path | None, sight: Sight, times: Sequence[float], ending: str, images: Sequence[Pixels], command: str
+) -> Path:
+    data = _encoded(sight, images, ending, command)
+    if path is not None:
+        write_new(path, data)
+        return path
+    ends = dict.fromkeys([times[0], times[-1]])
+    stem = "-".join([sight.recording.scene.name, *(f"t{time:g}" for time in ends)])
+    for number in itertools.count(1):
+        free = sight.recording.path / f"{stem}{f'-{number}' if number > 1 else ''}{ending}"
+        with suppress(TakenError):
+            write_new(free, data)
+            return free
+    raise AssertionError("numbers do not end")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -34,7 +34,7 @@ class Checkpoints(Watcher):
         state: State,
         scene_text: str,
         every: int | None = None,
-        before: Callable[[], None] = lambda: None,
+        before: Sequence[Callable[[], None]] = (),
     ):
         self.before = before
         self.folder, self.state, self.scene_text, self.every = folder, state, scene_text, every
@@ -70,7 +70,8 @@ class Checkpoints(Watcher):
         if self.state.number == self._number:
             return
         start = clock.monotonic()
-        self.before()
+        for keep in self.before:
+            keep()
         state, arrays = self.state, gather_state(self.state)
         if arrays is not None and self._mesh is not None:
             checkpoint = Checkpoint(

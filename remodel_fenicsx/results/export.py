@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import Any
 
@@ -12,10 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.axes import NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
+from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS
-from remodel_fenicsx.system.files import temporary_folder, write_new
+from remodel_fenicsx.system.files import write_new
+
+
+log = logging.getLogger(__name__)
 
 
 def write_vtu(
@@ -32,9 +39,10 @@ def write_vtu(
 
     of_elements = {name: [np.asarray(values)] for name, values in cell_data.items()}
     mesh = meshio.Mesh(points, [(vtk_to_meshio_type[cell_type], cells)], dict(point_data), of_elements)
-    with temporary_folder() as folder:
-        meshio.write(folder / "grid.vtu", mesh)
-        write_new(path, (folder / "grid.vtu").read_bytes())
+    with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
+        file = Path(folder) / "grid.vtu"
+        meshio.write(file, mesh)
+        write_new(path, file.read_bytes())
 
 
 # ---------------------------------------------------------------- cells as fibres of other programs
@@ -80,6 +88,7 @@ class Fibres:
     dimensions: Array
     axes: Array
     displacement: Array | None
+    others: Mapping[str, Array] = MappingProxyType({})  # prestretch, content, natural length, where there are any
 
     @property
     def tensors(self) -> Array:
@@ -101,6 +110,9 @@ def export(folder: Path | str, kind: str, path: Path | None = None, time: float 
     """Write the mean structure tensor of each element with its axes and dimensions into a new file."""
     ending, write = FIBRE_FORMATS[kind]
     fibres = recorded_fibres(RecordedRun(folder), time)
+    if fibres.others and kind not in WITH_OTHERS:
+        kinds = " and ".join(WITH_OTHERS)
+        log.warning("%s has no place for %s; %s files have them", kind, ", ".join(fibres.others), kinds)
     path = Path(folder) / f"fibres{ending}" if path is None else path
     write(path, fibres)
     return path
@@ -116,19 +128,22 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     time = float(recording.times[-1]) if time is None else time
     needed = ("cell_dimensions", *AXIS_FIELDS)
-    fields = recording.fields(time, (*needed, "displacement"))
+    fields = recording.fields(time, (*needed, "displacement", NATURAL_GRADIENT, *TURNED_OVER))
     missing = [name for name in needed if name not in fields]
     if missing:
         raise RecordingError(f"{recording.path}: output.fields was without {', '.join(missing)}")
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
-    displacement = fields.get("displacement")
-    return Fibres(recording.points, recording.elements, fields["cell_dimensions"], axes, displacement)
+    if not recording.scene.natural.is_of_the_mesh and NATURAL_GRADIENT not in fields:
+        log.warning("%s: output.fields was without %s: the prestretch is not written", recording.path, NATURAL_GRADIENT)
+    others = {name: fields[name] for name in (NATURAL_GRADIENT, *TURNED_OVER) if name in fields}
+    mesh = recording.points, recording.elements
+    return Fibres(*mesh, fields["cell_dimensions"], axes, fields.get("displacement"), others)
 
 
 # ---------------------------------------------------------------- formats
 def _vtu(path: Path, fibres: Fibres) -> None:
     of_elements = {"structure_tensor": fibres.tensors.reshape(-1, 9), "cell_dimensions": fibres.dimensions}
-    of_elements |= {name: fibres.axes[:, i] for i, name in enumerate(AXIS_FIELDS)}
+    of_elements |= {name: fibres.axes[:, i] for i, name in enumerate(AXIS_FIELDS)} | dict(fibres.others)
     of_nodes = {} if fibres.displacement is None else {"displacement": fibres.displacement}
     write_vtu(path, fibres.points, fibres.elements, fibres.names.vtk, of_elements, of_nodes)
 
@@ -158,9 +173,11 @@ def _febio(path: Path, fibres: Fibres) -> None:
     for number, (a, d) in enumerate(zip(_joined(axes[:, :3]), _joined(axes[:, 3:]), strict=True), start=1):
         lines.append(f'<elem lid="{number}"><a>{a}</a><d>{d}</d></elem>')
     lines.append("</ElementData>")
-    for i in range(3):
-        lines.append(f'<ElementData name="cell_dimension_{i + 1}" data_type="scalar" elem_set="body">')
-        lines += _rows('<elem lid="{number}">{values}</elem>', fibres.dimensions[:, i : i + 1])
+    maps = {f"cell_dimension_{i + 1}": fibres.dimensions[:, i] for i in range(3)} | dict(fibres.others)
+    for name, values in maps.items():
+        kind = "mat3" if name == NATURAL_GRADIENT else "scalar"
+        lines.append(f'<ElementData name="{name}" data_type="{kind}" elem_set="body">')
+        lines += _rows('<elem lid="{number}">{values}</elem>', values.reshape(len(values), -1))
         lines.append("</ElementData>")
     _write(path, [*lines, "</MeshData>", "</febio_spec>"])
 
@@ -187,6 +204,7 @@ def _abaqus(path: Path, fibres: Fibres) -> None:
     _write(path, [*lines, *_rows("** cell_dimensions,{number},{values}", fibres.dimensions)])
 
 
+WITH_OTHERS = ("vtu", "febio")
 # format: ending of its files, and what writes one
 FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
     "vtu": (".vtu", _vtu),

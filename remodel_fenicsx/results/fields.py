@@ -18,11 +18,11 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
-from remodel_fenicsx.model.axes import LocalAxes
+from remodel_fenicsx.model.axes import NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, REGION, UNLOADED
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, NO_PRESTRETCH, REGION, UNLOADED
 from remodel_fenicsx.schema import SAME_TIME, same_time
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state import State
@@ -31,12 +31,12 @@ from remodel_fenicsx.system.files import ClosedAtEnd
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
+OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains", NATURAL_GRADIENT))
 
 
 def field_names(
     asked: bool | Sequence[str],
-    lacking: Collection[str] = (REGION, UNLOADED, *TURNED_OVER),
+    lacking: Collection[str] = (REGION, *NO_PRESTRETCH, *TURNED_OVER),
     constant: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks."""
@@ -190,12 +190,16 @@ class Fields(Watcher, ClosedAtEnd):
         self._displacement = NodalGather(domain, self.state)
         quadrature, local_axes = self.state.cells.quadrature, self.state.cells.local_axes
         constant = local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
+        G = self.state.natural_gradient
+        if NATURAL_GRADIENT in self.names and G is not None:
+            constant[NATURAL_GRADIENT] = quadrature.element_mean(G).reshape(-1, 9)
         self._constant = {
             name: domain.gather_elements(values) for name, values in constant.items() if name in self.names
         }
         points, elements = domain.gather_mesh()
         self._grid: TransientGrid | None = None
         self._chains: TransientGrid | None = None
+        self._solved: dict[str, Array] | None = None  # fields of a step that is not committed yet
         if points is not None and elements is not None:
             geometry = domain.mesh.geometry.cmap
             cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), geometry.degree, elements)
@@ -211,29 +215,36 @@ class Fields(Watcher, ClosedAtEnd):
     def started(self, step: Step) -> None:
         """Write the start."""
         self.append(step.time)
+        self.publish()
 
     def solved(self, step: Step) -> None:
-        """Write the solved state, if it is its turn."""
+        """Note the solved state, if it is its turn."""
         asked = any(same_time(time, step.time) for time in self.times)
-        if step.number % self.every == 0 or step.is_last or asked:
-            self.append(step.time)
+        is_due = step.number % self.every == 0 or step.is_last or asked
+        self._solved = self._gathered() if is_due else None
 
-    def undone(self, step: Step) -> None:
-        """Take back what was written of it."""
-        for grid in (self._grid, self._chains):
-            if grid is not None and grid.last_time == step.time:
-                grid.drop_last()
+    def committed(self, step: Step) -> None:
+        """Write what was noted."""
+        if self._solved is not None:
+            self._write(step.time, self._solved)
 
     # ------------------------------------------------------------ writing
     def append(self, time: float) -> None:
         """Write the present state as the state of `time`. Collective."""
-        displacement = self._displacement()
-        gathered = {name: self.domain.gather_elements(values) for name, values in self._element_fields().items()}
-        if self._grid is None or displacement is None:
+        self._write(time, self._gathered())
+
+    def _gathered(self) -> dict[str, Array]:
+        """The fields of the present state on rank 0, nothing on others. Collective."""
+        local = {name: self.domain.gather_elements(values) for name, values in self._element_fields().items()}
+        found = local | {"displacement": self._displacement()}
+        return {name: values for name, values in found.items() if values is not None}
+
+    def _write(self, time: float, fields: dict[str, Array]) -> None:
+        if self._grid is None:
             return
-        fields = {name: values for name, values in gathered.items() if values is not None}
+        displacement = fields["displacement"]
         at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
-        changing = {name: fields[name] for name in fields if name in self.names}
+        changing = {name: fields[name] for name in fields if name in self.names and name != "displacement"}
         constant = {name: values for name, values in self._constant.items() if values is not None}
         self._grid.append(time, at_nodes, changing, constant=constant)
         if "chains" in self.names:
@@ -241,6 +252,12 @@ class Fields(Watcher, ClosedAtEnd):
                 axis=1
             )
             self._chains = append_chains(grid, time, self._centres, self._scale, middle, fields)
+
+    def publish(self) -> None:
+        """Let readers see all that is written so far, and a run go on with it that is killed from here on."""
+        for grid in (self._grid, self._chains):
+            if grid is not None:
+                grid.publish()
 
     def close(self) -> None:
         """Close the files."""

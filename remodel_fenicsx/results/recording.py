@@ -7,10 +7,9 @@ import fcntl
 import os
 import re
 import socket
-import time
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
-from functools import cached_property, wraps
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -73,7 +72,6 @@ Array = NDArray[np.float64]
 
 HISTORY, FIELDS, CHAIN_LINES, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
 LOG, STUDY = "run.log", "study.json"  # of a run; which runs a study has
-TRIES, BETWEEN_TRIES = 5, 0.1  # seconds: a step is written in a few milliseconds
 LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a thousand characters each
 
 
@@ -100,25 +98,6 @@ class HistoryColumns(dict[str, Array]):
         except ImportError as error:
             raise ImportError("history.frame() needs pandas, which is not installed; the columns need not") from error
         return pandas.DataFrame(dict(self))
-
-
-def _tried_again(read: Callable[..., Any]) -> Any:
-    """A reader that is not the last to speak: where a run is writing a step it reads again, a few times."""
-
-    @wraps(read)
-    def reading(self: RecordedRun, *arguments: Any, **others: Any) -> Any:
-        for _ in range(TRIES):
-            try:
-                return read(self, *arguments, **others)
-            except RecordingError:
-                with suppress(OSError):
-                    if writer(self.path)[1]:
-                        time.sleep(BETWEEN_TRIES)
-                        continue
-                raise
-        return read(self, *arguments, **others)
-
-    return reading
 
 
 class RecordedRun:
@@ -173,7 +152,6 @@ class RecordedRun:
 
     # ------------------------------------------------------------ history
     @cached_property
-    @_tried_again
     def history(self) -> HistoryColumns:
         """Columns of history.csv by name, arrays (rows,); `history.frame()` is a pandas DataFrame.
 
@@ -198,7 +176,6 @@ class RecordedRun:
 
     # ------------------------------------------------------------ fields
     @cached_property
-    @_tried_again
     def times(self) -> Array:
         """Times at which fields are recorded, (n,); none if the run wrote no fields.
 
@@ -214,7 +191,6 @@ class RecordedRun:
             return _block(steps["Values"], 0, int(steps.attrs["NSteps"]))
 
     @cached_property
-    @_tried_again
     def points(self) -> Array:
         """Reference coordinates of the nodes, (nodes, 3).
 
@@ -227,7 +203,6 @@ class RecordedRun:
             return _block(root["Points"], 0, int(root["NumberOfPoints"][0]))
 
     @cached_property
-    @_tried_again
     def elements(self) -> NDArray[np.int64]:
         """Numbers of the nodes of each element in VTK's order, (elements, nodes of one).
 
@@ -243,7 +218,6 @@ class RecordedRun:
                 raise RecordingError("elements have nodes that are not there")
             return numbers
 
-    @_tried_again
     def fields(self, time: float, names: Collection[str] | None = None) -> dict[str, Array]:
         """The fields at a recorded time by name: at nodes, (nodes, ...), and means over elements, (elements, ...).
 

@@ -31,7 +31,7 @@ from remodel_fenicsx.results.recording import (
     SCENE,
     is_vacant,
 )
-from remodel_fenicsx.results.vtkhdf import check_file
+from remodel_fenicsx.results.vtkhdf import recorded_steps
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.files import ClosedAtEnd, open_own, read_regular, write_whole
 
@@ -123,7 +123,8 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
     size_of_rows(folder / HISTORY, after)
     for name in (FIELDS, CHAIN_LINES) if fields else ():
         if os.path.lexists(folder / name):
-            check_file(folder / name)
+            for _ in recorded_steps(folder / name):
+                pass
 
 
 def forget_steps(folder: Path) -> None:

@@ -7,34 +7,46 @@ a parallel run rank 0 writes arrays that were gathered in the mesh file's order.
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import io
 import os
+import shutil
 import signal
-import struct
 import threading
-import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.system.files import ClosedAtEnd, open_own
+from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, part_of
 
 if TYPE_CHECKING:
     import h5py
 
+Array = NDArray[Any]
+Fields = Mapping[str, ArrayLike]
 
-# ---------------------------------------------------------------- a file that a full disk or a kill cannot spoil
-# HDF5 changes a few bytes in the middle of a file at each step. They stand behind its end before they are changed, in
-# this format since 0.1.0: a run that was killed meanwhile goes on.
-
-_CHANGE = struct.Struct("<QQ")  # offset and length, before the bytes
-_END = struct.Struct("<QI8s")  # length and check sum of the changes before it
-_MARK = b"remodel1"
+VERSION = (2, 2)
+# cell name of dolfinx: type of VTK for degree 1, for any higher degree ("Lagrange")
+CELL_TYPES = {
+    "interval": (3, 68),
+    "triangle": (5, 69),
+    "quadrilateral": (9, 70),
+    "tetrahedron": (10, 71),
+    "hexahedron": (12, 72),
+}
+LINE = 3
+_STEPS_PER_CHUNK = 256
+_OF_TOPOLOGY = ("Steps/CellOffsets", "Steps/ConnectivityIdOffsets")
+_ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
+# of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
+# floats become smaller by a fifth only, and a step would take twice as long
+_COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
 @contextmanager
@@ -54,149 +66,38 @@ def signals_held_back() -> Iterator[None]:
             signal.raise_signal(number)
 
 
-class StagedFile(io.RawIOBase):
-    """The file below h5py: what HDF5 writes waits in memory until `commit`."""
+class PatientFile(io.FileIO):
+    """The file below h5py. A write that fails is said when HDF5 has returned, which would crash the process."""
 
-    def __init__(self, path: Path, existing: bool = False):
-        self._descriptor = -1
-        super().__init__()
-        self._descriptor = open_own(path, os.O_RDWR | (0 if existing else os.O_CREAT | os.O_EXCL))
-        if existing:
-            self._finish_changes()
-        self._committed = self._end = os.fstat(self._descriptor).st_size
-        self._writes: list[tuple[int, bytes]] = []  # what waits, in order
-        self._position = 0
+    fault: OSError | None = None
 
-    def readable(self) -> bool:
-        return True
-
-    def writable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._end}[whence]
-        return self._position
-
-    def readinto(self, buffer: Any) -> int:
-        start, size = self._position, max(0, min(len(buffer), self._end - self._position))
-        data = bytearray(os.pread(self._descriptor, size, start).ljust(size, b"\0"))
-        for offset, change in self._writes:
-            low, high = max(start, offset), min(start + size, offset + len(change))
-            if low < high:
-                data[low - start : high - start] = change[low - offset : high - offset]
-        buffer[:size] = data
-        self._position += size
-        return size
-
-    def write(self, buffer: Any) -> int:
-        data = bytes(buffer)
-        self._writes.append((self._position, data))
-        self._position += len(data)
-        self._end = max(self._end, self._position)
-        return len(data)
-
-    def truncate(self, size: int | None = None) -> int:
-        # a file that is longer than its header says is valid: what is on the disk stays
-        self._end = max(self._committed, self._position if size is None else size)
-        return self._end
-
-    def commit(self) -> None:
-        """Bring everything to the disk, or raise OSError and keep it for the next time."""
-        changes: list[tuple[int, bytes]] = []
-        tail = bytearray(self._end - self._committed)
-        for offset, data in self._writes:
-            old = max(0, min(len(data), self._committed - offset))
-            changes += [(offset, data[:old])] if old else []
-            start = offset + old - self._committed
-            tail[start : start + len(data) - old] = data[old:]
-        # HDF5's superblock, at offset 0, says how long the file is: first, for chunk indices will name the new end
-        changes.sort(key=lambda change: change[0] > 0)
-        try:
-            self._write_all(self._committed, tail + _journal(changes))
-            os.fdatasync(self._descriptor)  # some file systems find out only now that they are full
-        except OSError:
-            os.ftruncate(self._descriptor, self._committed)
-            raise
-        self._make_changes(changes, self._end)
-        self._committed, self._writes = self._end, []
-
-    def _make_changes(self, changes: list[tuple[int, bytes]], end: int) -> None:
-        """Write over the old part, and only then forget what was to be written, which stands behind `end`."""
-        for offset, change in changes:
-            self._write_all(offset, change)
-        if changes:
-            os.fdatasync(self._descriptor)
-            os.ftruncate(self._descriptor, end)
-
-    def _finish_changes(self) -> None:
-        """Make the changes of a commit that was cut off."""
-        size = os.fstat(self._descriptor).st_size
-        end = os.pread(self._descriptor, _END.size, max(0, size - _END.size))
-        length, check_sum, mark = _END.unpack(end) if len(end) == _END.size else (0, 0, b"")
-        start = size - _END.size - length
-        if mark != _MARK or start < 0:
-            return
-        journal = os.pread(self._descriptor, length, start)
-        if zlib.crc32(journal) != check_sum:
-            return
-        changes, position = [], 0
-        while position < length:
-            offset, count = _CHANGE.unpack_from(journal, position)
-            position += _CHANGE.size + count
-            changes.append((offset, journal[position - count : position]))
-        self._make_changes(changes, start)
-
-    def close(self) -> None:
-        descriptor, self._descriptor = self._descriptor, -1
-        if descriptor >= 0:
-            os.close(descriptor)
-        super().close()
-
-    def _write_all(self, offset: int, data: bytes | bytearray) -> None:
+    def write(self, data: Any) -> int:
         view = memoryview(data)
-        while view:
-            written = os.pwrite(self._descriptor, view, offset)
-            view, offset = view[written:], offset + written
+        try:
+            while view:
+                view = view[super().write(view) :]
+        except OSError as error:
+            self.fault = error
+        return memoryview(data).nbytes
+
+    def check(self) -> None:
+        """Raise what went wrong."""
+        if self.fault is not None:
+            raise self.fault
 
 
-def _journal(changes: list[tuple[int, bytes]]) -> bytes:
-    """Changes as bytes; nothing for none."""
-    if not changes:
-        return b""
-    whole = b"".join(_CHANGE.pack(offset, len(change)) + change for offset, change in changes)
-    return whole + _END.pack(len(whole), zlib.crc32(whole), _MARK)
+class RecordedStep(NamedTuple):
+    """What `TransientGrid.append` takes."""
 
-
-Array = NDArray[Any]
-Fields = Mapping[str, ArrayLike]
-
-VERSION = (2, 2)
-# cell name of dolfinx: type of VTK for degree 1, for any higher degree ("Lagrange")
-CELL_TYPES = {
-    "interval": (3, 68),
-    "triangle": (5, 69),
-    "quadrilateral": (9, 70),
-    "tetrahedron": (10, 71),
-    "hexahedron": (12, 72),
-}
-LINE = 3
-_STEPS_PER_CHUNK = 256
-_OF_TOPOLOGY = ("Steps/CellOffsets", "Steps/ConnectivityIdOffsets")
-_ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
-_LARGEST_RATIO = 1100  # deflate makes nothing smaller than a 1032nd: a block that claims more is not there
-_ROWS_AT_ONCE = 10**6  # values that are read together where a whole file is checked
-# with these bounds HDF5 sets no "open for writing" mark, which a killed process would leave for ever
-_VERSIONS = ("earliest", "v110")
-# of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
-# floats become smaller by a fifth only, and a step would take twice as long
-_COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+    time: float
+    point_data: Fields
+    cell_data: Fields
+    points: ArrayLike | None = None
+    constant: Fields = {}
 
 
 class TransientGrid(ClosedAtEnd):
-    """A time series on one grid; the file is whole after the constructor and after every `append`."""
+    """A time series on one grid, written beside its place: `publish` and the end give it its name, whole."""
 
     def __init__(
         self,
@@ -206,40 +107,49 @@ class TransientGrid(ClosedAtEnd):
         cell_type: int,
         *,
         point_dtype: DTypeLike = np.float64,
+        replaces: bool = False,
     ):
-        with self._opened(path, "w"):
-            self._make(np.asarray(points, dtype=point_dtype), np.asarray(cells, dtype=np.int64), cell_type)
+        if os.path.lexists(path) and not replaces:
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+        self.path, self._part = path, part_of(path)
+        self._part.unlink(missing_ok=True)  # of a process that was killed
+        self.number_of_steps, self._has_published = 0, False
+        self._open("x+")
+        with self._written() as file:
+            self._make(file.create_group("VTKHDF"), np.asarray(points, point_dtype), np.asarray(cells), cell_type)
 
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
-        """Open a file again, to append after its steps up to `time`; later ones are dropped."""
-        grid = cls.__new__(cls)
-        with damage_named(path), grid._opened(path, "r+"):
-            grid._root = grid._file["VTKHDF"]
-            times = grid._root["Steps/Values"][: int(grid._root["Steps"].attrs["NSteps"])]
-            grid._count(int(np.searchsorted(times, time, side="right")))
-        return grid
-
-    @contextmanager
-    def _opened(self, path: Path, mode: str) -> Iterator[None]:
-        """Within, a file that was just opened is filled or looked at; it stays open unless that fails."""
+        """With the steps of a file up to `time`, to append more."""
         import h5py
 
-        self.path, self.number_of_steps, self.last_time = path, 0, -np.inf
+        with damage_named(path), h5py.File(path, "r") as file:
+            root = file["VTKHDF"]
+            points, cell_type = root["Points"][: int(root["NumberOfPoints"][0])], int(root["Types"][0])
+            cells = root["Connectivity"][:].reshape(int(root["NumberOfCells"][0]), -1)
+        grid = cls(path, points, cells, cell_type, point_dtype=points.dtype, replaces=True)
+        grid._take_over(time)
+        return grid
+
+    def _take_over(self, until: float = np.inf) -> None:
+        """Append the steps of the published file that this one lacks."""
+        for step in recorded_steps(self.path, self.number_of_steps):
+            if step.time <= until:
+                self.append(*step)
+
+    def _open(self, mode: str) -> None:
+        import h5py
+
+        self._disk = PatientFile(self._part, mode)
+        self._file = h5py.File(self._disk, "w" if mode == "x+" else "r+")
+
+    @contextmanager
+    def _written(self) -> Iterator[h5py.File]:
+        """Within, HDF5 writes; no signal comes between, whose handler might raise in `PatientFile.write`."""
         with signals_held_back():
-            self._staged = StagedFile(path, existing=mode == "r+")
-            # a file that is no HDF5 stays open where this fails: h5py still flushes it when it lets go of it
-            self._file = h5py.File(self._staged, mode, libver=_VERSIONS)
-            try:
-                yield
-                self._file.flush()
-                self._staged.commit()
-            except BaseException:
-                self._file.close()
-                self._staged.close()
-                if mode == "w":  # not even begun
-                    path.unlink(missing_ok=True)
-                raise
+            yield self._file
+            self._file.flush()
+        self._disk.check()
 
     def append(
         self,
@@ -249,71 +159,93 @@ class TransientGrid(ClosedAtEnd):
         points: ArrayLike | None = None,
         constant: Fields | None = None,
     ) -> None:
-        """Add one step and bring it to the disk; points are given at every step or at none."""
-        step, root = self.number_of_steps, self._root
+        """Add one step; points are given at every step or at none."""
+        if self._disk.closed:
+            self._go_on()
+        step = self.number_of_steps
         kinds = (("PointData", point_data, step), ("CellData", cell_data, step), ("CellData", constant, 0))
-        with signals_held_back():
+        # offsets that stay 0 say that the mesh is the one of the first step
+        numbers: dict[str, float] = dict.fromkeys(_ALWAYS_0, 0)
+        numbers |= {"Steps/NumberOfParts": 1, "Steps/PointOffsets": 0, "Steps/Values": time}
+        with self._written() as file:
+            root = file["VTKHDF"]
             for kind, fields, place in kinds:
                 for name, block in ((f"{kind}/{name}", np.asarray(values)) for name, values in (fields or {}).items()):
                     if name not in root:  # a chunk is a step, which readers take as a whole
-                        _create(root, name, np.float32, block.shape, fletcher32=True)
+                        _create(root, name, np.float32, block.shape)
                         _create(root, _offsets(name), np.int64, (_STEPS_PER_CHUNK,))
                     _write(root[name], place, block)
                     _write(root[_offsets(name)], step, [place * len(block)])
-            # offsets that stay 0 say that the mesh is the one of the first step
-            numbers: dict[str, float] = dict.fromkeys(_ALWAYS_0, 0)
-            numbers |= {"Steps/NumberOfParts": 1, "Steps/PointOffsets": 0, "Steps/Values": time}
             if points is not None:  # block 0 is the reference configuration
                 _write(root["Points"], step + 1, points)
                 numbers["Steps/PointOffsets"] = (step + 1) * len(np.asarray(points))
             for name, number in numbers.items():
                 columns = (1,) if name in _OF_TOPOLOGY else ()  # one for each kind of topology
                 _write(root[name], step, np.full((1, *columns), number))
-            self._file.flush()
-            # the number of steps comes last: until then a reader sees the series without this step
-            self.number_of_steps, self.last_time = step + 1, time
             root["Steps"].attrs.modify("NSteps", np.int64(step + 1))
-            self._file.flush()
-            self._staged.commit()
+            self.number_of_steps = step + 1
 
-    def drop_last(self) -> None:
-        """Take the last step back; the next `append`, or `close`, brings that to the disk."""
-        with signals_held_back():
-            self._count(self.number_of_steps - 1)
+    def publish(self) -> None:
+        """Give the file its name; keep the one that had it, to go on there."""
+        if self._disk.closed:
+            return
+        older = self.path.with_name(f"{self.path.name}.older")
+        older.unlink(missing_ok=True)
+        if self._has_published:  # else it is of another run, or begins otherwise
+            with suppress(OSError):  # a file system without hard links
+                os.link(self.path, older)
+        self._give_name()
+        self._has_published = True
+        if older.exists():
+            older.rename(self._part)
 
-    def _count(self, number: int) -> None:
-        """The file has so many steps from now on."""
-        steps = self._root["Steps"]
-        steps["Values"].resize(number, axis=0)  # VTK takes as many as stand there
-        steps.attrs.modify("NSteps", np.int64(number))
-        self.number_of_steps, self.last_time = number, float(steps["Values"][-1]) if number else -np.inf
+    def _go_on(self) -> None:
+        """Append to the file that had the name before, where nobody reads it any more, or else to a copy."""
+        with suppress(FileNotFoundError), open(self._part, "rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # HDF5's readers lock what they read
+            except BlockingIOError:
+                self._part.unlink()
+        if not self._part.exists():
+            shutil.copyfile(self.path, self._part)
+        self._open("r+")
+        self.number_of_steps = int(self._file["VTKHDF/Steps"].attrs["NSteps"])
+        self._take_over()
+
+    def _give_name(self) -> None:
+        try:
+            with signals_held_back():
+                self._file.close()
+            self._disk.check()
+            os.fsync(self._disk.fileno())
+            self._part.replace(self.path)
+        finally:  # what is not whole goes
+            self._disk.close()
+            self._part.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Write what is not yet on the disk and close; more than once does no harm."""
-        if self._staged.closed:
-            return
-        with signals_held_back():
-            try:
-                self._file.close()
-                self._staged.commit()
-            finally:
-                self._staged.close()
+        """Give the file its name, if it is whole, for good; more than once does no harm."""
+        try:
+            if not self._disk.closed:
+                self._give_name()
+        finally:
+            self._part.unlink(missing_ok=True)
 
-    def _make(self, points: Array, cells: Array, cell_type: int) -> None:
+    @staticmethod
+    def _make(root: h5py.Group, points: Array, cells: Array, cell_type: int) -> None:
         """Write the mesh, and no steps."""
-        self._root = root = self._file.create_group("VTKHDF")
         root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
         root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
         for name, number in {"Points": len(points), "Cells": len(cells), "ConnectivityIds": cells.size}.items():
             root[f"NumberOf{name}"] = np.array([number], dtype=np.int64)
-        _create(root, "Points", points.dtype, points.shape, fletcher32=True)
+        _create(root, "Points", points.dtype, points.shape)
         _write(root["Points"], 0, points)
-        root.create_dataset("Connectivity", data=cells.ravel(), **_COMPRESSION)
+        kinds = np.full(len(cells), cell_type, dtype=np.uint8)
+        root.create_dataset("Connectivity", data=cells.astype(np.int64).ravel(), **_COMPRESSION)
         root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
-        root.create_dataset("Types", data=np.full(len(cells), cell_type, dtype=np.uint8), **_COMPRESSION)
+        root.create_dataset("Types", data=kinds, **_COMPRESSION)
         for group in ("PointData", "CellData", "Steps/PointDataOffsets", "Steps/CellDataOffsets"):
             root.create_group(group)
-        # no check sum: these chunks are written over, and a reader must find the file whole between two writes
         _create(root, "Steps/Values", np.float64, (_STEPS_PER_CHUNK,))
         for name in ("Steps/NumberOfParts", "Steps/PointOffsets", *_ALWAYS_0):
             columns = (1,) if name in _OF_TOPOLOGY else ()
@@ -326,10 +258,10 @@ def _offsets(field: str) -> str:
     return "Steps/" + field.replace("/", "Offsets/", 1)
 
 
-def _create(group: h5py.Group, name: str, dtype: DTypeLike, chunk: tuple[int, ...], fletcher32: bool = False) -> None:
-    """An empty dataset that grows by rows; with `fletcher32` every chunk has a check sum."""
+def _create(group: h5py.Group, name: str, dtype: DTypeLike, chunk: tuple[int, ...]) -> None:
+    """An empty dataset that grows by rows, with a check sum of every chunk."""
     shape = (0, *chunk[1:]), dtype
-    group.create_dataset(name, *shape, maxshape=(None, *chunk[1:]), chunks=chunk, fletcher32=fletcher32)
+    group.create_dataset(name, *shape, maxshape=(None, *chunk[1:]), chunks=chunk, fletcher32=True)
 
 
 def _write(dataset: h5py.Dataset, number: int, block: ArrayLike) -> None:
@@ -356,6 +288,7 @@ def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple
 def damage_named(path: Path) -> Iterator[None]:
     """Within, HDF5's errors say in one line that the file is damaged; those of the disk stay what they are."""
     try:
+        check_regular(path)
         yield
     except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # the disk's have a number, HDF5's none
@@ -365,44 +298,29 @@ def damage_named(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: is damaged or of another kind: {words}; {remedy}") from error
 
 
-def check_file(path: Path) -> None:
-    """Read a file of `TransientGrid` as a whole, so that damage and what is foreign are noticed. Nothing is changed."""
+def recorded_steps(path: Path, first: int = 0) -> Iterator[RecordedStep]:
+    """The steps of a file of `TransientGrid` from this one on; what does not belong there is an error."""
     import h5py
 
-    os.close(open_own(path, os.O_RDONLY))
     with damage_named(path), h5py.File(path, "r") as file:
-        _check_group(file["VTKHDF"], _LARGEST_RATIO * path.stat().st_size)
-        _check_steps(file["VTKHDF"])
+        root, number = file["VTKHDF"], int(file["VTKHDF/Steps"].attrs["NSteps"])
+        times = root["Steps/Values"][:number]
+        if len(times) != number or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise ValueError("the times of its steps do not increase")
+        for step in range(first, number):
+            points = {name: _recorded(root, "Point", name, step)[0] for name in root["PointData"]}
+            cells = {name: _recorded(root, "Cell", name, step) for name in root["CellData"]}
+            changing, constant = ({n: v for n, (v, stays) in cells.items() if stays is kind} for kind in (False, True))
+            place, size = int(root["Steps/PointOffsets"][step]), int(root["NumberOfPoints"][0])
+            moved = root["Points"][place : place + size] if place else None
+            yield RecordedStep(float(times[step]), points, changing, moved, constant)
 
 
-def _check_group(group: h5py.Group, most: int) -> None:
-    import h5py
-
-    for name in group:
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise ValueError(f"{group.name}/{name} is a link to elsewhere")
-        entry = group[name]
-        if isinstance(entry, h5py.Group):
-            _check_group(entry, most)
-        elif entry.nbytes > most:
-            raise ValueError(f"{entry.name} claims {entry.nbytes} bytes")
-        elif entry.is_virtual or entry.external:
-            raise ValueError(f"{entry.name} is kept in another file")
-        else:
-            rows = max(1, _ROWS_AT_ONCE // max(1, int(np.prod(entry.shape[1:])))) if entry.shape else 1
-            for start in range(0, entry.shape[0] if entry.shape else 0, rows):
-                entry[start : start + rows]
-
-
-def _check_steps(root: h5py.Group) -> None:
-    steps, number = root["Steps"], int(root["Steps"].attrs["NSteps"])
-    times = steps["Values"][:number]
-    if len(times) != number or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise ValueError("the times of its steps do not increase")
-    for kind, unit in (("PointData", "NumberOfPoints"), ("CellData", "NumberOfCells")):
-        size = int(root[unit][0])
-        for name, offsets in steps[f"{kind}Offsets"].items():
-            places = offsets[:number]
-            at_every_step, once = (places == size * np.arange(number)).all(), not places.any()  # constant ones
-            if not (at_every_step or once) or len(root[kind][name]) < places[-1:].sum() + size * bool(number):
-                raise ValueError(f"the values of {name} are not where they belong")
+def _recorded(root: h5py.Group, kind: str, name: str, step: int) -> tuple[Array, bool]:
+    """Values of a field in a step; whether they are those of the first step."""
+    values, size = root[f"{kind}Data"][name], int(root[f"NumberOf{kind}s"][0])
+    start = int(root[f"Steps/{kind}DataOffsets"][name][step])
+    block = values[start : start + size]
+    if values.is_virtual or values.external or start not in (0, step * size) or len(block) != size:
+        raise ValueError(f"the values of {name} are not where they belong")
+    return block, start < step * size

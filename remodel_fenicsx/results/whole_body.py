@@ -15,9 +15,9 @@ from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.axes import NATURAL_GRADIENT
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
-from remodel_fenicsx.system.files import part_of
 
 spatial = Late("scipy.spatial")  # most runs show no reduction
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ class TurnedFields:
         found = {name: values[self.sources] for name, values in fields.items() if name != "displacement"}
         for name in set(found) & {*AXIS_FIELDS, *DIRECTION_FIELDS}:
             found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
-        for name in set(found) & set(TENSOR_FIELDS):
+        for name in set(found) & {*TENSOR_FIELDS, NATURAL_GRADIENT}:
             tensors = found[name].reshape(-1, 3, 3)
             turned = self.element_turns @ tensors @ np.swapaxes(self.element_turns, 1, 2)
             found[name] = turned.reshape(-1, 9)
@@ -208,23 +208,17 @@ def revolve(folder: Path | str) -> list[Path]:
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     image = _Image(recording, recording.scene.geometry.reductions[name].turn)
-    parts = [part_of(path) for path in paths]
-    for part in parts:
-        part.unlink(missing_ok=True)  # of one that was killed
-    with TransientGrid(parts[0], image.points, image.cells, image.cell_type) as grid:
-        chains: TransientGrid | None = None
-        for time in recording.times:
-            displacement, fields = image(recording.fields(float(time)))
-            grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
-            if displacement is not None and set(OF_CHAINS) <= set(fields):
-                middle = displacement[image.elements].mean(axis=1)
-                chains = append_chains(chains or parts[1], float(time), image.centres, image.scale, middle, fields)
-        if chains is not None:
-            chains.close()
-    written = [path for part, path in zip(parts, paths, strict=True) if part.exists()]
-    for path in reversed(written):  # the body last: where it is, all are
-        part_of(path).rename(path)
-    return written
+    grid, chains = TransientGrid(paths[0], image.points, image.cells, image.cell_type), None
+    for time in recording.times:
+        displacement, fields = image(recording.fields(float(time)))
+        grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
+        if displacement is not None and set(OF_CHAINS) <= set(fields):
+            middle = displacement[image.elements].mean(axis=1)
+            chains = append_chains(chains or paths[1], float(time), image.centres, image.scale, middle, fields)
+    for each in (chains, grid):  # the body last: where it is, all are
+        if each is not None:
+            each.close()
+    return [path for path in paths if path.exists()]
 
 
 class _Image(TurnedFields):

@@ -16,7 +16,7 @@ from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS, Chain
 from remodel_fenicsx.model.laws import COMPLEX_STEP
 from remodel_fenicsx.schema.settings import Cells, Material, Remodeling, STRESS_UNITS, in_region
 from remodel_fenicsx.schema.tables import fault, is_number, quoted
-from remodel_fenicsx.schema.toml import merged, put
+from remodel_fenicsx.schema.text import merged, put
 
 # ---------------------------------------------------------------- without a preset
 

@@ -46,7 +46,7 @@ from remodel_fenicsx.schema.settings import (
     Solver,
     Supports,
     Time,
-    UNLOADED,
+    NO_PRESTRETCH,
     faces_of,
     in_region,
 )
@@ -63,7 +63,7 @@ from remodel_fenicsx.schema.tables import (
     quoted,
     shown,
 )
-from remodel_fenicsx.schema.toml import merged, parse_override, put, read_toml, toml_text
+from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
 
 
@@ -411,7 +411,7 @@ class Scene(Table):
         """Fields that the body has not, each with the reason."""
         found = {} if self.regions else {REGION: "the scene has no regions"}
         same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
-        found |= {UNLOADED: same} if self.natural.is_of_the_mesh else {}
+        found |= dict.fromkeys(NO_PRESTRETCH, same) if self.natural.is_of_the_mesh else {}
         stays = "it changes only with remodeling.turnover, which is not set"
         return found | ({} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays))
 

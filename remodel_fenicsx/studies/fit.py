@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import ctypes
 import hashlib
-import io
 import json
 import logging
 import re
@@ -16,14 +14,12 @@ from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from html import escape
 from itertools import product
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -31,20 +27,17 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError
-from remodel_fenicsx.report.page import Card, folded, section, table as card_table
-from remodel_fenicsx.report.page import page_with
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema.csv_table import TableFileError, read_columns
 from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.tables import Table, fault, shown
-from remodel_fenicsx.schema.toml import read_toml
+from remodel_fenicsx.schema.text import TableFileError, read_columns, read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
 from remodel_fenicsx.simulation import Simulation, begin_again, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
-from remodel_fenicsx.studies.page import COLOURS, DOTS_PER_INCH, STYLE, Answer, Page, label, made_with, panels
+from remodel_fenicsx.studies.page import COLOURS, Answer, Page, label, made_with, panels
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
 from remodel_fenicsx.system.terminal import Line, hold_log, open_log, unsaid
@@ -446,25 +439,6 @@ PROFILE_STEP, PROFILE_REACH = 1.0, 4.0  # standard deviations of the straight li
 ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
-_MODULI = ("lame_lambda", "lame_mu", "chain_density", "initial_stiffness", "persistence_length", "temperature")
-KNOWN_GROUPS: list[tuple[set[str], str]] = [
-    (
-        {f"material.{key}" for key in ("chain_density", "persistence_length", "temperature", "energy_factor")},
-        "only their product c = omega k theta n / (4 A_p) is in the energy",
-    ),
-    (
-        {"material.chain_density", "material.initial_stiffness", "material.persistence_length"},
-        "both are the stiffness of the network",
-    ),
-    ({"material.contour_length", "material.locking_stretch"}, "both are the length at which a chain locks"),
-    ({"remodeling.kappa", "remodeling.half_life"}, "the half-life is ln 2 / kappa"),
-    (
-        {"remodeling.threshold", "loads.pressure.value", "scale.pressure"} | {f"material.{key}" for key in _MODULI},
-        "without a measured force, all stresses may be multiplied by one factor",
-    ),
-]
-"""Unknowns that go together, and why; the first group that has all of them counts."""
-
 
 class Problem:
     """Residuals over their standard deviations as a function of the logarithms of the unknowns."""
@@ -540,18 +514,13 @@ class Problem:
             return
         blind = directions[-1] * np.sign(directions[-1][np.abs(directions[-1]).argmax()])
         pairs = [(u.key, part) for u, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
-        keys, named = [key for key, _ in pairs], [f"{key} ({part:+.2f})" for key, part in pairs]
+        named = [f"{key} ({part:+.2f})" for key, part in pairs]
         if len(named) == 1:
-            raise SceneError(f"unknowns: {keys[0]} changes nothing that is measured; fix it or give it a prior")
+            raise SceneError(f"unknowns: {pairs[0][0]} changes nothing that is measured; fix it or give it a prior")
         raise SceneError(
             f"unknowns: the data cannot tell apart {', '.join(named)}: changed together by these powers of a factor "
-            f"they give the same measurements{_reason(keys)}; fix one of them or give it a prior"
+            f"they give the same measurements; fix one of them or give it a prior"
         )
-
-
-def _reason(keys: Sequence[str]) -> str:
-    """Why unknowns go together, where it is known."""
-    return next((f" ({words})" for group, words in KNOWN_GROUPS if set(keys) <= group and len(set(keys)) > 1), "")
 
 
 class NoStart(RemodelError):  # noqa: N818
@@ -836,7 +805,7 @@ class Fit(Answer):
         return text + (f" At the edge of what is allowed: {', '.join(edges)}." if edges else "")
 
     def write(self, folder: Path) -> None:
-        """Write tables, picture and page."""
+        """Write tables and picture."""
         super().write(folder)
         notes = [self.title, made_with()]
         if self.profiles:
@@ -847,7 +816,6 @@ class Fit(Answer):
             Page(folder, "profiles").save_table(columns, notes)
         correlations = dict(zip(self.keys, self.correlations, strict=True))
         Page(folder, "correlations").save_table({"key": self.keys, **correlations}, notes)
-        write_whole(folder / "fit.html", page_with(self._cards()).encode())
 
     def figure(self) -> Figure:
         """Each measured column over the load, or time, that was prescribed."""
@@ -866,26 +834,3 @@ class Fit(Answer):
         axes.plot(x[order], modelled[order], color=COLOURS[0], label="fitted model")
         axes.set(xlabel=label(self.scene, along), ylabel=label(self.scene, name))
         axes.set_title(f"{table.name} ({table.state})", fontsize=8)
-
-    def _cards(self) -> list[Card]:
-        """All that was found, for a page like a run's report: it has title and verdict as text."""
-        with rc_context(STYLE):
-            self.figure().savefig(plain := io.BytesIO(), dpi=DOTS_PER_INCH["png"])
-        picture = base64.b64encode(plain.getvalue()).decode("ascii")
-        image = f'<img alt="measured and fitted" width="100%" src="data:image/png;base64,{picture}">'
-        note = f'<p class="note">{escape(self.verdict())}</p>'
-        numbers, pairs = [], []
-        for i, (key, value, low, high) in enumerate(zip(self.keys, self.values, self.lower, self.upper, strict=True)):
-            more = f"; profile {self.profiles[key].in_words()}" if key in self.profiles else ""
-            numbers.append((key, f"{value:.5g} (95 %: {low:.5g} to {high:.5g}{more})"))
-            pairs += [(f"{key}, {self.keys[j]}", f"{self.correlations[i, j]:+.2f}") for j in range(i)]
-        return [
-            Card("head", f'<header class="whole"><h1>{escape(self.title)}</h1>{note}</header>', {"name": self.title}),
-            Card(
-                "picture", section("Measured and fitted", image, "whole", "points with one standard deviation; lines")
-            ),
-            Card("numbers", section("Fitted numbers", card_table(numbers))),
-            Card("pairs", section("Correlations of the logarithms", card_table(pairs))),
-            Card("scene", folded("The scene with these numbers", f"<pre>{escape(self.scene.to_toml())}</pre>")),
-            Card("made", folded("Made with", f"<p>{escape(made_with())}</p>")),
-        ]

@@ -23,7 +23,6 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from scipy.spatial import KDTree
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import RemodelError
@@ -33,7 +32,7 @@ from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
-DOTS_PER_INCH = {"png": 200, "pdf": 300, "svg": 300}  # of pictures in space where all else is lines and letters
+DOTS_PER_INCH = 200
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
@@ -49,14 +48,11 @@ STYLE: dict[str, Any] = {
     "lines.linewidth": 1.6,
     "legend.frameon": False,
     "figure.facecolor": "white",
-    "pdf.fonttype": 42,  # letters that can be searched and edited
-    "svg.hashsalt": MARK,  # the same figure, the same file
 }
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
 
 
 LETTER_PLACE = (-28.0, STYLE["axes.titlepad"])  # points, from the corner of a panel
-NO_COLOURS = np.zeros((0, 3))
 
 
 class FigureError(RemodelError, ValueError):
@@ -77,7 +73,7 @@ class Page:
         """Write NAME.png; title, caption and what it was made with stand in the file."""
         made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
         about = About(f"{MARK} {__version__}", self.title, self.caption, made_with, self.name)
-        self._write(f"{self.name}.png", as_file(figure, "png", about))
+        self._write(f"{self.name}.png", as_file(figure, about))
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
         """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
@@ -184,27 +180,17 @@ class About:
     comment: str
 
 
-def as_file(figure: Figure, ending: str, about: About, colours: NDArray[np.float64] = NO_COLOURS) -> bytes:
-    """A figure as png, pdf or svg; a PNG has 256 colours, these (n, 3) in 0..1 as they are."""
-    common = {"Title": about.title, "Creator": about.made_by}
-    notes: dict[str, dict[str, Any]] = {
-        "png": {"Software": about.made_by, "Title": about.title, "Description": about.caption,
-                "Source": about.made_with, "Comment": about.comment},
-        "pdf": common | {"Subject": about.caption, "Keywords": about.made_with, "CreationDate": None},
-        "svg": common | {"Description": about.caption, "Source": about.made_with, "Date": None},
-    }  # fmt: skip
-    drawn, how = io.BytesIO(), {"format": ending, "dpi": DOTS_PER_INCH[ending], "facecolor": "white"}
-    if ending != "png":
-        figure.savefig(drawn, **how, metadata=notes[ending])  # type: ignore[arg-type]
-        return drawn.getvalue()
-    figure.savefig(drawn, **how)  # type: ignore[arg-type]
-    texts, small, dpi = PngInfo(), io.BytesIO(), DOTS_PER_INCH["png"]
-    for key, value in notes["png"].items():
+def as_file(figure: Figure, about: About) -> bytes:
+    """A figure as a PNG of 256 colours, which is a quarter as large."""
+    notes = {"Software": about.made_by, "Title": about.title, "Description": about.caption,
+             "Source": about.made_with, "Comment": about.comment}  # fmt: skip
+    drawn, small, texts, dpi = io.BytesIO(), io.BytesIO(), PngInfo(), DOTS_PER_INCH
+    figure.savefig(drawn, format="png", dpi=dpi, facecolor="white")
+    for key, value in notes.items():
         texts.add_text(key, value)
     with Image.open(drawn) as full:
-        picture = full.convert("RGB")
-        picture = Palette(picture, colours)(picture)
-        picture.save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
+        how: dict[str, Any] = {"method": Image.Quantize.MAXCOVERAGE, "kmeans": 2, "dither": Image.Dither.NONE}
+        full.convert("RGB").quantize(256, **how).save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
     return small.getvalue()
 
 
@@ -232,26 +218,6 @@ def panel_letters(*axes_of_panels: Axes) -> None:
     """Letter the panels of a figure a, b, c, ...: bold, on the line of the titles, left of the axes."""
     for letter, axes in zip("abcdefgh", axes_of_panels, strict=False):
         axes.annotate(letter, (0, 1), LETTER_PLACE, "axes fraction", "offset points", fontsize=10, fontweight="bold")
-
-
-class Palette:
-    """256 colours, with which a picture is a quarter as large: some as they are, the rest chosen for a picture."""
-
-    def __init__(self, picture: Image.Image, colours: NDArray[np.float64]):
-        kept = np.rint(255 * colours).astype(np.uint8)
-        how: dict[str, Any] = {"method": Image.Quantize.MAXCOVERAGE, "kmeans": 2, "dither": Image.Dither.NONE}
-        chosen = picture.quantize(256 - len(kept), **how).getpalette()
-        self.colours = np.concatenate([kept, np.array(chosen, dtype=np.uint8).reshape(-1, 3)[: 256 - len(kept)]])
-        self._nearest = KDTree(self.colours.astype(float))
-
-    def __call__(self, picture: Image.Image) -> Image.Image:
-        """A picture in these colours."""
-        pixels = np.asarray(picture)
-        numbers, places = np.unique(pixels @ np.array([1 << 16, 1 << 8, 1]), return_inverse=True)
-        nearest = self._nearest.query(numbers[:, None] >> [16, 8, 0] & 255, p=1)[1].astype(np.uint8)
-        result = Image.fromarray(nearest[places].reshape(pixels.shape[:2]), mode="P")
-        result.putpalette(self.colours.tobytes())
-        return result
 
 
 def _cell(value: Any) -> str:

@@ -32,7 +32,6 @@ from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 log = logging.getLogger(__name__)
 
 GROWS = 1.001  # factor: changes that no pass touches, where tension is missing, keep their size to what was iterated
-LONG_SCALE = -12.0  # lowest factor that is drawn on a linear scale
 Table = dict[str, list[float]]
 
 
@@ -45,7 +44,6 @@ SHEAR_PLANES = ((0, 1), (0, 2), (1, 2))
 LARGEST_BASIS, RESTARTS = 40, 20  # of the Krylov space
 FACTOR_ERROR = 5e-3  # absolute: enough to tell on which side of -1 or 1 a factor is
 ENDS = {"reversing": SLEPc.EPS.Which.SMALLEST_REAL, "growing": SLEPc.EPS.Which.LARGEST_REAL}
-SHARE_NAMES = ("turn_12", "turn_13", "turn_23", "lengths")
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,6 @@ class PassMode:
     factor: float
     place: tuple[float, float, float]
     volume_share: float
-    shares: dict[str, float]
 
 
 class LinearPass:
@@ -174,17 +171,12 @@ class LinearPass:
 
     def _mode(self, factor: float, change: Array) -> PassMode:
         comm, volumes = self.equilibrium.comm, self._weights**2
-        axes = self.cells.axes[: self.owned]
-        inside = axes @ change @ np.swapaxes(axes, 1, 2)
         square = np.sum(change**2, axis=(1, 2))
         first, second, whole = (
             float(comm.allreduce(np.sum(volumes * values))) for values in (square, square**2, np.ones(self.owned))
         )
-        parts = [2 * inside[:, i, j] ** 2 for i, j in SHEAR_PLANES]
-        parts.append(square - np.sum(parts, axis=0))
-        shares = [float(comm.allreduce(np.sum(volumes * part))) / first for part in parts]
         place = self.quadrature.place_of_largest(square.reshape(-1, self.quadrature.shape[1]))
-        return PassMode(factor, place, first**2 / second / whole, dict(zip(SHARE_NAMES, shares, strict=True)))
+        return PassMode(factor, place, first**2 / second / whole)
 
     # ------------------------------------------------------------ tensors as vectors
     def tensors(self, vector: Array) -> Array:
@@ -269,7 +261,7 @@ def stability(
         stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
         kinematics = scene.model.kinematics
         log.info("analysing %s at %d of %d steps, kinematics %r", scene.name, len(chosen), steps, kinematics)
-        for unseen in unseen_by(scene):
+        if unseen := unseen_by(scene):
             log.info("%s", unseen)
         progress = stack.enter_context(Progress(steps, f"{scene.name} stability", -1 if quiet else comm.rank))
         try:
@@ -285,15 +277,15 @@ def stability(
     return place, Analysis(scene, as_table(watcher, share), share)
 
 
-def unseen_by(scene: Scene) -> list[str]:
+def unseen_by(scene: Scene) -> str:
     """What an analysis on the scene's kinematics does not see, in a sentence; nothing where it sees all."""
     name = scene.model.kinematics
     if not KINEMATICS[name].reduced:
-        return []
-    return [
+        return ""
+    return (
         f"kinematics {name!r} sees changes that keep its symmetry only: passes of the whole body may multiply others "
         "by more, and the body may buckle; model.kinematics = 'full' sees all"
-    ]
+    )
 
 
 def as_table(watcher: AmplificationWatcher, share: float) -> Table:
@@ -307,8 +299,6 @@ def as_table(watcher: AmplificationWatcher, share: float) -> Table:
     for index, name in enumerate("xyz"):
         table[name] = [np.nan if mode is None else mode.place[index] for mode in reversing]
     table["volume_share"] = [np.nan if mode is None else mode.volume_share for mode in reversing]
-    for name in SHARE_NAMES:
-        table[name] = [np.nan if mode is None else mode.shares[name] for mode in reversing]
     table["growing_factor"] = [_factor(found.growing) for found in watcher.found]
     return table
 
@@ -345,8 +335,8 @@ class Analysis(Answer):
 
     def verdict(self) -> str:
         """Whether passes with the scene's coupling make small changes smaller; and what the analysis does not see."""
-        unseen = "".join(f" But {words}." for words in unseen_by(self.scene))
-        return verdict(self.columns) + unseen
+        unseen = unseen_by(self.scene)
+        return verdict(self.columns) + (f" But {unseen}." if unseen else "")
 
     def figure(self) -> Figure:
         """Factors over time."""
@@ -358,11 +348,7 @@ class Analysis(Answer):
             words = f"the share {self.share:g} of it that is made"
             axes.plot(table["time"], table["factor_of_coupling"], "s-", markersize=4, color=COLOURS[0], label=words)
         lowest = np.nanmin([*table["factor"], -1.6])
-        if lowest < LONG_SCALE:
-            axes.set_yscale("symlog", linthresh=2, linscale=1.0)
-            ticks = [1, 0, -1, -2, *(t for t in (-5, -10, -20, -50, -100, -200, -500, -1000) if t > 1.3 * lowest)]
-            axes.set_yticks(ticks, [f"{tick:d}".replace("-", "−") for tick in ticks])
-            axes.set_yticks([], minor=True)
+        axes.set_yscale("symlog", linthresh=2)
         axes.set(ylim=(1.3 * lowest, 1.2), xlabel="time")
         axes.set(ylabel="factor of one pass on the\nworst small change of the cells")
         axes.set_xlim(left=0)

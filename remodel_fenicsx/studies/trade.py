@@ -298,25 +298,18 @@ class _Guess(NamedTuple):
 
 def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
     """Rows with errors against the best guess of the exact result, and what it rests on."""
-    notes = _about_steps_on_the_same_cells(results)
     results = _on_the_mean(results)
     by_coupling: dict[str, list[Result]] = {}
     for result in results:
         if result.setting.step is not None:
             by_coupling.setdefault(result.setting.way[1], []).append(result)
     if not by_coupling:
-        return [Row(result, np.nan, np.nan, doubt="nothing to compare with") for result in results], notes
-    guesses = {name: _guess(same) for name, same in by_coupling.items()}
-    name, best = min(guesses.items(), key=lambda item: float(np.hypot(item[1].unknown, item[1].beyond)))
-    notes += best.notes
-    for other, guess in guesses.items():
-        if other != name and np.isfinite(guess.unknown):
-            apart = typical(guess.angles - best.angles)
-            notes.append(f"couplings: the limits of {other!r} and {name!r} are {apart:.2g} degrees apart")
+        return [Row(result, np.nan, np.nan, doubt="nothing to compare with") for result in results], []
+    guesses = [_guess(same) for same in by_coupling.values()]
+    best = min(guesses, key=lambda guess: float(np.hypot(guess.unknown, guess.beyond)))
     rows = sorted((_row(result, best) for result in results), key=lambda row: row.result.seconds)
     on_front = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
-    notes += _about_kinematics(results)
-    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], notes
+    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], best.notes
 
 
 def _guess(fixed: Sequence[Result]) -> _Guess:
@@ -438,47 +431,6 @@ def _in_words(sweep: _Sweep, found: SweepLimit) -> str:
     return f"{start}no order seen ({sweep.words}), {last}: the estimates are differences to the finest, no better"
 
 
-def _about_steps_on_the_same_cells(results: Sequence[Result]) -> list[str]:
-    """What steps alone cost, where the noise of random cells hides it: all of them have the first seed's cells."""
-    if not any(result.noise for result in results):
-        return []
-    by_mesh: dict[tuple[str, int, int], list[Result]] = {}
-    for result in results:
-        by_mesh.setdefault(result.setting.mesh, []).append(replace(result, angles=result.single[0]))
-    same = max(by_mesh.values(), key=len)  # the mesh on which most steps were tried
-    sweep = _halved({_step(result): result for result in same if result.setting.step is not None})
-    if len(sweep) < 2:
-        return []
-    found = limit([result.angles for result in sweep])
-    exact, finest = sweep[-1].angles + found.beyond, sweep[-1].setting
-    costs = [f"{r.setting.steps_in_words} {typical(r.angles - exact):.2g}" for r in same if r.setting is not finest]
-    last = "an order shows" if found.trusted else f"no order shows, {finest.steps_in_words} counts as exact"
-    where = f"({_mesh_in_words(sweep)}; {last})"
-    return [f"steps alone, on the same cells {where}, cost in degrees: {', '.join(costs)}"]
-
-
-def _about_kinematics(results: Sequence[Result]) -> list[str]:
-    """Whether the whole body does what a part of it does."""
-    parts = {_alike(result): result for result in reversed(results) if result.setting.is_reduced}
-    notes = []
-    for result in results:
-        if set(result.setting.changes) != {KINEMATIC} or result.setting.is_reduced or _alike(result) not in parts:
-            continue
-        part = parts[_alike(result)]
-        apart = typical(result.angles - part.angles)
-        several = "; where finer meshes do not bring them together the body has several solutions"
-        notes.append(
-            f"kinematics: {result.setting.mesh[0]} and {part.setting.mesh[0]} on alike elements are {apart:.2g} "
-            f"degrees apart{several if apart > NO_ERROR else ''}"
-        )
-    return notes
-
-
-def _alike(result: Result) -> tuple[Any, ...]:
-    """All but the kinematics."""
-    return *result.setting.mesh[1:], result.setting.step, result.setting.way[1]
-
-
 # ---------------------------------------------------------------- the runs
 BUDGET = 600.0  # seconds
 NOTHING = 1e-9  # degrees: the error of what others are compared with
@@ -537,22 +489,12 @@ class _TradeStudy(Study):
         """The table of what was run."""
         if len(self.results) < FEWEST_RUNS:
             reached = f"{len(self.results)} of {len(self.settings)} settings reached the end"
-            raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, self._advice())
+            advice = "a larger budget goes on" if self.left else "the same command tries again what has failed"
+            raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, advice)
         rows, notes = estimated(self.results)
         if self.left:
-            notes.append(f"left out, over the budget: {', '.join(setting.name for setting in self.left)}")
+            notes = [*notes, f"left out, over the budget: {', '.join(setting.name for setting in self.left)}"]
         return Trade(self.scene, rows, notes, self.failed)
-
-    def _advice(self) -> str:
-        """What the cheapest settings that are left would take, if so many are left."""
-        number = FEWEST_RUNS - len(self.results)
-        seconds = sorted(-(-len(one.seeds) // self.jobs) * self._expected(one) for one in self.left)
-        if len(seconds) < number:
-            return "the same command tries again what has failed"
-        return (
-            f"a larger budget goes on; the cheapest {number} need about {sum(seconds[:number]):.2g} s for their "
-            "steps; add a few seconds for the start of each process, and more where code must be compiled"
-        )
 
     def _expected(self, setting: Setting) -> float:
         """Seconds of one of its runs, by what others have taken."""

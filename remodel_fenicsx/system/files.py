@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 import errno
-import fcntl
 import math
 import os
 import re
 import shlex
 import shutil
 import stat
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
@@ -68,8 +66,7 @@ def read_regular(path: Path, most: int) -> bytes:
 
 def check_regular(path: Path) -> None:
     """Raise ForeignFileError if what stands there is no regular file, nor a link to one: opening it might wait."""
-    if path.exists() and not path.is_file():
-        raise ForeignFileError(errno.EINVAL, NO_FILE, str(path))
+    os.close(_regular(path, os.O_RDONLY)[0])
 
 
 def open_own(path: Path, flags: int) -> int:
@@ -162,33 +159,6 @@ class ClosedAtEnd:
 
     def close(self) -> None:
         """Let go of files."""
-
-
-# ---------------------------------------------------------------- folders for a while
-# They go with the process that made them, if it was killed too: with the next one's.
-
-PREFIX = "remodel-fenicsx-"
-
-
-@contextmanager
-def temporary_folder() -> Iterator[Path]:
-    """A new folder, locked as long as this process lives; those that nobody locks any more are removed."""
-    for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}*.tmp"):
-        with suppress(OSError), _locked(left):  # of another process, or of another user
-            if left.stat().st_uid == os.getuid():
-                shutil.rmtree(left)
-    with tempfile.TemporaryDirectory(prefix=PREFIX, suffix=".tmp") as folder, _locked(Path(folder)):
-        yield Path(folder)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 # ---------------------------------------------------------------- what is typed on the command line

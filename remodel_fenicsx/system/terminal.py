@@ -36,13 +36,11 @@ class Progress:
         self._last: tuple[float, float] | None = None
         self._paces: deque[float] = deque(maxlen=LAST_PACES)  # seconds a step
         self._pending: str | None = None  # the newest line that was not printed
-        self._bar: Any = None  # `bar.Bar`, on a terminal
+        self._bar: Any = None  # rich's, on a terminal
 
     def __enter__(self) -> Self:
         if not self._silent and _is_terminal():
-            from remodel_fenicsx.system.bar import Bar  # late: most runs have no terminal
-
-            self._bar = Bar(self._title, self._total or None, self._done)
+            self._bar = _bar(self._title, self._total or None, self._done)
             self._bar.start()
         return self
 
@@ -71,7 +69,7 @@ class Progress:
         count = count or f"{index}/{self._total}"
         at, newton, left = f"t = {time:g}", f"{newton_iterations} Newton", self._time_left(index)
         if self._bar is not None:  # what stands last is lost first where the terminal is narrow
-            self._bar.show(index, count, _joined(at, newton, load_text), left)
+            self._bar.update(0, completed=index, count=count, state=_joined(at, newton, load_text), left=left)
         else:
             self._say(_joined(f"step {count}", at, load_text, newton, left), at_once=index >= self._total)
 
@@ -86,7 +84,7 @@ class Progress:
         """Print a line above the bar, or between the plain lines."""
         if self._bar is not None:
             with suppress(OSError):
-                self._bar.say(text)
+                self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
         elif not self._silent:
             announce(f"{self._title}: {text}")
 
@@ -118,9 +116,33 @@ class Line(Progress):
     def show(self, text: str) -> None:
         """Show a line; where lines stay, only now and then."""
         if self._bar is not None:
-            self._bar.show(0, "", text, "")
+            self._bar.update(0, state=text)
         elif not self._silent:
             self._say(text, at_once=False)
+
+
+def _bar(title: str, total: int | None, done: float) -> Any:
+    """Title, bar, step, state, time so far, time left on one line of stderr; what others print stands above it."""
+    from rich.console import Console  # late: most runs have no terminal
+    from rich.progress import BarColumn, Progress as RichProgress, TextColumn, TimeElapsedColumn
+    from rich.table import Column
+
+    class Cropped(TextColumn):
+        def render(self, task: Any) -> Any:
+            text = super().render(task)
+            text.no_wrap, text.overflow = True, "ellipsis"
+            return text
+
+    named, count, state, left = (f"{{task.fields[{name}]}}" for name in ("title", "count", "state", "left"))
+    plain: dict[str, Any] = {"markup": False}
+    cropped = plain | {"table_column": Column()}
+    columns = Cropped(named, **cropped), BarColumn(24), TextColumn(count, **plain), Cropped(state, **cropped)
+    console = Console(stderr=True)
+    console.width -= 3  # a line that reaches the edge is broken by the ^C that a terminal shows, and stands there twice
+    how: dict[str, Any] = {"console": console, "refresh_per_second": 4, "redirect_stdout": sys.stdout.isatty()}
+    found = RichProgress(*columns, TimeElapsedColumn(), TextColumn(left, **plain), **how)
+    found.add_task("", total=total, completed=done, title=title, count="", state="starting", left="")  # type: ignore
+    return found
 
 
 def _is_terminal() -> bool:

@@ -24,7 +24,7 @@ from remodel_fenicsx.results import checkpoint
 from remodel_fenicsx.results.run_folder import History
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.results.run_folder import FolderTaken
-from remodel_fenicsx.results.vtkhdf import TransientGrid
+from remodel_fenicsx.results.vtkhdf import PatientFile, TransientGrid
 from remodel_fenicsx.running import resume, run
 from tests.conftest import mpirun
 from tests.forks import forked
@@ -60,13 +60,15 @@ class Camera:
     @contextmanager
     def running(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         """Within, it looks."""
-        pwrite, row = os.pwrite, History._write
+        write, row = PatientFile.write, History._write
 
-        def half_and_whole(descriptor: int, data: Any, offset: int) -> int:
+        def half_and_whole(file: PatientFile, data: Any) -> int:
             self.look("before a write of fields")
-            pwrite(descriptor, bytes(data)[: len(data) // 2], offset)
+            place = file.tell()
+            write(file, bytes(data)[: len(data) // 2])
             self.look("in a write of fields")
-            return pwrite(descriptor, data, offset)
+            file.seek(place)
+            return write(file, data)
 
         def half_row(history: History, data: bytes) -> None:
             history._file.write(data[: len(data) // 2])
@@ -84,9 +86,9 @@ class Camera:
             patch.setattr(owner, name, looking)
 
         with monkeypatch.context() as patch:
-            patch.setattr(os, "pwrite", half_and_whole)
+            patch.setattr(PatientFile, "write", half_and_whole)
             patch.setattr(History, "_write", half_row)
-            for owner, name in ((os, "ftruncate"), (os, "fsync"), (Path, "replace"), (Path, "unlink")):
+            for owner, name in ((os, "link"), (os, "fsync"), (Path, "replace"), (Path, "rename"), (Path, "unlink")):
                 before(owner, name)
             yield
 
@@ -295,7 +297,7 @@ def test_a_full_disk_loses_nothing(
     if what != "fields":
         assert len(left) == {"history": len(left), "checkpoint": 18}[what]
     else:
-        assert Recording(folder).times[-1] == 3.5
+        assert Recording(folder).times[-1] in (3.5, 4.0)  # which may just have had room
     (disk / "filler").unlink()
     resume(folder, [], SELF)
     assert_same(folder, expected)

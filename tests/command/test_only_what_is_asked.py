@@ -133,7 +133,14 @@ def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None
     asked: dict[str, Any] = {"all": True, "two": ["displacement", "fibre_angle"], "chains": ["chains"], "none": False}
     folders = {name: run(scene(output={"fields": fields}), tmp_path / name, SELF) for name, fields in asked.items()}
     whole = Recording(folders["all"]).fields(3.0)
-    assert set(whole) == set(FIELDS_BY_NAME) - {"chains", "region", "fibre_angle_unloaded", "content", "natural_length"}
+    assert set(whole) == set(FIELDS_BY_NAME) - {
+        "chains",
+        "region",
+        "fibre_angle_unloaded",
+        "natural_gradient",
+        "content",
+        "natural_length",
+    }
     two = Recording(folders["two"]).fields(3.0)
     assert set(two) == {"displacement", "fibre_angle"}
     assert all(np.array_equal(two[name], whole[name]) for name in two)

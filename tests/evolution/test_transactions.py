@@ -20,7 +20,6 @@ from remodel_fenicsx.body.shape import Column
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.fields import Fields
 from remodel_fenicsx.results.run_folder import RunFolder
-from remodel_fenicsx.results.vtkhdf import TransientGrid
 from tests.parts import pulled_cube
 from tests.runs import made
 
@@ -150,10 +149,6 @@ FAULTS: dict[str, tuple[Callable[..., list[Watcher]], BaseException]] = {
     "loads": (after(lambda s: s.stepper, "load_values", lambda time: time), KeyError("force")),
     "solver": (after(lambda s: s.stepper.coupling, "solve", lambda time, loads: time), KeyboardInterrupt()),
     "column": (column(after_pass=False), ZeroDivisionError()),
-    "field writer": (
-        after(lambda s: TransientGrid, "append", lambda grid, time, *fields: time),
-        OSError(errno.ENOSPC, "disk full"),
-    ),
     "watcher, solved": (hook("solved"), RuntimeError()),
     "pass": (after(lambda s: s.stepper.remodeling, "apply", lambda old, new, *_: new), FloatingPointError()),
     "column after the pass": (column(after_pass=True), ValueError()),

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from remodel_fenicsx import Recording, cli
-from remodel_fenicsx.pictures import files, bodies as rendering
-from remodel_fenicsx.pictures.bodies import coloured, scale_colours
+from remodel_fenicsx.pictures import bodies as rendering
+from remodel_fenicsx.pictures.bodies import AMBIENT, coloured
 from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.results.whole_body import WholeBody
@@ -78,11 +78,6 @@ def test_the_cube_has_its_size_and_its_colour(recorded: Recorded, drawn: Drawn) 
     shares = np.all(body == expected, axis=2).sum() / (rows * columns)
     chains = np.all(body < 70, axis=2).sum() / (rows * columns)
     assert 0.03 < chains < 0.3 and shares > 0.95 - chains
-    # the bar at the left of the scale is a round length, and as long as it says
-    foot = picture[-picture.shape[0] // 4 :, : picture.shape[1] // 5]
-    longest = np.all(foot < 100, axis=2).sum(axis=1).max()
-    length = longest / rows * size[2]
-    assert min(abs(length / round_one - 1) for round_one in (0.1, 0.2, 0.5)) < 0.03
 
 
 def test_all_that_is_written_lies_outside_of_the_body(drawn: Drawn) -> None:
@@ -155,10 +150,11 @@ def test_other_elements_are_drawn_and_chains_where_they_were_recorded(drawn: Dra
 
 
 def test_colours_are_those_of_the_scale_and_no_other(drawn: Drawn) -> None:
-    """But for chains, edges and their borders: shaded, as the palette keeps them."""
+    """But for chains, edges and their borders; shaded where faces look elsewhere."""
     body = panel(drawn("artery"))
     filled = body[np.any(body < 245, axis=2)].astype(int)
-    scale = np.rint(255 * scale_colours()).astype(int)
+    shades = np.linspace(1.0, AMBIENT, 5)[:, None, None] * coloured(np.arange(2.5, 90.0, 5.0))
+    scale = np.rint(255 * shades.reshape(-1, 3)).astype(int)
     nearest = np.abs(filled[::37, None] - scale).sum(axis=2).min(axis=1)
     assert np.mean(nearest < 20) > 0.85
 
@@ -170,20 +166,19 @@ def test_a_picture_says_what_it_is_and_where_it_comes_from(recorded: Recorded, t
         assert cli.main(["picture", str(folder), "--time", "4.2"]) == 0
         name = f"cube-t4{'-2' if number else ''}.png"
         with Image.open(folder / name) as picture:
-            assert picture.info["Title"] == "cube: angle of the collagen" and picture.mode == "P"
-            assert "dolfinx" in picture.info["Source"] and "four chains" in picture.info["Description"]
+            assert picture.info["Title"] == "cube: angle of the collagen" and picture.mode == "RGB"
+            assert (
+                "dolfinx" in picture.info["Source"]
+                and "cube of 1 x 1 x 1; 1 hexahedron. Black: the four" in picture.info["Description"]
+            )
         assert stat.S_IMODE((folder / name).stat().st_mode) & 0o044 == 0o044 & ~os.umask(os.umask(0o022))
 
 
-@pytest.mark.parametrize(("ending", "signs"), [("svg", (b"<image", b"<svg")), ("pdf", (b"%PDF", b"/Image"))])
-def test_letters_are_lines_where_the_kind_knows_lines(
-    recorded: Recorded, tmp_path: Path, ending: str, signs: tuple[bytes, ...]
-) -> None:
-    path = tmp_path / f"cube.{ending.upper()}"
+def test_a_pdf_shows_the_body(recorded: Recorded, tmp_path: Path) -> None:
+    path = tmp_path / "cube.PDF"
     assert cli.main(["picture", str(recorded("cube")), "-o", str(path)]) == 0
     content = path.read_bytes()
-    assert all(sign in content for sign in signs)
-    assert ending == "pdf" or content.count(b"<image") == 1 and content.count(b"<path") > 30
+    assert content.startswith(b"%PDF") and b"/Image" in content
 
 
 @pytest.mark.parametrize(("ending", "frames", "expected"), [("gif", 5, 5), ("webp", 4, 4), ("gif", 60, 11)])
@@ -212,42 +207,6 @@ def test_an_animation_has_so_many_frames_that_differ(
 
 def test_a_run_that_failed_is_drawn(drawn: Drawn) -> None:
     assert np.any(panel(drawn("failed", "--layers", "1")) < 200)
-
-
-# ---------------------------------------------------------------- mp4
-def fake_ffmpeg(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    program = folder / "bin" / "ffmpeg"
-    program.parent.mkdir()
-    program.write_text(f"#!/bin/sh\n{text}\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
-
-
-def test_mp4_is_what_ffmpeg_makes_of_all_frames(
-    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = tmp_path / "words"
-    fake_ffmpeg(tmp_path, monkeypatch, f'echo "$@" > {words}; cat > film.mp4')
-    film = tmp_path / "film.mp4"
-    assert cli.main(["animate", str(recorded("cube")), "--frames", "3", "-o", str(film)]) == 0
-    wide, tall = map(int, words.read_text().split("-s ")[1].split()[0].split("x"))
-    assert wide % 2 == tall % 2 == 0 and film.stat().st_size == 3 * wide * tall * (3 + 19)
-    pixels = np.frombuffer(film.read_bytes(), dtype=np.uint8).reshape(22, tall, wide, 3)
-    assert np.array_equal(pixels[2], pixels[-1]) and not np.array_equal(pixels[0], pixels[1])
-
-
-def test_mp4_without_ffmpeg_is_one_line(
-    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    words = ["animate", str(recorded("cube")), "-o", str(tmp_path / "film.mp4")]
-    monkeypatch.setattr(files.shutil, "which", lambda name: None)
-    assert cli.main(words) == 5
-    assert capsys.readouterr().err == "remodel-fenicsx: mp4 needs ffmpeg, which is not there; .webp needs nothing\n"
-    monkeypatch.undo()
-    fake_ffmpeg(tmp_path, monkeypatch, "cat > /dev/null; echo Unknown encoder >&2; exit 1")
-    assert cli.main([*words, "--frames", "2"]) == 5
-    said = "remodel-fenicsx: ffmpeg ended with 1: Unknown encoder; .webp needs nothing\n"
-    assert capsys.readouterr().err == said and not (tmp_path / "film.mp4").exists()
 
 
 # ---------------------------------------------------------------- what is refused

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import resource
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.results.whole_body import chain_displacement, chain_lines
-from remodel_fenicsx.results.vtkhdf import LINE, StagedFile, TransientGrid, vtk_cells
+from remodel_fenicsx.results.vtkhdf import LINE, PatientFile, TransientGrid, vtk_cells
 from tests.forks import forked
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
@@ -80,7 +80,9 @@ def test_reader_finds_every_step(tmp_path):
     with TransientGrid(path, points, cells, 12) as grid:
         for k, (point_data, cell_data) in enumerate(steps):
             grid.append(0.5 * k, point_data, cell_data)
-        found = read(path)  # while the writer has it open
+        grid.publish()
+        grid.append(9.0, *steps[0])
+        found = read(path)  # while the writer goes on
     assert found["steps"] == 3
     for k, (point_data, cell_data) in enumerate(steps):
         assert found[f"{k} time"] == 0.5 * k
@@ -183,8 +185,6 @@ def test_reader_finds_moving_chains(tmp_path):
     with TransientGrid(path, points, lines, LINE, point_dtype=np.float32) as grid:
         for k in range(4):
             grid.append(k, {"displacement": k * points}, {"angle": np.full(12, float(k))}, points=series[k][0])
-        grid.append(4.0, {"displacement": points}, {"angle": np.zeros(12)}, points=points)
-        grid.drop_last()  # VTK writes over its memory where there are more times than steps
     found = read(path)
     assert found["steps"] == 4
     for k in range(4):
@@ -204,161 +204,105 @@ def test_nothing_is_overwritten(tmp_path):
     assert path.read_text() == "mine"
 
 
-def test_full_disk_raises_and_keeps_the_series(tmp_path):
+def test_a_full_disk_raises_and_keeps_what_was_published(tmp_path):
     # a limit on the size of files stands for the full disk: the same error from the same system call
     path = tmp_path / "f.vtkhdf"
     field = np.random.default_rng(5).random((4, 8, 3)).astype(np.float32)
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    grid = TransientGrid(path, CUBE, VTK_CUBE, 12)
+    grid.append(0.0, {"u": field[0]})
+    grid.publish()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, old[1]))
+    try:
+        for k in (1, 2):  # an error again as long as there is no room
+            with pytest.raises(OSError) as full:
+                grid.append(k, {"u": field[k]})
+            assert full.value.errno == errno.EFBIG
+        with pytest.raises(OSError):
+            grid.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    grid.close()
+    assert np.array_equal(raw_series(path, "u", 8), field[:1])
+    assert [found.name for found in tmp_path.iterdir()] == ["f.vtkhdf"]
+
+
+@pytest.mark.parametrize("steps", [1, 64])  # the index of HDF5 grows a level at 64 chunks
+def test_a_process_that_is_killed_leaves_what_was_published(tmp_path, monkeypatch, steps):
+    field = np.arange(70 * 24.0).reshape(70, 8, 3)
+    path, copies = tmp_path / "f.vtkhdf", []
+
+    def looking(owner, name):
+        real = getattr(owner, name)
+
+        def look(*arguments, **options):
+            copies.append(shutil.copy(path, tmp_path / f"{len(copies)}.copy"))
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(owner, name, look)
+
+    grid = TransientGrid(path, CUBE, VTK_CUBE, 12)
+    for k in range(steps):
+        grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
+    grid.publish()
+    for owner, name in ((PatientFile, "write"), (os, "link"), (Path, "replace"), (Path, "rename"), (Path, "unlink")):
+        looking(owner, name)
+    for k in range(steps, steps + 2):
+        grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
+        grid.publish()
+    grid.close()
+    monkeypatch.undo()
+    counts = [len(raw_series(copy, "u", 8)) for copy in copies]
+    assert counts == sorted(counts) and set(counts) == {steps, steps + 1, steps + 2} and len(counts) > 20
+    for copy, count in [*zip(copies, counts, strict=True)][:: len(copies) // 5]:
+        with TransientGrid.continued(Path(copy), count - 1.5) as grid:  # without the last one
+            assert grid.number_of_steps == count - 1
+            for k in range(count - 1, steps + 3):
+                grid.append(k, {"u": -field[k]}, {"c": np.ones(1)}, points=CUBE - k)
+        expected = [*field[: count - 1], *-field[count - 1 : steps + 3]]
+        assert np.array_equal(raw_series(copy, "u", 8), expected)
+        with h5py.File(copy) as file:
+            moved = file["VTKHDF/Points"][:].reshape(-1, 8, 3)[1:] - CUBE
+        assert moved[:, 0, 0].tolist() == [*range(count - 1), *(-k for k in range(count - 1, steps + 3))]
+
+
+def test_files_take_turns_and_who_reads_one_keeps_it(tmp_path, monkeypatch):
+    """Each step is written twice, whatever is there already; a file that is read is not written on."""
+    path, copied, real = tmp_path / "f.vtkhdf", [], shutil.copyfile
+    monkeypatch.setattr(shutil, "copyfile", lambda *files: copied.append(files) or real(*files))
     with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
-        grid.append(0.0, {"u": field[0]})
-        size = path.stat().st_size
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 20, old[1]))
-        try:
-            for k in (1, 2):  # an error again as long as there is no room
-                with pytest.raises(OSError):
-                    grid.append(k, {"u": field[k]})
-                assert path.stat().st_size == size
-                assert np.array_equal(raw_series(path, "u", 8), field[:1])
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, old)
-        grid.append(3.0, {"u": field[3]})
-        assert np.array_equal(raw_series(path, "u", 8), field)  # the steps without room were not forgotten
-    assert np.array_equal(raw_series(path, "u", 8), field)
-
-
-@pytest.mark.parametrize("steps", [0, 1, 63, 64])  # the index of HDF5 grows a level at 64 chunks
-def test_a_file_cut_off_between_any_two_writes_is_whole(tmp_path, monkeypatch, steps):
-    field = np.arange(65 * 24.0).reshape(65, 8, 3)
-    path, copy = tmp_path / "f.vtkhdf", tmp_path / "copy.vtkhdf"
-    cuts, write = [], os.pwrite
-
-    def copy_and_write(descriptor, data, offset):
-        shutil.copy(path, copy)  # what a process that is killed here leaves behind
-        series = raw_series(copy, "u", 8)
-        assert np.array_equal(series, field[: len(series)]) or not series
-        cuts.append(len(series))
-        return write(descriptor, data, offset)
-
-    monkeypatch.setattr(os, "fdatasync", lambda descriptor: None)
-    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
-        for k in range(steps):
-            grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
-        monkeypatch.setattr(os, "pwrite", copy_and_write)
-        grid.append(steps, {"u": field[steps]}, {"c": np.zeros(1)}, points=CUBE + steps)
-        monkeypatch.setattr(os, "pwrite", write)
-    assert len(cuts) > 10 and cuts == sorted(cuts) and set(cuts) <= {steps, steps + 1} and cuts[0] == steps
+        for k in range(20):
+            grid.append(k, {"u": np.full(8, k)}, constant={"depth": [0.5]})
+            grid.publish()
+            assert len(raw_series(path, "u", 8)) == k + 1
+        assert len(copied) == 1
+        with h5py.File(path) as file:
+            for k in range(20, 23):
+                grid.append(k, {"u": np.full(8, k)}, constant={"depth": [0.5]})
+                grid.publish()
+            assert int(file["VTKHDF/Steps"].attrs["NSteps"]) == 20
+        assert len(copied) == 2 and len(raw_series(path, "u", 8)) == 23
+    with h5py.File(path) as file:
+        assert file["VTKHDF/CellData/depth"].shape == (1,)
+    assert [found.name for found in tmp_path.iterdir()] == ["f.vtkhdf"]
 
 
 def test_ctrl_c_waits_for_the_step(tmp_path, monkeypatch):
-    # an exception that comes up while HDF5 calls back into StagedFile would crash the process
-    write, calls = StagedFile.write, []
+    # an exception that comes up while HDF5 calls back into PatientFile would crash the process
+    write, calls = PatientFile.write, []
 
-    def interrupted(self, buffer):
-        calls.append(len(buffer))
+    def interrupted(self, data):
+        calls.append(len(data))
         signal.raise_signal(signal.SIGINT)
-        return write(self, buffer)
+        return write(self, data)
 
     handler = signal.getsignal(signal.SIGINT)
     with TransientGrid(tmp_path / "f.vtkhdf", CUBE, VTK_CUBE, 12) as grid:
         grid.append(0.0, {"u": np.zeros(8)})
-        monkeypatch.setattr(StagedFile, "write", interrupted)
+        monkeypatch.setattr(PatientFile, "write", interrupted)
         with pytest.raises(KeyboardInterrupt):
             grid.append(1.0, {"u": np.ones(8)})
-        monkeypatch.setattr(StagedFile, "write", write)
+        monkeypatch.setattr(PatientFile, "write", write)
         assert calls and signal.getsignal(signal.SIGINT) is handler
-        assert np.array_equal(raw_series(grid.path, "u", 8), [np.zeros(8), np.ones(8)])
         grid.append(2.0, {"u": np.full(8, 2.0)})
     assert np.array_equal(raw_series(grid.path, "u", 8), [np.zeros(8), np.ones(8), np.full(8, 2.0)])
-
-
-def test_what_was_staged_can_be_read_back(tmp_path):
-    # HDF5 seldom reads what it wrote, so the overlay of old bytes, changes and new end is checked by itself
-    staged, expected = StagedFile(tmp_path / "f"), bytearray()
-    random = np.random.default_rng(6)
-    for turn in range(200):
-        start, data = int(random.integers(0, len(expected) + 20)), random.bytes(int(random.integers(1, 60)))
-        expected.extend(bytes(max(0, start + len(data) - len(expected))))
-        expected[start : start + len(data)] = data
-        staged.seek(start)
-        assert staged.write(data) == len(data)
-        if turn % 7 == 0:
-            staged.commit()
-            assert (tmp_path / "f").read_bytes() == expected
-        start, size = int(random.integers(0, len(expected))), int(random.integers(1, 300))
-        buffer = bytearray(size)
-        staged.seek(start)
-        count = staged.readinto(buffer)
-        assert count == min(size, len(expected) - start) and buffer[:count] == expected[start : start + size]
-    assert staged.seek(0, os.SEEK_END) == len(expected)
-    staged.close()
-
-
-# ---------------------------------------------------------------- going on
-@pytest.mark.parametrize("steps", [2, 64])
-def test_a_file_cut_off_between_any_two_writes_goes_on(tmp_path, monkeypatch, steps):
-    field = np.arange(70 * 24.0).reshape(70, 8, 3)
-    path, copies, write = tmp_path / "f.vtkhdf", [], os.pwrite
-
-    def copy_and_write(descriptor, data, offset):
-        write(descriptor, bytes(data)[: len(data) // 2], offset)
-        copies.append(shutil.copy(path, tmp_path / f"{len(copies)}.vtkhdf"))
-        return write(descriptor, data, offset)
-
-    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
-        for k in range(steps):
-            grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
-        monkeypatch.setattr(os, "pwrite", copy_and_write)
-        grid.append(steps, {"u": field[steps]}, {"c": np.zeros(1)}, points=CUBE + steps)
-        monkeypatch.setattr(os, "pwrite", write)
-    for number, copy in enumerate(copies):
-        kept = steps - 1 if number % 2 else steps  # another time, without the last whole step
-        with TransientGrid.continued(Path(copy), kept - 0.5) as grid:
-            assert grid.number_of_steps == kept and grid.last_time == kept - 1
-            for k in range(kept, steps + 2):
-                grid.append(k, {"u": -field[k]}, {"c": np.ones(1)}, points=CUBE - k)
-        expected = [*field[:kept], *-field[kept : steps + 2]]
-        assert np.array_equal(raw_series(copy, "u", 8), expected)
-        with h5py.File(copy) as file:
-            moved = file["VTKHDF/Points"][:].reshape(-1, 8, 3)
-            assert np.array_equal(
-                moved[1:], [CUBE + k for k in range(kept)] + [CUBE - k for k in range(kept, steps + 2)]
-            )
-
-
-def test_a_commit_that_was_cut_off_is_finished_by_who_opens_the_file(tmp_path, monkeypatch):
-    path, write, done = tmp_path / "f", os.pwrite, []
-    staged = StagedFile(path)
-    staged.write(bytes(100))
-    staged.commit()
-    for start in (10, 0, 50):
-        staged.seek(start)
-        staged.write(b"changed")
-    staged.seek(100)
-    staged.write(b"new")
-
-    def killed(descriptor, data, offset):
-        if len(done) == 2:  # the new end, and one of three changes
-            raise KeyboardInterrupt
-        done.append(offset)
-        return write(descriptor, data, offset)
-
-    monkeypatch.setattr(os, "pwrite", killed)
-    with pytest.raises(KeyboardInterrupt):
-        staged.commit()
-    monkeypatch.setattr(os, "pwrite", write)
-    staged.close()
-    expected = bytearray(bytes(100) + b"new")
-    for start in (10, 0, 50):
-        expected[start : start + 7] = b"changed"
-    assert path.read_bytes()[:103] != expected and len(path.read_bytes()) > 103
-    for _ in range(2):  # a second time it is whole already
-        StagedFile(path, existing=True).close()
-        assert path.read_bytes() == expected
-
-
-def test_a_mark_without_its_changes_says_nothing(tmp_path):
-    changes = struct.pack("<QQ", 0, 3) + b"bad"
-    for end in (struct.pack("<QI8s", len(changes), 1, b"remodel1"), struct.pack("<QI8s", 2**40, 1, b"remodel1"), b"x"):
-        (tmp_path / "f").write_bytes(b"good" + changes + end)
-        StagedFile(tmp_path / "f", existing=True).close()
-        assert (tmp_path / "f").read_bytes() == b"good" + changes + end

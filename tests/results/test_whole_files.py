@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
-import threading
-import time
 from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx import Recording, RecordingError, cli, preset_scene, run as run_scene
-from remodel_fenicsx.results.recording import RunLock
+from remodel_fenicsx import cli, preset_scene, run as run_scene
 from remodel_fenicsx.system.files import write_new
-from remodel_fenicsx.system.files import temporary_folder
 
 # a command that is killed at its N-th write, rename or link that has to do with a file of this name
 KILLED = """
@@ -65,41 +58,3 @@ def test_a_new_file_is_whole_or_not_there(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError):
         write_new(path, b"another")
     assert path.read_bytes() == b"whole" and [found.name for found in tmp_path.iterdir()] == ["page.html"]
-
-
-def test_the_temporary_folder_of_a_killed_process_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the next one; that of a process that lives stays."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    program = "import time; from remodel_fenicsx.system.files import temporary_folder\n"
-    program += "with temporary_folder() as folder:\n    (folder / 'job').touch()\n    time.sleep(100)"
-    command = [sys.executable, "-c", program]
-    killed, alive = (subprocess.Popen(command, env=os.environ | {"TMPDIR": str(tmp_path)}) for _ in range(2))
-    try:
-        while len(list(tmp_path.glob("*/job"))) < 2:
-            time.sleep(0.05)
-        killed.kill()
-        killed.wait()
-        with temporary_folder() as folder:
-            assert len(list(tmp_path.iterdir())) == 2 and folder.parent == tmp_path
-        assert len(list(tmp_path.iterdir())) == 1
-    finally:
-        alive.kill()
-        alive.wait()
-
-
-@pytest.mark.parametrize("name", ["history.csv", "fields.vtkhdf"])
-def test_a_recording_waits_for_the_step_that_is_being_written(name: str, quarter: Path, tmp_path: Path) -> None:
-    """Where a run is at work; what is damaged for good is refused."""
-    folder = shutil.copytree(quarter, tmp_path / "run")
-    whole = (folder / name).read_bytes()
-    (folder / name).write_bytes(whole[: len(whole) // 2 - 1])
-    with RunLock(folder):
-        (folder / "whole").write_bytes(whole)
-        timer = threading.Timer(0.2, lambda: (folder / "whole").replace(folder / name))
-        timer.start()
-        found = Recording(folder)
-        assert (found.times if name == "fields.vtkhdf" else found.history["time"]).tolist() == [0.0, 1.0]
-        timer.join()
-    (folder / name).write_bytes(whole[: len(whole) // 2 - 1])
-    with pytest.raises(RecordingError):
-        _ = Recording(folder).times, Recording(folder).history

@@ -34,7 +34,7 @@ from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.tables import SceneError as SchemaError
-from remodel_fenicsx.schema.toml import parse_override
+from remodel_fenicsx.schema.text import parse_override
 from remodel_fenicsx.simulation import checked_domain
 from tests.forks import forked
 from tests.parts import tube

@@ -16,7 +16,7 @@ from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene.reference import json_schema
 from remodel_fenicsx.scene.presets import PRESETS
 from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict
-from remodel_fenicsx.schema.toml import put
+from remodel_fenicsx.schema.text import put
 from tests.conftest import Refused
 from tests.scene.test_bad_input import ODD_NUMBERS, ODD_TEXTS, changed
 from tests.scene.test_scene import WRONG

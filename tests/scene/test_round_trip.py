@@ -66,7 +66,7 @@ def test_every_key_with_every_kind_of_value(bases: list[Scene], tmp_path: Path):
     for key, field in asked.items():
         for base in bases:
             for value in [*choices(field), *VALUES]:
-                if key.endswith((".file", ".fibres")) and not Path(str(value)).is_absolute():
+                if key.endswith((".file", "cells.fibres")) and not Path(str(value)).is_absolute():
                     continue  # read_scene puts the scene's folder before it
                 try:
                     scene = base.with_values({key: value})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -81,7 +80,6 @@ def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
     said = "\n".join(notes)
     assert "time: no error (steps 5, 2.5 on refinement 1, degree 1)" in said  # of 'implicit', whose guess is taken
     assert "mesh: order 2 (refinements 1, 2, 4 of degree 2)" in said
-    assert "couplings: the limits of 'staggered' and " in said
     exact_ones = {row.result.setting.scene.remodeling.coupling for row in rows if row.angle_error < 0.02}
     assert exact_ones == {"implicit"}
 
@@ -129,14 +127,9 @@ def test_random_cells_are_compared_in_the_mean() -> None:
             result = replace(result, noise=0.01, single=single)
         results.append(result)
     assert {len(result.setting.seeds) for result in results} == {1, trade.SEEDS}
-    rows, notes = trade.estimated(results)
+    rows, _ = trade.estimated(results)
     for row in rows:
         assert row.angle_error < 5.0
-    # what steps cost does not drown in the noise of cells: 0.4 of SMOOTH for a step of one
-    cost = 0.4 * trade.typical(SMOOTH)
-    words = next(note for note in notes if note.startswith("steps alone, on the same cells"))
-    assert "an order shows" in words and f"step 2.5 {2.5 * cost:.2g}, " in words and f"step 1 {cost:.2g}, " in words
-    assert not any("same cells" in note for note in estimated()[1])
 
 
 def test_the_front() -> None:
@@ -276,7 +269,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s", "-q"]) == 4
     said = capsys.readouterr().err
     assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
-    assert re.search(r"is kept, a larger budget goes on; the cheapest 2 need about \S+ s for their steps", said)
+    assert said.endswith("is kept, a larger budget goes on\n")
     assert said.count("\n") == 1
 
     first = trade.ladder(read_scene(path))[:2]

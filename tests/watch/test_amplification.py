@@ -91,9 +91,6 @@ def test_the_factor_is_that_by_which_a_tilt_grows_in_a_run() -> None:
     # lateral stresses are zero, where the positive part has a kink: a run sees one side, central differences their mean
     assert found.reversing is not None and found.reversing.factor == pytest.approx(grown, rel=0.15)
     assert grown < -2.5
-    shares = found.reversing.shares
-    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
-    assert shares["turn_12"] + shares["turn_13"] > 0.8  # the direction of the load turns
     assert 0.1 < found.reversing.volume_share <= 1.0
 
 

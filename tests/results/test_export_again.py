@@ -1,0 +1,128 @@
+"""What `export` writes of a wall with prestretch and turnover begins another run, which is the same."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+
+from remodel_fenicsx import Recording, Scene, SceneError, run
+from remodel_fenicsx.results.export import export
+from tests.mesh_files import write_tube
+from tests.runs import SELF, made
+from tests.values import ramped
+
+LAYERS = [
+    {"from": 0.0, "to": 0.5, "prestretch": {"axial": 1.05}},
+    {"from": 0.5, "prestretch": {"circumferential": 1.1}},
+]
+TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0}
+COLUMNS = ("lumen_volume", "fibre_angle_inner", "content", "natural_length", "stored_energy")
+
+
+def scene(vessel: Path, end: float, loaded: float = 2.0, **tables: Any) -> Scene:
+    """A tube of tetrahedra, which have one F each, with two layers that were stretched; all its loads by a time."""
+    values: dict[str, Any] = {
+        "geometry": {"shape": "mesh", "file": str(vessel)}, "cells": {"initial": "isotropic"},
+        "natural": {"layers": LAYERS}, "loads": ramped(loaded, pressure=0.5, elongation=0.05),
+        "remodeling": {"law": "tensor", "coupling": "staggered", "turnover": TURNOVER},
+        "output": {"columns": [*COLUMNS], "report": False}, "time": {"end": end},
+        "solver": {"method": "direct", "relative_tolerance": 1e-10},
+    }  # fmt: skip
+    return Scene(**values | tables)
+
+
+def again(vessel: Path, file: Path, end: float, **tables: Any) -> Scene:
+    """The scene that begins with an exported file, all loads in its first step."""
+    values: dict[str, Any] = {"cells": {"fibres": str(file)}, "natural": {"fibres": True}}
+    return scene(vessel, end, 1.0, **values | tables)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A mesh, and the first run on it."""
+    folder = tmp_path_factory.mktemp("again")
+    mesh = write_tube(folder / "tube.msh", "tetrahedron")
+    return mesh, run(scene(mesh, 3.0), folder / "run", SELF)
+
+
+def test_a_file_exported_and_read_again_gives_the_same_run(first: tuple[Path, Path], tmp_path: Path) -> None:
+    """As the first one, but for means over elements; of these, to the digits of the file, from whatever time."""
+    mesh, started = first
+    file = export(started, "vtu", tmp_path / "first.vtu", 2.0)
+    second = run(again(mesh, file, 5.0), tmp_path / "second", SELF)
+    third = run(again(mesh, export(second, "vtu", tmp_path / "second.vtu", 3.0), 3.0), tmp_path / "third", SELF)
+    original, read, twice = (Recording(folder).history for folder in (started, second, third))
+    for name in COLUMNS:
+        np.testing.assert_allclose(read[name][1:3], original[name][2:4], rtol=2e-3, err_msg=name)
+        np.testing.assert_allclose(twice[name][1:], read[name][3:], rtol=2e-6, err_msg=name)
+    assert read["content"][0] == pytest.approx(original["content"][2], rel=1e-6) != 1.0
+    assert read["natural_length"][0] == pytest.approx(original["natural_length"][2], rel=1e-6) != 1.0
+
+
+def test_it_goes_on_as_itself(first: tuple[Path, Path], tmp_path: Path) -> None:
+    """Resumed from its own copy of the file, to the last digit."""
+    from tests.runs import goes_on
+
+    mesh, started = first
+    goes_on(again(mesh, export(started, "vtu", tmp_path / "first.vtu", 2.0), 3.0), tmp_path, 2.0, 3.0)
+
+
+def test_the_arrays_are_those_of_the_wall(first: tuple[Path, Path], tmp_path: Path) -> None:
+    """G of the layers in VTU and FEBio, of the whole element; what has no place for it is said."""
+    mesh, started = first
+    written = meshio.read(export(started, "vtu", tmp_path / "a.vtu"))
+    G = written.cell_data["natural_gradient"][0].reshape(-1, 3, 3)
+    with made(scene(mesh, 3.0)) as simulation:
+        domain, own = simulation.domain, simulation.state.natural_gradient.mean(axis=1)  # type: ignore[union-attr]
+        np.testing.assert_allclose(G, domain.gather_elements(own), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(G), 1.0, atol=1e-2)
+    root = ElementTree.parse(export(started, "febio", tmp_path / "a.feb")).getroot()
+    for name, kind in (("natural_gradient", "mat3"), ("content", "scalar"), ("natural_length", "scalar")):
+        (data,) = (entry for entry in root.iter("ElementData") if entry.get("name") == name)
+        rows = [[float(word) for word in (entry.text or "").split(",")] for entry in data]
+        assert data.get("data_type") == kind
+        np.testing.assert_allclose(np.reshape(rows, (len(G), -1)), written.cell_data[name][0].reshape(len(G), -1))
+
+
+def test_what_has_no_place_is_said(first: tuple[Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    export(first[1], "csv", tmp_path / "a.csv")
+    assert "csv has no place for natural_gradient, content, natural_length; vtu and febio files have" in caplog.text
+
+
+def test_what_is_refused(first: tuple[Path, Path], tmp_path: Path) -> None:
+    mesh, started = first
+    file = export(started, "vtu", tmp_path / "a.vtu")
+    still = {"law": "tensor", "coupling": "staggered"}
+    torn = meshio.read(file)
+    torn.cell_data["natural_gradient"][0][3] *= -1
+    meshio.write(tmp_path / "torn.vtu", torn)
+    for changed, line in (
+        (
+            again(mesh, file, 1.0, natural={}),
+            "cells.fibres = .*: has natural_gradient, content, natural_length of an e",
+        ),
+        (
+            again(mesh, file, 1.0, remodeling=still, output={}),
+            "cells.fibres = .*: has content and natural_length, which only rem",
+        ),
+        (again(mesh, tmp_path / "torn.vtu", 1.0), "cells.fibres = .*: natural_gradient of row 4 has no determinant ab"),
+    ):
+        with pytest.raises(SceneError, match=f"^{line}"), made(changed):
+            pass
+    for keys, line in (
+        ({"cells": {"initial": "isotropic"}}, "natural.fibres = true: needs cells.fibres"),
+        ({"natural": {"fibres": True, "layers": LAYERS}}, "natural.fibres = true: natural.opening_angle or layers ar"),
+        (
+            {"mesh": {"degree": 2, "formulation": "selective-integration"}},
+            "natural.fibres = true: must be false unless mesh.form",
+        ),
+    ):
+        with pytest.raises(SceneError, match=f"^{line}"):
+            again(mesh, file, 1.0, **keys)  # type: ignore[arg-type]
+    with made(again(mesh, file, 1.0, natural={"fibres": False})) as simulation:
+        assert simulation.state.natural_gradient is None
