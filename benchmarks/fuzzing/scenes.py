@@ -296,7 +296,10 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
     locked = scene["material"]["contour_length"] <= 1.3 * scene["cells"]["end_to_end_length"]
     if turns and plain and not locked and scene["material"]["chain_density"] and random.random() < 0.2:
         numbers = {"time": rounded(random.uniform(20, 80)), "deposition_stretch": rounded(random.uniform(1.02, 1.2))}
-        scene["remodeling"]["turnover"] = numbers | {"gain": rounded(random.uniform(0.5, 2))}
+        numbers |= {"gain": rounded(random.uniform(0.5, 2)), "rates": random.choice(("cauchy", "tension"))}
+        grows = scene["geometry"]["shape"] == "tube" and scene["remodeling"]["coupling"] != "implicit"
+        grows = grows and scene.get("mesh", {}).get("formulation", "displacement") == "displacement"
+        scene["remodeling"]["turnover"] = numbers | {"volume": random.choice((0.0, 0.3, 0.6)) if grows else 0.0}
     if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.05:
         scene["geometry"]["is"] = "loaded"
         if scene["time"]["end"] == "equilibrium":

@@ -60,7 +60,8 @@ def scene_of(wall: Wall, turnover: dict[str, float] | None, end: float = END, **
     """A wall on one radius."""
     ramp = [[0.0, 0.0], [RAMP_END, 1.0]]
     loads = {"pressure": wall.pressure, "elongation": 0.1}
-    turned = {"turnover": {"time": TIME} | turnover} if turnover else {}
+    as_before = {"rates": "tension", "volume": 0.0}  # what the page is about
+    turned = {"turnover": {"time": TIME} | as_before | turnover} if turnover else {}
     return scene_from_dict({
         "preset": "consistent",
         "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": wall.outer_radius, "length": 2.0},

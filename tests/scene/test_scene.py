@@ -303,7 +303,13 @@ def test_a_scene_as_run_reads_back_as_the_same_scene(tmp_path, path):
 
 def test_the_demos_are_the_preset():
     of_the_paper = {"artery": "tube", "cube": "cube", "tendon": "tendon"}
-    assert [path.stem for path in DEMOS if path.stem not in of_the_paper] == ["layers", "pulse", "sheet", "turnover"]
+    assert [path.stem for path in DEMOS if path.stem not in of_the_paper] == [
+        "hypertension",
+        "layers",
+        "pulse",
+        "sheet",
+        "turnover",
+    ]
     for path in (path for path in DEMOS if path.stem in of_the_paper):
         shape = of_the_paper[path.stem]
         printed = scene_from_dict({"name": path.stem, "preset": PAPER, "geometry": {"shape": shape}})
