@@ -71,7 +71,7 @@ def kept_times(history: HistoryColumns, times: Numbers, most: int) -> Numbers:
 Array = NDArray[np.float64]
 
 HISTORY, FIELDS, CHAIN_LINES, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
-LOG, STUDY = "run.log", "study.json"  # of a run; which runs a study has
+LOG = "run.log"
 LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a thousand characters each
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time as clock
 from collections.abc import Callable, Mapping
@@ -18,7 +17,6 @@ from remodel_fenicsx.errors import PAUSED, RemodelError, SOLVE_FAILED
 from remodel_fenicsx.results.recording import (
     HISTORY,
     SCENE,
-    STUDY,
     HistoryColumns,
     RecordedRun,
     RecordingError,
@@ -174,8 +172,6 @@ class Study:
     def do(self) -> None:
         """Run what is not complete; `failed` then has the last words of those that have failed, or are damaged."""
         self._waiting = [run for run in self.runs if self._is_left(run)]
-        text = {"study": self.name, "scene": self.scene.name, "runs": [run.name for run in self.runs]}
-        write_whole(self.folder / STUDY, (json.dumps(text, indent=1) + "\n").encode())  # for `status`
         self.learn()
         pausing = False
         with StopRequest() as stop, Line(f"{self.scene.name} {self.name}", self.quiet) as line:

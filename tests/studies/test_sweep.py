@@ -60,7 +60,7 @@ def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pyt
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(rows(out)) == 5 and len(list(out.glob("*/history.csv"))) == 5
     assert (out / "sweep.png").stat().st_size > 10_000
-    assert status(out)[0] == f"{out}: sweep of cube, 5 runs: 5 finished"
+    assert status(out)[0] == f"{out}: 5 runs: 5 finished"
 
 
 def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,6 +75,11 @@ def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: p
     angles = {(row["remodeling.kappa"], row["loads.force.value"]): row["mean_fibre_angle"] for row in rows(out)}
     assert sorted(angles) == [("0.05", "4"), ("0.05", "8"), ("0.1", "4"), ("0.1", "8")]
     assert [key for key, angle in angles.items() if not np.isfinite(float(angle or "nan"))] == [("0.1", "4")]
+    run = out / "remodeling.kappa-0.05_loads.force.value-4"
+    (run / "history.csv").write_text("".join((run / "history.csv").read_text().splitlines(keepends=True)[:-1]))
+    with (run / "run.log").open("a") as log:
+        log.write("2026-01-01 00:00:00,000 INFO failed: no equilibrium\n")
+    assert status(out) == [f"{out}: 3 runs: 1 failed, 2 finished", f"{run.name} has failed: no equilibrium"]
 
 
 def test_drawn_numbers_outside_of_a_range_are_failed_points(

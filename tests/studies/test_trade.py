@@ -234,7 +234,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     with forked_children():
         assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "-q"]) == 3
         assert "point-1-degree-1-step-0.5-1 has failed: " in capsys.readouterr().err
-        assert status(out)[0].endswith("3 finished, 1 failed")
+        assert status(out) == [f"{out}: 3 runs: 3 finished"]
         (out / "point-1-degree-1-step-0.5-1").unlink()
         assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "--budget", "10min"]) == 0
     words = capsys.readouterr().out
@@ -257,7 +257,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     s = 1 - np.exp(-0.1 * 18.0)
     assert last == pytest.approx(np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s))), abs=1e-6)
 
-    assert status(out) == [f"{out}: trade of cube, 4 runs: 4 finished", f"its answer: {out / 'trade.csv'}"]
+    assert status(out) == [f"{out}: 4 runs: 4 finished"]
     before = {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")}
     assert len(before) == 4  # the three, and 'implicit'
     assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
