@@ -80,6 +80,13 @@ class PatientFile(io.FileIO):
             self.fault = error
         return memoryview(data).nbytes
 
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:  # longer than files may be
+            self.fault = error
+            return self.tell()
+
     def check(self) -> None:
         """Raise what went wrong."""
         if self.fault is not None:
