@@ -192,6 +192,13 @@ class TransientGrid(ClosedAtEnd):
             root["Steps"].attrs.modify("NSteps", np.int64(step + 1))
             self.number_of_steps = step + 1
 
+    def __exit__(self, *error: object) -> None:
+        if error[0] is not None:  # not whole
+            with signals_held_back():
+                self._file.close()
+            self._disk.close()
+        self.close()
+
     def publish(self) -> None:
         """Give the file its name; keep the one that had it, to go on there."""
         if self._disk.closed:
