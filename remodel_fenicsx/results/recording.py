@@ -305,15 +305,6 @@ def versions_as_run(folder: Path) -> dict[str, str]:
     return found
 
 
-def steps_recorded(folder: str | os.PathLike[str]) -> int:
-    """How many steps a run has recorded so far, without reading them; 0 before it has begun."""
-    try:
-        rows = read_regular(Path(folder) / HISTORY, LARGEST_HISTORY).count(b"\n")
-    except FileNotFoundError:
-        return 0
-    return max(0, rows - 2)  # the head, and t = 0
-
-
 def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
     """The columns of a folder's history.csv by name, arrays over its rows; before the first step only `time`, empty."""
     path = Path(folder) / HISTORY

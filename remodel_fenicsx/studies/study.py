@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -22,7 +21,6 @@ from remodel_fenicsx.results.recording import (
     RecordingError,
     RunLock,
     read_history,
-    steps_recorded,
     writer,
 )
 from remodel_fenicsx.running import with_files_kept
@@ -63,17 +61,6 @@ class Run:
     def beside(self, ending: str) -> Path:
         """A file beside its folder, of the same name: names have dots of their own (`step-0.5`)."""
         return self.folder.with_name(f"{self.folder.name}{ending}")
-
-    @property
-    def steps_done(self) -> int:
-        """How many steps are recorded; of steps that are chosen, how many of `time.step` their time takes."""
-        time = self.scene.time
-        if time.tolerance is None:
-            return min(steps_recorded(self.folder), time.number_of_steps)
-        with suppress(RecordingError):  # none yet, or a row that is being written
-            times = self.history()["time"]
-            return int(time.progress(len(times) - 1, float(times[-1]))) if len(times) else 0
-        return 0
 
     def is_complete(self) -> bool:
         """Whether this very scene is recorded to its end."""
@@ -236,9 +223,7 @@ class Study:
             worker.process.send_signal(PAUSE)
 
     def _progress(self) -> str:
-        """How far all runs are, and those under way."""
-        total = sum(run.scene.time.number_of_steps for run in self.runs)
-        done = {run.name: run.steps_done for run in self.runs}
-        parts = [f"{run.name} {done[run.name]}/{run.scene.time.number_of_steps}" for run in self._running.values()]
-        more = [f"{len(self._waiting)} more to start"] if self._waiting else []
-        return f"{100 * sum(done.values()) // total} % of {len(self.runs)} runs: {', '.join(parts + more) or 'done'}"
+        """How many runs are behind, and which are under way."""
+        done = len(self.runs) - len(self._waiting) - len(self._running)
+        under_way = ", ".join(run.name for run in self._running.values())
+        return f"{done} of {len(self.runs)} runs done{f'; under way: {under_way}' if under_way else ''}"

@@ -15,6 +15,7 @@ import pytest
 from remodel_fenicsx import cli, preset_scene
 from remodel_fenicsx.results.recording import FolderTaken, RunLock
 from remodel_fenicsx.results.status import status
+from remodel_fenicsx import running
 from remodel_fenicsx.studies import stability
 from remodel_fenicsx.studies.sweep import ensemble, latin_hypercube, read_axes
 from remodel_fenicsx.studies.trade import trade
@@ -174,7 +175,8 @@ def test_a_study_of_any_kind_is_alone_in_its_folder(
     study: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second has found the folder empty before the first took it."""
-    monkeypatch.setattr(stability, "chosen_folder", lambda folder, *_: folder)
+    for module in (stability, running):
+        monkeypatch.setattr(module, "chosen_folder", lambda folder, *_: folder)
     scene = pulled_cube(1.0).with_values({"cells.initial": "random"})
     with RunLock(tmp_path), pytest.raises(FolderTaken, match=f"process {os.getpid()} on .* writes in it"):
         study(scene, tmp_path)
