@@ -161,7 +161,7 @@ def points(kept: Kept) -> Iterator[Point]:
         exact = reference(method.law, kept)
         for setting in [*settings(method), *whole.settings(name, scene(method))]:
             if (file := f"{name}-{setting.name}") in kept:
-                words = setting.name if setting.name.startswith("profile") else " ".join(setting.in_words().split())
+                words = setting.name
                 every = setting.name.startswith("full")
                 words += ", every tangent factorised" if every else whole.other_words(setting.name)
                 yield Point(name, setting.name, words, kept.found(file, *exact))

@@ -31,7 +31,7 @@ from remodel_fenicsx.system.environment import (
     reason_unusable,
     versions,
 )
-from remodel_fenicsx.system.files import megabytes, positive, refusal_in_words, wall_time, write_new
+from remodel_fenicsx.system.files import positive, refusal_in_words, wall_time, write_new
 
 # what an error of Python's begins with, and the option for it
 OPTIONS = {"folder": "-o", "path": "-o", "times": "--time", "layers": "--layers", "cut": "--cut", "view": "--view"}
@@ -61,7 +61,7 @@ Do = Callable[[argparse.Namespace], int | None]
 Needs = Sequence[Callable[[], str | None]]
 KINDS: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(("DATA", "DIR", "FILE", "FOLDER", "SCENE"), Path),
-    **{"K": int, "MB": megabytes, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
+    **{"K": int, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
 }
 
 
@@ -342,12 +342,9 @@ def _status(options: argparse.Namespace) -> None:
 
 @command(
     "report",
-    ["report artery --open", "report artery -o artery.html --size 5"],
+    ["report artery --open", "report artery -o artery.html"],
     RUN_FOLDER,
     option("-o --output FILE  Write the page to this new file (default: DIR/report.html, which is made anew)."),
-    option(
-        "--size MB  Limit the page to this many MB (default: %(default)g); if need be with fewer times.", default=20.0
-    ),
     option("--open  Show the page in a browser."),
     alone=True,
 )
@@ -355,11 +352,8 @@ def _report(options: argparse.Namespace) -> None:
     """Make the page of the run in DIR for a browser, finished or not."""
     from remodel_fenicsx.report import write_report
 
-    written = write_report(options.folder, options.output, options.size)
+    written = write_report(options.folder, options.output)
     _say(str(written))
-    size = written.stat().st_size / 1e6
-    if size > options.size:
-        _complain(f"warning: the page has {size:.3g} MB, more than --size {options.size:g}: even two times need that")
     if options.open:
         import webbrowser  # slow to import, and seldom asked for
 

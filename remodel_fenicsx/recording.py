@@ -62,15 +62,13 @@ class Recording(RecordedRun):
         sandbox = "allow-scripts allow-downloads"  # no origin of its own: it reaches nothing of the notebook
         return f'<iframe srcdoc="{page}" sandbox="{sandbox}" style="{FRAME_STYLE}" title="report of a run"></iframe>'
 
-    def report(self, path: Path | None = None, size: float = 20.0) -> Path:
+    def report(self, path: Path | None = None) -> Path:
         """Make the page of the run for a browser, as `remodel-fenicsx report` does.
 
         Parameters
         ----------
         path
             A new file; default: report.html in the folder, which is made anew.
-        size
-            MB (10^6 bytes) that it may have: where it would be larger fewer times are shown.
 
         Returns
         -------
@@ -90,7 +88,7 @@ class Recording(RecordedRun):
         """
         from remodel_fenicsx.report.page import write_report
 
-        return write_report(self.path, path, size)
+        return write_report(self.path, path)
 
     def grid(self, time: float | None = None) -> pyvista.UnstructuredGrid:
         """The whole body at a recorded time for PyVista; of a reduction it is turned into the body.

@@ -6,7 +6,7 @@ import hashlib
 import logging
 import shutil
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -60,7 +60,7 @@ def run(
     quiet: bool = True,
     deadline: float | None = None,
     report: bool = True,
-    watchers: Sequence[Watcher] = (),
+    watchers: Sequence[Watcher | Callable[[Simulation], Watcher]] = (),
 ) -> Path:
     """Run a scene and record it.
 
@@ -79,7 +79,8 @@ def run(
     report
         Whether it leaves report.html at its end, if the scene does not say otherwise (`output.report`).
     watchers
-        Who else follows the steps, before they are recorded; those of every run are in `extend.WATCHERS`.
+        Who else follows the steps, before they are recorded, or functions of the `Simulation` that make them; those of
+        every run are in `extend.WATCHERS`.
 
     Returns
     -------
@@ -121,7 +122,8 @@ def run(
             simulation = body.enter_context(_built(_with_sums(scene, comm), comm))
             place = place or chosen_folder(None, scene.name, comm)
         with locked(place, comm, new=True):
-            _record(simulation, place, stop, held, quiet, deadline, report, watchers=watchers)
+            followers = [one if isinstance(one, Watcher) else one(simulation) for one in watchers]
+            _record(simulation, place, stop, held, quiet, deadline, report, watchers=followers)
     return place
 
 

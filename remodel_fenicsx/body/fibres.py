@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from remodel_fenicsx.body.mesh_file import read_exchange_file
+from remodel_fenicsx.body.mesh_file import in_place, read_exchange_file
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
 from remodel_fenicsx.schema.text import TableFileError, read_columns
@@ -65,8 +65,8 @@ class FibreFile:
         far, rows[chosen] = cKDTree(self.places).query(centres[chosen])
         if (far > sizes[chosen]).any():
             worst = (far / sizes[chosen]).argmax()
-            place, size = ", ".join(f"{x:.4g}" for x in centres[chosen][worst]), sizes[chosen][worst]
-            rule = f"nothing is measured within one element ({size:.3g}) of ({place}); "
+            place, size = in_place(centres[chosen][worst]), sizes[chosen][worst]
+            rule = f"nothing is measured within one element ({size:.3g}) of {place}; "
             raise FibreFileError(rule + f"the nearest is {far[worst]:.3g} away")
         return rows, float(far.max())
 

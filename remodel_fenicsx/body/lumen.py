@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.mesh_file import of_vtk, split_quads, split_wedges, vtk_arrays
+from remodel_fenicsx.body.mesh_file import in_place, of_vtk, split_quads, split_wedges, vtk_arrays
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.schema.settings import LARGEST_MESH
@@ -124,7 +124,7 @@ def oriented(surface: Surface, name: str) -> Surface:
     number = number.reshape(-1)
     if (counts > 2).any():
         place = points[distinct[counts > 2][0]].mean(axis=0)
-        raise LumenError(f"{name}: three triangles or more meet in one edge, at {_at(place)}; a lumen has two")
+        raise LumenError(f"{name}: three triangles or more meet in one edge, at {in_place(place)}; a lumen has two")
     if (counts == 2).all():
         raise LumenError(f"{name}: the surface is closed; cut its ends open, where the vessel goes on")
     order = np.argsort(number, kind="stable")
@@ -239,7 +239,7 @@ def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], throu
         normals = _smoothed(normals, surface, openings)
     else:
         place = points[tetrahedra[folded][0]].mean(axis=0)
-        raise LumenError(f"--thickness: too thick: the wall folds over at {_at(place)}, where the lumen is hollow")
+        raise LumenError(f"--thickness: too thick: the wall folds over at {in_place(place)}, where the lumen is hollow")
     _check_room(surface.points, points[-size:], thickness)
     of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(surface.triangles))
     faces = {"inner": surface.triangles, "outer": surface.triangles + size * (len(levels) - 1)}
@@ -285,7 +285,7 @@ def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
     distance, _ = cKDTree(inner).query(outer)
     if (crossed := distance < LEAST_ROOM * thickness).any():
         place = outer[int(np.argmax(crossed))]
-        raise LumenError(f"--thickness: too thick: the wall meets another part of the vessel at {_at(place)}")
+        raise LumenError(f"--thickness: too thick: the wall meets another part of the vessel at {in_place(place)}")
 
 
 def _of_degree_2(points: Array, tetrahedra: Integers, layers: Integers, faces: Mapping[str, Integers]) -> GrownWall:
@@ -303,10 +303,6 @@ def _of_degree_2(points: Array, tetrahedra: Integers, layers: Integers, faces: M
     return GrownWall(
         whole, np.column_stack([tetrahedra, middles]), layers, {k: with_middles(v) for k, v in faces.items()}
     )
-
-
-def _at(place: Array) -> str:
-    return "(" + ", ".join(f"{number:.4g}" for number in place) + ")"
 
 
 # ---------------------------------------------------------------- what the command does

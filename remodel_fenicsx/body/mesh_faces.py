@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, MeshFileError, as_rows, distinct
+from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, MeshFileError, as_rows, distinct, in_place
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
 
@@ -89,7 +89,7 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     for name, numbers in groups.items():
         chosen = np.isin(file.facet_groups, numbers)
         for key in as_rows(np.sort(file.facets[chosen], axis=1)):
-            row, where = index.get(key), "at " + _place(file.points[list(key)].mean(axis=0))
+            row, where = index.get(key), "at " + in_place(file.points[list(key)].mean(axis=0))
             if row is None:
                 words = "inside the body" if key in inside else "that are no facets of its elements"
                 raise FaceError(name, f"has facets {words}, the first {where}")
@@ -98,7 +98,7 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
             owner[row] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
-        where, share = _place(places[bare][0].mean(axis=0)), bare.sum()
+        where, share = in_place(places[bare][0].mean(axis=0)), bare.sum()
         rule = f"{share} of {len(bare)} facets of the boundary are in no face of geometry.faces, the first at {where}"
         raise MeshFileError(rule + "; if that is meant: geometry.open_boundary = true")
     faces = []
@@ -246,7 +246,7 @@ def _check_elements(file: MeshFile) -> None:
     bad = np.flatnonzero(turned.min(axis=1) <= FLAT * np.abs(determinants).mean())
     if len(bad):
         cell = int(bad[0])
-        where = _place(file.points[file.corners[cell]].mean(axis=0))
+        where = in_place(file.points[file.corners[cell]].mean(axis=0))
         raise MeshFileError(
             f"element {file.cell_numbers[cell]} at {where} is twisted or flat: its volume is not above zero "
             f"everywhere in it ({len(bad)} such element{'s' if len(bad) > 1 else ''})"
@@ -281,10 +281,6 @@ def _middle(file: MeshFile, cell: int, pair: tuple[int, int]) -> int:
     (nodes,) = as_rows(file.cells[[cell]])
     local = tuple(sorted(nodes.index(node) for node in pair))
     return int(nodes[MIDDLES[file.kind][local[0], local[1]]])
-
-
-def _place(point: Array) -> str:
-    return "(" + ", ".join(f"{x:.4g}" for x in point) + ")"
 
 
 # ---------------------------------------------------------------- supports of faces

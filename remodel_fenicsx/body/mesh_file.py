@@ -92,6 +92,11 @@ def as_rows(table: Integers) -> list[tuple[int, ...]]:
     return [tuple(row) for row in listed]
 
 
+def in_place(point: Array) -> str:
+    """A place in words."""
+    return "(" + ", ".join(f"{number:.4g}" for number in point) + ")"
+
+
 def distinct(values: Integers) -> list[int]:
     """Different ones of a list of numbers, in its order."""
     listed: Any = values.tolist()
@@ -263,8 +268,8 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
     away, nodes = cKDTree(file.points).query(corners)
     far = away > SAME_NODE * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1, keepdims=True)
     if far.any():
-        place, distance = ", ".join(f"{x:.4g}" for x in corners[far][0]), away[far][0]
-        rule = f"at ({place}), the nearest is {distance:.3g} away: is it the surface of this mesh, in its unit?"
+        where = f"at {in_place(corners[far][0])}, the nearest is {away[far][0]:.3g} away"
+        rule = f"{where}: is it the surface of this mesh, in its unit?"
         raise MeshFileError(f"{path.name}: {far.sum()} corners of triangles are no nodes of the mesh, the first {rule}")
     number = 1 + max([*distinct(file.facet_groups), *file.names[2].values()], default=0)
     return replace(

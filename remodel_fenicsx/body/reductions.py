@@ -230,15 +230,14 @@ def for_means(scene: Any) -> str:
 
 
 def explained(scene: Any) -> list[str]:
-    """The choice in words: what it costs, why nothing cheaper, what it cannot show."""
+    """The choice in words: why nothing cheaper, what it cannot show."""
     made = choice(scene)
-    cost = f" ({_cost(scene, made.name)})" if KINEMATICS[made.name].reduced else ""
-    lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}{cost}"]
+    lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}"]
     for name, reasons in made.objections.items():
         if name != made.name:
             means = " for means over seeds" if is_for_means(scene, name) else ""
-            lines.append(f"{name!r}{f', allowed{means}' if not reasons else ''} ({_cost(scene, name)})")
-            lines[-1] += "".join(f"{': not allowed: ' if not index else '; '}{r}" for index, r in enumerate(reasons))
+            verdict = f"not allowed: {'; '.join(reasons)}" if reasons else f"allowed{means}"
+            lines.append(f"{name!r}, {verdict}")
     lines += only_for_means(scene)
     if KINEMATICS[made.name].reduced and (swinging := _leaves_symmetry(scene)):
         lines.append(
@@ -289,13 +288,6 @@ def step_cost(scene: Any, name: str) -> float:
     if element == "tetrahedron":
         number *= 6
     return POINTS_OF_THE_REST + kinematics.cost * number * POINTS[element, mesh.degree]
-
-
-def _cost(scene: Any, name: str) -> str:
-    cost = step_cost(scene, name) / step_cost(scene, "full")
-    if cost > 0.7:
-        return "about the cost of 'full'"
-    return f"about 1/{float(f'{1 / cost:.1g}'):g} of the cost of 'full'"
 
 
 def _leaves_symmetry(scene: Any) -> str:

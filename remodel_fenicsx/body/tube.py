@@ -457,10 +457,6 @@ class Tube(RoundWall):
         """Circumferential, axial, radial about the z axis, rows (..., 3, 3)."""
         return cylindrical_axes(coordinates)
 
-    def station(self, coordinates: Array) -> Array:
-        """Along z, from 0 to 1, (...,)."""
-        return np.asarray(coordinates[..., 2] / self.length, dtype=np.float64)
-
 
 def whole_tube(
     shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None,

@@ -6,6 +6,6 @@ gives a card: HTML and, for what moves, data and arrays that the scripts in `ass
 
 from __future__ import annotations
 
-from remodel_fenicsx.report.page import PAGE_SIZE, REPORT, ReportError, write_report
+from remodel_fenicsx.report.page import REPORT, ReportError, write_report
 
-__all__ = ["PAGE_SIZE", "REPORT", "ReportError", "write_report"]
+__all__ = ["REPORT", "ReportError", "write_report"]

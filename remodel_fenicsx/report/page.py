@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import math
 import os
 import re
 import shlex
@@ -597,50 +596,40 @@ def cards(run: ReportedRun) -> list[Card]:
 # Template, cards, data, scripts; nothing in it asks for anything from outside.
 
 REPORT = "report.html"
-PAGE_SIZE = 20.0  # MB that a page has at most, if it need not be larger for two times
+PAGE_SIZE = 20.0  # MB that a page should have at most
 SCRIPTS = ("data.js", "body.js", "angles.js", "stress.js", "curves.js", "page.js")
 STYLES = ("report.bundle.css", "page.css")
 GENERATOR_TAG = b'name="generator" content="remodel_fenicsx'  # what bears it may be made anew
 LARGEST_PAGE = 10**9  # bytes
 FEWEST_TIMES = 2
-BEST_RATIO = 0.15  # of deflated to plain bytes of fields: none was smaller, so that no time is left out too early
-TRIES = 4
+RATIO = 0.35  # of deflated to plain bytes of fields: few are larger
 
 
 class ReportError(RemodelError, ValueError):
     """No report for a reason that its one line names."""
 
 
-def write_report(folder: str | os.PathLike[str], path: Path | None = None, size: float = PAGE_SIZE) -> Path:
+def write_report(folder: str | os.PathLike[str], path: Path | None = None) -> Path:
     """Make the report of a run, finished or not, from its folder."""
     recording = RecordedRun(folder)
     if path is not None:
-        write_new(path, page_of(recording, size).encode("utf-8"))
+        write_new(path, page_of(recording).encode("utf-8"))
         return path
     path = recording.path / REPORT
     if path.exists() and GENERATOR_TAG not in read_regular(path, LARGEST_PAGE)[:4096]:
         raise ReportError(f"{path}: is no report of this command and is not overwritten; choose another file")
-    write_whole(path, page_of(recording, size).encode("utf-8"))
+    write_whole(path, page_of(recording).encode("utf-8"))
     return path
 
 
 def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
-    """The page as text; parameters and errors as of `write_report`."""
+    """The page as text, of about so many MB at most."""
     if not has_a_body(recording):
         return page_with(cards(ReportedRun(recording)))
-    whole, count = WholeBody(recording), 6 * len(recording.points) + 11 * len(recording.elements)
-    # more times than this do not fit, however small they become
-    most = max(FEWEST_TIMES, int(1e6 * size / (4 / 3 * BEST_RATIO * count)))
-    for _ in range(TRIES):
-        body = ShownBody.of(whole, kept_times(recording.history, recording.times, most))
-        found = cards(ReportedRun(recording, body))
-        page = page_with(found)
-        if len(page) <= 1e6 * size or len(body.times) <= FEWEST_TIMES:
-            break
-        rest = len(page_with([card for card in found if card.name != "view"]))
-        share = max(0.0, 1e6 * size - rest) / (len(page) - rest)
-        most = max(FEWEST_TIMES, min(len(body.times) - 1, math.floor(0.97 * share * len(body.times))))
-    return page
+    of_a_time = 4 / 3 * RATIO * (6 * len(recording.points) + 11 * len(recording.elements))  # bytes, in base64
+    whole, most = WholeBody(recording), max(FEWEST_TIMES, int(1e6 * size / of_a_time))
+    body = ShownBody.of(whole, kept_times(recording.history, recording.times, most))
+    return page_with(cards(ReportedRun(recording, body)))
 
 
 def page_with(found: list[Card]) -> str:

@@ -71,7 +71,7 @@ def kept_times(history: HistoryColumns, times: Numbers, most: int) -> Numbers:
 Array = NDArray[np.float64]
 
 HISTORY, FIELDS, CHAIN_LINES, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
-LOG, STUDY = "run.log", "study.json"  # of a run; which runs a study has
+LOG = "run.log"
 LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a thousand characters each
 
 
@@ -303,15 +303,6 @@ def versions_as_run(folder: Path) -> dict[str, str]:
         name, _, version = line[1:].strip().partition(" ")
         found[name] = version
     return found
-
-
-def steps_recorded(folder: str | os.PathLike[str]) -> int:
-    """How many steps a run has recorded so far, without reading them; 0 before it has begun."""
-    try:
-        rows = read_regular(Path(folder) / HISTORY, LARGEST_HISTORY).count(b"\n")
-    except FileNotFoundError:
-        return 0
-    return max(0, rows - 2)  # the head, and t = 0
 
 
 def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:

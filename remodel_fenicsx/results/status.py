@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import time as clock
@@ -13,13 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from remodel_fenicsx.results.checkpoint_file import time_of_checkpoint
-from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, LOG, STUDY, RecordedRun, RecordingError, writer
+from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, LOG, SCENE, RecordedRun, RecordingError, writer
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.system.files import ForeignFileError, MOST_RUNS, read_regular, typed
+from remodel_fenicsx.system.files import read_regular, typed
 from remodel_fenicsx.system.terminal import duration
 
-_NAME = re.compile(r"\w[\w.+ -]{0,199}")  # as scenes have: of one file, in no folder elsewhere
-LARGEST_STUDY = 10**7  # bytes: ten thousand names of runs
 RECENT = 20  # steps whose mean is the rate
 BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
 _LOG_LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
@@ -28,8 +25,8 @@ SHOWN = 5  # runs of a study that have failed and are named
 
 def status(folder: Path) -> list[str]:
     """Lines for people: where the run is, whether it is alive, its rate, its checkpoint; or what a study's runs do."""
-    if (folder / STUDY).is_file():
-        return _of_study(folder)
+    if runs := [] if (folder / SCENE).exists() else sorted(path.parent for path in folder.glob(f"*/{SCENE}")):
+        return _of_study(folder, runs)
     holder, lives = writer(folder)
     if not lives or (folder / HISTORY).exists():
         recording = RecordedRun(folder)  # what is no run's folder is refused
@@ -98,39 +95,17 @@ def _said_of_its_end(folder: Path) -> tuple[str, str]:
     return "stopped", last.removeprefix(STOPPED) if last.startswith(STOPPED) else ""
 
 
-def _of_study(folder: Path) -> list[str]:
-    """How many of its runs are where, which have failed and why, and where the answer is."""
-    try:
-        study = json.loads(read_regular(folder / STUDY, LARGEST_STUDY))
-        name, scene, runs = study["study"], study["scene"], study["runs"]
-        if not all(isinstance(text, str) and _NAME.fullmatch(text) for text in (name, scene, *runs)):
-            raise ValueError("names are not those of files")
-        if len(runs) > MOST_RUNS:
-            raise ValueError(f"more than {MOST_RUNS} runs")
-    except (ValueError, KeyError, TypeError, RecursionError, ForeignFileError) as error:
-        raise RecordingError(f"{folder / STUDY}: is damaged: {error}") from error
-    states = {run: _state(folder / run) for run in runs}
+def _of_study(folder: Path, runs: list[Path]) -> list[str]:
+    """How many of its runs are where, and which have failed and why."""
+    states = {run.name: _state(run) for run in runs}
     counted = Counter(state for state, _ in states.values())
-    lines = [
-        f"{folder}: {name} of {scene}, {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"
-    ]
+    lines = [f"{folder}: {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"]
     failed = [f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"]
-    lines += failed[:SHOWN] + ([f"and {len(failed) - SHOWN} more"] if len(failed) > SHOWN else [])
-    answer = folder / f"{name}.csv"
-    lines.append(f"its answer: {answer}" if answer.exists() else "no answer yet")
-    if set(counted) - {"finished", "running"}:
-        lines[-1] += f"; the same command goes on: {typed()} {name} SCENE -o {folder}"
-    return lines
+    return lines + failed[:SHOWN] + ([f"and {len(failed) - SHOWN} more"] if len(failed) > SHOWN else [])
 
 
 def _state(folder: Path) -> tuple[str, str]:
     """Of a run of a study in a word; and why it has failed."""
-    if not folder.is_dir():
-        messages = folder.with_name(f"{folder.name}.txt")
-        data = read_regular(messages, LARGEST_HISTORY) if messages.is_file() else b""
-        said = data.decode(errors="replace").split("\n")
-        last = next((line for line in reversed(said) if line), "")
-        return ("failed", last.removeprefix("remodel-fenicsx: ")) if last else ("not begun", "")
     if writer(folder)[1]:
         return "running", ""
     try:

@@ -80,6 +80,13 @@ class PatientFile(io.FileIO):
             self.fault = error
         return memoryview(data).nbytes
 
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:  # longer than files may be
+            self.fault = error
+            return self.tell()
+
     def check(self) -> None:
         """Raise what went wrong."""
         if self.fault is not None:
@@ -184,6 +191,13 @@ class TransientGrid(ClosedAtEnd):
                 _write(root[name], step, np.full((1, *columns), number))
             root["Steps"].attrs.modify("NSteps", np.int64(step + 1))
             self.number_of_steps = step + 1
+
+    def __exit__(self, *error: object) -> None:
+        if error[0] is not None:  # not whole
+            with signals_held_back():
+                self._file.close()
+            self._disk.close()
+        self.close()
 
     def publish(self) -> None:
         """Give the file its name; keep the one that had it, to go on there."""

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -208,16 +209,16 @@ def revolve(folder: Path | str) -> list[Path]:
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     image = _Image(recording, recording.scene.geometry.reductions[name].turn)
-    grid, chains = TransientGrid(paths[0], image.points, image.cells, image.cell_type), None
-    for time in recording.times:
-        displacement, fields = image(recording.fields(float(time)))
-        grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
-        if displacement is not None and set(OF_CHAINS) <= set(fields):
-            middle = displacement[image.elements].mean(axis=1)
-            chains = append_chains(chains or paths[1], float(time), image.centres, image.scale, middle, fields)
-    for each in (chains, grid):  # the body last: where it is, all are
-        if each is not None:
-            each.close()
+    with ExitStack() as stack:  # the body is closed last: where it is, all are
+        grid = stack.enter_context(TransientGrid(paths[0], image.points, image.cells, image.cell_type))
+        chains: TransientGrid | None = None
+        for time in recording.times:
+            displacement, fields = image(recording.fields(float(time)))
+            grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
+            if displacement is not None and set(OF_CHAINS) <= set(fields):
+                middle = displacement[image.elements].mean(axis=1)
+                new = append_chains(chains or paths[1], float(time), image.centres, image.scale, middle, fields)
+                chains = chains or stack.enter_context(new)
     return [path for path in paths if path.exists()]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,12 @@ from remodel_fenicsx.fem.assembly import factorised
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.results.run_folder import RunFolder, chosen_folder, locked
+from remodel_fenicsx.results.run_folder import chosen_folder
+from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, SceneError
+from remodel_fenicsx.schema.settings import Model
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.page import COLOURS, Answer, aligned
-from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, end_all_ranks_on_exception
-from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
 
 log = logging.getLogger(__name__)
 
@@ -224,6 +224,12 @@ class AmplificationWatcher(Watcher):
                 log.warning("time %g: a factor of the pass was %s", step.time, words)
         self.found.append(Amplification(step.time, *modes))
 
+    def committed(self, step: Step) -> None:
+        """Say it."""
+        if self.chosen(step):
+            found = _factor(self.found[-1].reversing)
+            log.info("time %g: a pass multiplies the worst small change by %.3g", step.time, found)
+
     def undone(self, step: Step) -> None:
         """What was found of the step goes."""
         if self.found and self.found[-1].time == step.time:
@@ -244,37 +250,25 @@ def stability(
         raise SceneError("cases: the analysis takes one load case; leave out [[cases]]")
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; leave it out")
-    end_all_ranks_on_exception()
-    with hold_log(comm.rank, quiet=quiet) as held:
-        simulation = Simulation(scene, comm)
-    scene = simulation.scene  # with the kinematics that was chosen
     place = chosen_folder(folder, f"{scene.name}-stability", comm)
-    steps, share = scene.time.number_of_steps, simulation.stepper.remodeling.share
+    steps, made = scene.time.number_of_steps, list[AmplificationWatcher]()
     chosen = {round(steps * (index + 1) / number) for index in range(number)}
-    watcher = AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen)
 
-    with ExitStack() as stack:
-        stop = stack.enter_context(StopRequest())
-        simulation.state.stop_signal = lambda: stop.number or (PAUSE if stop.pause else 0)
-        stack.enter_context(locked(place, comm, new=True))
-        record = stack.enter_context(RunFolder(place, scene.to_toml("as analysed: all values"), comm.rank))
-        stack.enter_context(open_log(place / "run.log", comm.rank, quiet=quiet, held=held))
-        kinematics = scene.model.kinematics
-        log.info("analysing %s at %d of %d steps, kinematics %r", scene.name, len(chosen), steps, kinematics)
-        if unseen := unseen_by(scene):
-            log.info("%s", unseen)
-        progress = stack.enter_context(Progress(steps, f"{scene.name} stability", -1 if quiet else comm.rank))
-        try:
-            for step in simulation.steps([watcher, record]):
-                progress.step(step.number, step.time, "", step.work.newton_iterations, None)
-                if step.number in chosen:
-                    found = _factor(watcher.found[-1].reversing)
-                    log.info("time %g: a pass multiplies the worst small change by %.3g", step.time, found)
-        finally:
-            if comm.rank == 0 and watcher.found:  # of a run that ends early too
-                Analysis(scene, as_table(watcher, share), share).write(place)
-        simulation.close()
-    return place, Analysis(scene, as_table(watcher, share), share)
+    def watcher(simulation: Simulation) -> Watcher:
+        made.append(AmplificationWatcher(simulation.stepper, lambda step: step.number in chosen))
+        return made[0]
+
+    def answer() -> Analysis:
+        share, kinematics = made[0].stepper.remodeling.share, made[0].stepper.state.kinematics.name
+        taken = scene.model_copy(update={"model": Model(kinematics=kinematics)})
+        return Analysis(taken, as_table(made[0], share), share)
+
+    try:
+        run(scene.with_values({"output.fields": False}), place, comm, quiet, report=False, watchers=[watcher])
+    finally:
+        if comm.rank == 0 and made and made[0].found:  # of a run that ends early too
+            answer().write(place)
+    return place, answer()
 
 
 def unseen_by(scene: Scene) -> str:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time as clock
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -18,13 +16,11 @@ from remodel_fenicsx.errors import PAUSED, RemodelError, SOLVE_FAILED
 from remodel_fenicsx.results.recording import (
     HISTORY,
     SCENE,
-    STUDY,
     HistoryColumns,
     RecordedRun,
     RecordingError,
     RunLock,
     read_history,
-    steps_recorded,
     writer,
 )
 from remodel_fenicsx.running import with_files_kept
@@ -65,17 +61,6 @@ class Run:
     def beside(self, ending: str) -> Path:
         """A file beside its folder, of the same name: names have dots of their own (`step-0.5`)."""
         return self.folder.with_name(f"{self.folder.name}{ending}")
-
-    @property
-    def steps_done(self) -> int:
-        """How many steps are recorded; of steps that are chosen, how many of `time.step` their time takes."""
-        time = self.scene.time
-        if time.tolerance is None:
-            return min(steps_recorded(self.folder), time.number_of_steps)
-        with suppress(RecordingError):  # none yet, or a row that is being written
-            times = self.history()["time"]
-            return int(time.progress(len(times) - 1, float(times[-1]))) if len(times) else 0
-        return 0
 
     def is_complete(self) -> bool:
         """Whether this very scene is recorded to its end."""
@@ -174,8 +159,6 @@ class Study:
     def do(self) -> None:
         """Run what is not complete; `failed` then has the last words of those that have failed, or are damaged."""
         self._waiting = [run for run in self.runs if self._is_left(run)]
-        text = {"study": self.name, "scene": self.scene.name, "runs": [run.name for run in self.runs]}
-        write_whole(self.folder / STUDY, (json.dumps(text, indent=1) + "\n").encode())  # for `status`
         self.learn()
         pausing = False
         with StopRequest() as stop, Line(f"{self.scene.name} {self.name}", self.quiet) as line:
@@ -240,9 +223,7 @@ class Study:
             worker.process.send_signal(PAUSE)
 
     def _progress(self) -> str:
-        """How far all runs are, and those under way."""
-        total = sum(run.scene.time.number_of_steps for run in self.runs)
-        done = {run.name: run.steps_done for run in self.runs}
-        parts = [f"{run.name} {done[run.name]}/{run.scene.time.number_of_steps}" for run in self._running.values()]
-        more = [f"{len(self._waiting)} more to start"] if self._waiting else []
-        return f"{100 * sum(done.values()) // total} % of {len(self.runs)} runs: {', '.join(parts + more) or 'done'}"
+        """How many runs are behind, and which are under way."""
+        done = len(self.runs) - len(self._waiting) - len(self._running)
+        under_way = ", ".join(run.name for run in self._running.values())
+        return f"{done} of {len(self.runs)} runs done{f'; under way: {under_way}' if under_way else ''}"

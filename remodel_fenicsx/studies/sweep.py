@@ -19,7 +19,6 @@ from remodel_fenicsx.body.reductions import only_for_means
 from remodel_fenicsx.results.recording import HistoryColumns
 from remodel_fenicsx.scene.scene import Scene, SceneError, in_region
 from remodel_fenicsx.schema.tables import shown
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import COLOURS, Answer, aligned, label, panels
 from remodel_fenicsx.studies.study import FEWEST_RUNS, Study, TooFewRuns
 from remodel_fenicsx.system.files import MOST_RUNS
@@ -311,17 +310,15 @@ class Ensemble(Answer):
         return [name for name, values in self.columns.items() if np.ptp(values[:, row]) != 0]
 
     def lines(self) -> list[str]:
-        """The columns that differ between seeds, at some times."""
-        width, lines = max(len(name) for name in self.columns), []
-        for time in chosen_times(self.scene):
-            row = next(row for row, recorded in enumerate(self.time) if same_time(float(recorded), time))
-            lines.append(f"time {time:g}, {self.seeds} seeds")
-            lines.append(f"{'':{width}} {'mean':>11} {'deviation':>11} {'least':>11} {'most':>11} {ISOTROPIC:>11}")
-            for name in self.varying(row):
-                cells = {kind: f"{values[row]:11.5g}" for kind, values in self.statistics(name).items()}
-                if not self.knows_deviations:
-                    cells["deviation"] = f"{'not known':>11}"
-                lines.append(f"{name:{width}} {' '.join(cells.values())} {self._beside(name, row)}")
+        """The columns that differ between seeds, at the end."""
+        width, row = max(len(name) for name in self.columns), len(self.time) - 1
+        lines = [f"time {self.time[row]:g}, {self.seeds} seeds"]
+        lines.append(f"{'':{width}} {'mean':>11} {'deviation':>11} {'least':>11} {'most':>11} {ISOTROPIC:>11}")
+        for name in self.varying(row):
+            cells = {kind: f"{values[row]:11.5g}" for kind, values in self.statistics(name).items()}
+            if not self.knows_deviations:
+                cells["deviation"] = f"{'not known':>11}"
+            lines.append(f"{name:{width}} {' '.join(cells.values())} {self._beside(name, row)}")
         return lines
 
     def _beside(self, name: str, row: int) -> str:
@@ -383,15 +380,6 @@ class Ensemble(Answer):
         if name in self.isotropic and name not in self.extremes:
             axes.plot(self.time, self.isotropic[name], "--", color=COLOURS[1], label="isotropic cells")
         axes.set(xlabel="time", ylabel=label(self.scene, name), xlim=(0, self.time[-1]))
-
-
-def chosen_times(scene: Scene) -> list[float]:
-    """The end of the last ramp, and the end."""
-    step, end = scene.time.step, scene.last_time
-    if scene.time.is_equilibrium:
-        return [end]
-    last = step * round(scene.end_of_ramps / step)
-    return [last, end] if step <= last < end else [end]
 
 
 def ensemble(

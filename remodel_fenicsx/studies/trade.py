@@ -101,14 +101,6 @@ class Setting:
         """How long they are, or their tolerance."""
         return f"step {self.step:g}" if self.step is not None else f"tolerance {self.scene.time.tolerance:g}"
 
-    def in_words(self) -> str:
-        """Kinematics, mesh, steps and coupling on a line."""
-        kinematics, refinement, degree = self.mesh
-        mesh = "" if KINEMATICS[kinematics].homogeneous else f" refinement {refinement} degree {degree}"
-        profile = f" (profile {self.profile})" if self.profile else ""
-        coupling = f" {self.way[1]}" if COUPLING in self.changes else ""
-        return f"{kinematics:12}{mesh} {self.steps_in_words}{coupling}{profile}"
-
 
 def ladder(scene: Scene) -> list[Setting]:
     """All settings that the scene allows, each once: sweeps of one factor from the cheapest kinematics, then both."""
@@ -279,11 +271,6 @@ class Row:
     length_error: float
     on_front: bool = False
     doubt: str = ""
-
-    @property
-    def words(self) -> str:
-        """Its setting."""
-        return " ".join(self.result.setting.in_words().split())
 
 
 class _Guess(NamedTuple):
@@ -518,7 +505,7 @@ class _TradeStudy(Study):
             rows = estimated(self.results)[0] if len(self._results) > 1 else []
             error = next((row.angle_error for row in rows if row.result.setting == setting), np.nan)
             so_far = f"so far {error:.2g} degrees off" if error > NOTHING else "the finest so far"
-            self.say(f"{setting.in_words()}: {result.seconds:.2g} s, {so_far}")
+            self.say(f"{setting.name}: {result.seconds:.2g} s, {so_far}")
 
 
 def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Result:
@@ -580,7 +567,7 @@ class Trade(Answer):
         for row in self.rows:
             numbers = f"{row.result.seconds:9.3g} {row.angle_error:9.2g} {100 * row.length_error:9.2g}"
             doubt = f"  ({row.doubt})" if row.doubt else ""
-            lines.append(f"{'* ' if row.on_front else '  '}{numbers}  {row.result.setting.in_words()}{doubt}")
+            lines.append(f"{'* ' if row.on_front else '  '}{numbers}  {row.result.setting.name}{doubt}")
         about = "*: no other setting is as good for less. Errors are estimates; degrees: fibre angle, root mean square."
         return [*lines, about]
 
@@ -592,9 +579,10 @@ class Trade(Answer):
             return f"Not known: all {len(self.rows)} errors are doubted; trade.csv says why."
         best = min(good or trusted, key=lambda row: (row.result.seconds if good else 0.0, row.angle_error))
         cost = f"{best.result.seconds:.2g} s of the processor for an error of {best.angle_error:.2g} degrees"
+        name = best.result.setting.name
         if not good:
-            return f"No setting is known to be within {WANTED:g} degree; the closest is {best.words}, {cost}."
-        return f"The cheapest setting within {WANTED:g} degree is {best.words}, {cost}."
+            return f"No setting is known to be within {WANTED:g} degree; the closest is {name}, {cost}."
+        return f"The cheapest setting within {WANTED:g} degree is {name}, {cost}."
 
     def write(self, folder: Path) -> None:
         """Write the table, the picture, and a scene of each row."""
@@ -626,8 +614,8 @@ class Trade(Answer):
             axes.plot(*_places([row for row in same if row.on_front]), "o", color=colour, markersize=5)
         if kinds:
             figure.legend(loc="outside lower left", ncols=3)
-            names = [row.words for row in front]
-            names += [f"no error: {row.words}" for row in self.rows if row.on_front and row not in front]
+            names = [row.result.setting.name for row in front]
+            names += [f"no error: {row.result.setting.name}" for row in self.rows if row.on_front and row not in front]
             place: dict[str, Any] = {"loc": "outside right center", "handlelength": 0, "fontsize": 6.5}
             place |= {"title": "filled, from left to right: no\nother one is as good for less", "title_fontsize": 7.5}
             figure.legend([Line2D([], [], linestyle="")] * len(names), names, **place)

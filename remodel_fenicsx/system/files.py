@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import errno
-import math
 import os
 import re
 import shlex
@@ -183,20 +182,6 @@ def positive(text: str) -> int:
     number = int(text)
     if not 1 <= number <= MOST_RUNS:
         raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number from 1 to {MOST_RUNS}")
-    return number
-
-
-MOST_MEGABYTES = 1000.0  # of a page: browsers open no larger one
-
-
-def megabytes(text: str) -> float:
-    """A number above 0, up to `MOST_MEGABYTES`."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0 < number <= MOST_MEGABYTES:
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed is a number of MB above 0, up to {MOST_MEGABYTES:g}")
     return number
 
 

@@ -464,25 +464,6 @@ def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> Non
     assert {path.name for path in tmp_path.iterdir()} == {*put_there, "scene.toml", "out", "the-users-own"}
 
 
-@pytest.mark.parametrize(
-    "study",
-    [
-        {"study": "../../x", "scene": "x", "runs": []},
-        {"study": "ensemble", "scene": "x", "runs": [".."]},
-        {"study": "ensemble", "scene": "x", "runs": ["/proc/self"]},
-        {"study": "ensemble", "scene": "x", "runs": ["a\x1b[31m"]},
-        {"study": "ensemble", "scene": "x", "runs": ["x" * 5000]},
-        {"study": {}, "scene": [], "runs": {"a": 1}},
-        {"study": "ensemble", "scene": "x", "runs": [str(number) for number in range(200_000)]},
-    ],
-    ids=["elsewhere", "above", "at the root", "control", "long", "tables", "many"],
-)
-def test_a_foreign_study_names_runs_of_its_own_folder(study: Any, tmp_path: Path) -> None:
-    """Before, 200,000 runs took the square of that."""
-    (tmp_path / "study.json").write_text(json.dumps(study))
-    assert "study.json: is damaged" in refusal_of("status", tmp_path)
-
-
 def test_a_column_named_often_is_one_column() -> None:
     """30,000 of them took minutes."""
     scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"output.columns": ["mean_stretch"] * 30_000})

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import pytest
 
 from remodel_fenicsx import cli, preset_scene, run as run_scene
 from remodel_fenicsx.system.files import write_new
+from tests.conftest import Refused
 
 # a command that is killed at its N-th write, rename or link that has to do with a file of this name
 KILLED = """
@@ -45,6 +48,18 @@ def test_revolve_that_was_killed_does_not_block_itself(quarter: Path) -> None:
     assert cli.main(["revolve", str(quarter)]) == 0
     assert all((quarter / name).exists() for name in names)
     assert not list(quarter.glob("*.part"))
+
+
+def test_revolve_of_damaged_fields_leaves_nothing(quarter: Path, tmp_path: Path, refused: Refused) -> None:
+    folder = shutil.copytree(quarter, tmp_path / "run", ignore=shutil.ignore_patterns("fields_body*"))
+    with h5py.File(folder / "fields.vtkhdf") as file:
+        chunk = file["VTKHDF/CellData/fibre_angle"].id.get_chunk_info(1)
+    data = bytearray((folder / "fields.vtkhdf").read_bytes())
+    data[chunk.byte_offset + 8] ^= 1
+    (folder / "fields.vtkhdf").write_bytes(data)
+    before = sorted(path.name for path in folder.iterdir())
+    assert "fields.vtkhdf: is damaged" in refused("revolve", folder)
+    assert sorted(path.name for path in folder.iterdir()) == before
 
 
 def test_a_new_file_is_whole_or_not_there(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 from remodel_fenicsx import cli, preset_scene
 from remodel_fenicsx.results.recording import FolderTaken, RunLock
 from remodel_fenicsx.results.status import status
+from remodel_fenicsx import running
 from remodel_fenicsx.studies import stability
 from remodel_fenicsx.studies.sweep import ensemble, latin_hypercube, read_axes
 from remodel_fenicsx.studies.trade import trade
@@ -60,7 +61,7 @@ def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pyt
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(rows(out)) == 5 and len(list(out.glob("*/history.csv"))) == 5
     assert (out / "sweep.png").stat().st_size > 10_000
-    assert status(out)[0] == f"{out}: sweep of cube, 5 runs: 5 finished"
+    assert status(out)[0] == f"{out}: 5 runs: 5 finished"
 
 
 def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,6 +76,11 @@ def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: p
     angles = {(row["remodeling.kappa"], row["loads.force.value"]): row["mean_fibre_angle"] for row in rows(out)}
     assert sorted(angles) == [("0.05", "4"), ("0.05", "8"), ("0.1", "4"), ("0.1", "8")]
     assert [key for key, angle in angles.items() if not np.isfinite(float(angle or "nan"))] == [("0.1", "4")]
+    run = out / "remodeling.kappa-0.05_loads.force.value-4"
+    (run / "history.csv").write_text("".join((run / "history.csv").read_text().splitlines(keepends=True)[:-1]))
+    with (run / "run.log").open("a") as log:
+        log.write("2026-01-01 00:00:00,000 INFO failed: no equilibrium\n")
+    assert status(out) == [f"{out}: 3 runs: 1 failed, 2 finished", f"{run.name} has failed: no equilibrium"]
 
 
 def test_drawn_numbers_outside_of_a_range_are_failed_points(
@@ -169,7 +175,8 @@ def test_a_study_of_any_kind_is_alone_in_its_folder(
     study: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second has found the folder empty before the first took it."""
-    monkeypatch.setattr(stability, "chosen_folder", lambda folder, *_: folder)
+    for module in (stability, running):
+        monkeypatch.setattr(module, "chosen_folder", lambda folder, *_: folder)
     scene = pulled_cube(1.0).with_values({"cells.initial": "random"})
     with RunLock(tmp_path), pytest.raises(FolderTaken, match=f"process {os.getpid()} on .* writes in it"):
         study(scene, tmp_path)
