@@ -382,10 +382,9 @@ class _Around:
 
 
 class NaturalConfiguration(_Around):
-    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G.
+    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G."""
 
-    Tissue that grows has another G in time; `initial` is that of the start, whose volume all amounts belong to.
-    """
+    # tissue that grows has another G in time; `initial` is that of the start, to whose volume all amounts belong
 
     def __init__(self, kinematics: Any, gradient: Any, closing: Any = None, initial: Any = None):
         self.field, self.gradient, self.closing = kinematics, gradient, closing

@@ -370,7 +370,7 @@ def cube(end: float, step: float, turnover: dict[str, float], **changes: Any) ->
     """Equal cells under a force: one point."""
     return isotropic(
         "consistent", "point", geometry={"shape": "cube"}, loads=ramped(10.0, force=3.0), output={"columns": COLUMNS},
-        remodeling={"turnover": {"time": 40.0} | turnover} | changes, time={"end": end, "step": step},
+        remodeling={"turnover": TENSION | {"time": 40.0} | turnover} | changes, time={"end": end, "step": step},
     )  # fmt: skip
 
 

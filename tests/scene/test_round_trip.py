@@ -20,7 +20,7 @@ LOAD = {"kind": "pressure", "face": "outer", "value": 1.0, "ramp": RAMP}
 NAMES = {"regions": "media", "loads": "wall", "supports": "outer"}  # that some base has
 # one of each kind of value that TOML has, and what some keys ask for; None is a key that is not there
 VALUES: list[Any] = [
-    None, True, False, 0, 1, 2, 7, 0.0, 0.25, 0.5, 1.1, 30.0, 1500.0, "mm", "kPa", "10 mm", "1.5 kPa",
+    None, True, False, 0, 1, 2, 7, 0.0, 0.25, 0.3, 0.5, 1.1, 30.0, 1500.0, "mm", "kPa", "10 mm", "1.5 kPa",
     "/tmp/ä' \"b.vtu", "a" * 64, "equilibrium", "kuhl-holzapfel-2007", "fast", "inner", "pressure", "clamped",
     [], [0.5], [1.0], [0.6, 0.8, 0.0], RAMP, ["fibre_angle", "cells"], ["outer_area"], ["lumen_volume"],
     {}, {"axial": 1.1}, {"value": 2.0, "ramp": RAMP}, {"wall": LOAD}, {"inner": 3, "outer": ["outer"]},
