@@ -21,7 +21,7 @@ from mpi4py import MPI
 import remodel_fenicsx
 from remodel_fenicsx import Scene, cli, extend, parts
 from docs.making.pages import DOCS, markdown
-from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, WithRegions, columns_of
+from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, WithRegions, columns_of, columns_on_request
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 from remodel_fenicsx.schema.tables import Table, description, sections
 
@@ -192,7 +192,9 @@ def of_shape(kind: type[Shape]) -> tuple[list[Column], list[Column]]:
     always = columns_of(kind, loads=(), regions=regions)
     known = {column.name for column in always}
     of_loads = [column for column in columns_of(kind, regions=regions) if column.name not in known]
-    return list(always), [*of_loads, *kind.columns_on_request]
+    held = columns_on_request(kind, held=["NAME"] if kind.supported_faces is None else [])
+    of_supports = [column for name, column in held.items() if name.startswith("support_force_")]
+    return list(always), [*of_loads, *kind.columns_on_request, *of_supports]
 
 
 def columns_table() -> str:

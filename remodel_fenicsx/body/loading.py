@@ -71,6 +71,7 @@ class Loading:
         self._potentials: list[Callable[[Any], Any]] = []
         self._begins: dict[int, str] = {}  # where the strain is one number: the face from which it is counted
         self.has_caps = False
+        self.supports: dict[str, Any] = {}  # by face: the potential of its springs, a function of u; None: held
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:

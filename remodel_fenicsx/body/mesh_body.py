@@ -409,6 +409,10 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         """Whether they are all volumes of the file."""
         return bool(regions) and set(self._regions(self._with_regions(self._read()))) <= set(regions)
 
+    def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
+        """All but those that are free."""
+        return [face for face, support in _with_ends(supports).items() if support.kind != "free"]
+
     def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
         """Whether they are there, the body cannot move as a whole, and no support takes all of a pressure."""
         for name in supports:

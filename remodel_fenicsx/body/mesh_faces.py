@@ -59,6 +59,11 @@ class Face:
     normal: Array
     centre: Array
 
+    @property
+    def flatness(self) -> float:
+        """1 of a plane part, 0 of one that goes around: length of the mean of its normals."""
+        return float(np.linalg.norm(self.normals.mean(axis=0)))
+
 
 @dataclass(frozen=True, eq=False)
 class Boundary:
@@ -302,16 +307,22 @@ def add_support(
         domain: MeshDomain = loading.domain  # type: ignore[assignment]
         for part, facets in domain.facets_of_parts(face):
             loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
+        loading.supports[face] = None
     elif support.kind in _DENSITIES:
         density = _DENSITIES[support.kind](loading, face, support, moves)
         half, measure = loading.constant((support.stiffness or stiffness) / 2), loading.surface_measure(face)
-        loading.add_potential(lambda u: half * density(loading.kinematics.displacement(u)) * loading.weight * measure)
+
+        def potential(u: Any) -> Any:
+            return half * density(loading.kinematics.displacement(u)) * loading.weight * measure
+
+        loading.add_potential(potential)
+        loading.supports[face] = potential
 
 
 def _guided(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
     """(u . N - d)^2 + (u . c)^2."""
     sliding = _sliding(loading, face, support, moves)
-    normal, centre = _of_parts(loading, face, "normal"), _of_parts(loading, face, "centre")
+    normal, centre = of_parts(loading, face, "normal"), of_parts(loading, face, "centre")
     around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
     # a Constant: a number in the kernel would be another kernel for each mesh
     squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
@@ -320,7 +331,7 @@ def _guided(loading: Loading, face: str, support: Support, moves: tuple[str, flo
 
 def _sliding(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
     """(u . N - d)^2."""
-    normal = _of_parts(loading, face, "normal")
+    normal = of_parts(loading, face, "normal")
     way = loading.magnitude(*moves) if moves else 0.0
     return lambda u: (ufl.inner(u, normal) - way) ** 2
 
@@ -339,7 +350,7 @@ _DENSITIES: dict[str, Callable[[Loading, str, Support, tuple[str, float] | None]
 }
 
 
-def _of_parts(loading: Loading, face: str, name: str) -> Any:
+def of_parts(loading: Loading, face: str, name: str) -> Any:
     """A vector of each part of the face, as a function that is constant on elements."""
     domain: MeshDomain = loading.domain  # type: ignore[assignment]
     element = basix_ufl.element("DG", domain.mesh.topology.cell_name(), 0, shape=(3,))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.schema.settings import TURNOVER_POWER, Load, Mesh, Region, Support, faces_of, in_region
+from remodel_fenicsx.schema.settings import NAME, TURNOVER_POWER, Load, Mesh, Region, Support, faces_of, in_region
 from remodel_fenicsx.schema.tables import Table, fault, refuse
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
 
@@ -266,6 +267,7 @@ def columns_of(
     loads: Container[str] | None = None,
     regions: Iterable[str] = (),
     cases: int = 1,
+    held: Iterable[str] = (),
 ) -> tuple[Column, ...]:
     """The columns of a shape's history, in the order of the file, those on request last.
 
@@ -284,6 +286,8 @@ def columns_of(
         Names of the scene's regions.
     cases
         Number of its load cases: what differs in them has a column for each.
+    held
+        Names of its faces with supports (`Shape.held_faces`).
 
     Returns
     -------
@@ -314,17 +318,28 @@ def columns_of(
     others = (*shape.columns, *of_regions, *COLUMNS.values())
     chosen = [column for column in others if column.name in requested]
     known = {column.name for column in (*always, *others)}
-    on_request = columns_on_request(shape, regions)
+    on_request = columns_on_request(shape, regions, held)
     extra = (on_request[name] for name in requested if name not in known)
     found = (*always, *(chosen or others), *extra)
     differ = [column for column in found if column.by_case and not column.after_pass]
     return (*found, *(column.of_case(number) for number in range(2, cases + 1) for column in differ))
 
 
-def columns_on_request(shape: Shape | type[Shape], regions: Iterable[str] = ()) -> dict[str, Column]:
+def columns_on_request(
+    shape: Shape | type[Shape], regions: Iterable[str] = (), held: Iterable[str] = ()
+) -> dict[str, Column]:
     """Columns by name that a history of this shape has only where a scene names them."""
     of_regions = [column for name in regions for column in shape.region_columns_on_request(name)]
-    return COLUMNS_ON_REQUEST | {column.name: column for column in (*shape.columns_on_request, *of_regions)}
+    of_supports = [_of_support(face) for face in held if re.fullmatch(NAME, face)]
+    found = (*shape.columns_on_request, *of_regions, *of_supports)
+    return COLUMNS_ON_REQUEST | {column.name: column for column in found}
+
+
+def _of_support(face: str) -> Column:
+    meaning = (
+        f"force by which the support of the face `{face}` pulls the body, along the mean outward normal of the face"
+    )
+    return Column(f"support_force_{face}", "force", meaning, lambda m: m.support_force(face))
 
 
 @dataclass(frozen=True)
@@ -669,6 +684,16 @@ class Shape(_Is):  # type: ignore[misc]
             known = not kinematics.reduced or kinematics.name in kind.reductions
             if name in loads if loads is not None else known:
                 kind.add(self, loading, name)
+
+    def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
+        """Faces whose supports are `[supports.NAME]`, and none of the shape's own.
+
+        Parameters
+        ----------
+        supports
+            Those of a scene by name of the face.
+        """
+        return []
 
     def fills(self, regions: Collection[str]) -> bool:
         """Whether these regions of a scene, by name, are all of the body."""

@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Column, Shape, columns_of
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.mesh_faces import cap_volume
+from remodel_fenicsx.body.mesh_faces import cap_volume, of_parts
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.results.fields import NodalGather
+from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
+NOT_AROUND = 0.5  # of the area of a face: its mean normal times area, that of a half sphere
 NO_LUMEN = 1e-9  # of the body's size cubed: what a flat inner face encloses by rounding
 
 
@@ -242,6 +244,16 @@ class Measurement:
         measure = self.tool(("end force", face), lambda: _EndForceForms(self.equilibrium, face, length))
         return self.tool_of_step(("end force", face), measure)
 
+    def support_force(self, face: str) -> float:
+        """Of an own body: force by which the support of a face pulls it, along the mean normal of each of its parts.
+
+        Parameters
+        ----------
+        face
+            Its name, of `Domain.faces`.
+        """
+        return float(self.tool(("support", face), lambda: _SupportForce(self.equilibrium, face))())
+
     def lumen_volume(self) -> float:
         """Of an own body (`MeshDomain`): volume inside the deformed inner face, with flat caps on its rims."""
         return float(self.tool("lumen volume", lambda: _LumenVolume(self.observer))())
@@ -359,6 +371,39 @@ class _LumenVolume:
             volume += sum(cap_volume(self._nodes + displacement, rim) for rim in self._rims)
         volume = float(over_ranks(self._comm, volume, MPI.SUM))
         return volume if abs(volume) > NO_LUMEN * self._size**3 else math.nan
+
+
+class _SupportForce:
+    """What springs do in a shift along the normal, or what is out of balance at nodes that are held."""
+
+    def __init__(self, equilibrium: Equilibrium, face: str):
+        self._equilibrium, state = equilibrium, equilibrium.state
+        self._unknown, domain, loading = state.unknown, state.loading.domain, state.loading
+        self._comm, potential = domain.comm, loading.supports[face]
+        if min(part.flatness for part in domain.parts if part.name == face) < NOT_AROUND:
+            raise SceneError(
+                f"output.columns = 'support_force_{face}': the face goes around the body, so that there is no direction"
+            )
+        normal = of_parts(loading, face, "normal")
+        self._form = potential and jit.form(-ufl.derivative(potential(self._unknown), self._unknown, normal))
+        self._nodes: list[tuple[Any, Array]] = []
+        for part, facets in domain.facets_of_parts(face) if potential is None else ():
+            nodes = dolfinx.fem.locate_dofs_topological(self._unknown.function_space, 2, facets)
+            self._nodes.append((nodes[nodes < state.number_of_owned_unknowns // 3], part.normal))
+
+    def __call__(self) -> float:
+        """In the present state. Collective."""
+        if self._form is not None:
+            local = float(np.real(dolfinx.fem.assemble_scalar(self._form)))
+        else:
+            vectors = [self._unknown.x.petsc_vec.duplicate() for _ in range(2)]
+            self._equilibrium.assemble_internal(vectors[0])
+            self._equilibrium.assemble_external(vectors[1])
+            forces = (vectors[0].array + vectors[1].array).reshape(-1, 3)
+            local = sum(float((forces[nodes] @ normal).sum()) for nodes, normal in self._nodes)
+            for vector in vectors:
+                vector.destroy()
+        return float(over_ranks(self._comm, local, MPI.SUM))
 
 
 class EndForce(NamedTuple):

@@ -384,12 +384,17 @@ class Scene(Table):
     def column_names(self) -> list[str]:
         """Of all that a history of it may have; one is there twice where a region's name makes it."""
         always = columns_of(self.geometry, regions=self.regions)
-        return [*columns_on_request(self.geometry, self.regions), *(column.name for column in always)]
+        return [*columns_on_request(self.geometry, self.regions, self.held_faces), *(column.name for column in always)]
 
     def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
         """Of its history, in the order of the file; with `more` of those on request."""
         requested = [*self.output.columns, *more]
-        return columns_of(self.geometry, requested, self.loads, self.regions, len(self.cases))
+        return columns_of(self.geometry, requested, self.loads, self.regions, len(self.cases), self.held_faces)
+
+    @property
+    def held_faces(self) -> list[str]:
+        """Faces with supports that have columns of their forces."""
+        return self.geometry.held_faces(self.supports.faces)
 
     def stops(self) -> list[float]:
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
