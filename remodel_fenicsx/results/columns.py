@@ -378,7 +378,8 @@ class _SupportForce:
 
     def __init__(self, equilibrium: Equilibrium, face: str):
         self._equilibrium, state = equilibrium, equilibrium.state
-        self._unknown, domain, loading = state.unknown, state.loading.domain, state.loading
+        self._unknown, loading = state.unknown, state.loading
+        domain: Any = loading.domain  # a `MeshDomain`
         self._comm, potential = domain.comm, loading.supports[face]
         if min(part.flatness for part in domain.parts if part.name == face) < NOT_AROUND:
             raise SceneError(

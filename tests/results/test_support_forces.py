@@ -36,7 +36,7 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("kind", "ends"), [("guided", "free"), ("sliding", "free"), ("held", "clamped")])
 def test_ends_pull_with_the_force_of_the_wall(kind: str, ends: str, tube: Path) -> None:
-    """Measured otherwise, by a virtual lengthening of the tube by numbers with the same elements; alike at both ends."""
+    """Measured otherwise, by a virtual lengthening of a tube by numbers with the same elements; at both ends."""
     supports = {"inlet": {"kind": "guided" if kind == "sliding" else kind}, "outlet": {"kind": kind}}
     rows = rows_of(scene(tube, supports=supports, remodeling=LAW))
     by_numbers = Scene(
@@ -74,5 +74,7 @@ def test_what_is_refused(tube: Path) -> None:
             SceneError, match=f"output.columns = '{name}': no such column on request; .*'support_force_i"
         ):
             scene(tube, [name])
+    with pytest.raises(SceneError, match="output.columns = 'support_force_inlet': no such column on request"):
+        scene(tube, supports={"inlet": {"kind": "free"}})
     with pytest.raises(SceneError, match="output.columns = 'support_force_inlet': no such column on request"):
         Scene(geometry={"shape": "tube"}, preset="consistent", output={"columns": ENDS})
