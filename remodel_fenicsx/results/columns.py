@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Column, Shape, columns_of
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.mesh_faces import cap_volume, of_parts
+from remodel_fenicsx.body.mesh_faces import NOT_AROUND, cap_volume, of_parts
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks
@@ -26,7 +26,6 @@ from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
-NOT_AROUND = 0.5  # of the area of a face: its mean normal times area, that of a half sphere
 NO_LUMEN = 1e-9  # of the body's size cubed: what a flat inner face encloses by rounding
 
 
