@@ -59,7 +59,8 @@ def test_a_block_is_pulled_as_the_cube(block: Path) -> None:
     ramp = [[row["time"], row["support_force_z0"]] for row in rows]
     cube = Scene(
         geometry={"shape": "cube", "side": 1.0}, cells={"initial": "isotropic"},
-        loads={"force": {"value": 1.0, "ramp": ramp}}, remodeling={"law": "tensor", "coupling": "staggered"}, time={"end": 6.0},
+        loads={"force": {"value": 1.0, "ramp": ramp}}, time={"end": 6.0},
+        remodeling={"law": "tensor", "coupling": "staggered"},
     )  # fmt: skip
     for row, other in zip(rows, rows_of(cube), strict=True):
         assert other["mean_stretch"] == pytest.approx(1 + row["to_z1"], rel=1e-5)
@@ -123,7 +124,7 @@ def test_what_is_refused(block: Path, tmp_path: Path) -> None:
         "loads.more.face = 'z0': loads.way moves this face too"
     )
     assert refusal({}, supports={"x0": free["x0"]}, output={}).startswith(
-        "supports (x0 'sliding'): they leave the body free to move"
+        "supports (x0 'sliding'): they leave the body free to turn"
     )
     assert refusal({}, supports=free | {"lid": {}}, output={}).startswith(
         "supports.lid: the body has no such face; it has x0"
