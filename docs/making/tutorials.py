@@ -30,6 +30,7 @@ PICTURES = {  # of docs/figures: what a page's commands leave
     "tutorial-residual-stress.png": "angles.png",
     "tutorial-fit.png": "fitted/fit.png",
     "tutorial-biaxial.png": "biaxial/fit.png",
+    "tutorial-gel.png": "gel.png",
     "tutorial-sweep.png": "sweep/sweep.png",
 }
 

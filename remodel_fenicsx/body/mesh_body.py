@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,9 +28,9 @@ from remodel_fenicsx.body.mesh_file import (
 )
 from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions
 from remodel_fenicsx.body.wall import WalledMesh
-from remodel_fenicsx.schema.settings import LARGEST_MESH, Load, Mesh, Support, faces_of
+from remodel_fenicsx.schema.settings import LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
-from remodel_fenicsx.schema.units import LENGTH_UNITS, STRESS
+from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, STRESS
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -40,6 +40,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that leave a face no motion along its normal
+ON_FACES: dict[str, Callable[[str], LoadKind]] = {
+    "pressure": lambda face: LoadKind(_by_hold_faces, f"pressure on the deformed face {face}", STRESS),
+    "displacement": lambda face: LoadKind(_by_hold_faces, f"way of the face {face} along its normal, outwards", LENGTH),
+}
 ROLES = ("inner", "outer", "inlet", "outlet")
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 Names = tuple[str | int, ...]
@@ -48,6 +52,10 @@ _GROUPS: JsonDict = {
     "allowed": "a table of names, numbers or lists of them",
     "additionalProperties": {"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 1}]},
 }
+
+
+def _by_hold_faces(shape: Any, loading: Any, name: str) -> None:
+    """A part of the supports."""
 
 
 def _faces(value: Any) -> Any:
@@ -115,54 +123,12 @@ def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], the
     return found
 
 
-def _with_ends(supports: Mapping[str, Support]) -> dict[str, Support]:
-    return {"inlet": Support(), "outlet": Support()} | dict(supports)
+class FileBody(WithRegions, FromFile):
+    """A body whose mesh, faces and regions are those of a file."""
 
-
-class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
-    """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
-
-    The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
-    all of one kind. A run keeps a copy of the file.
-    """
-
-    loads: ClassVar[dict[str, LoadKind]] = {
-        "pressure": LoadKind(
-            lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
-            "pressure on the deformed inner face",
-            STRESS,
-        ),
-        "elongation": LoadKind(
-            lambda shape, loading, name: None,  # a part of the supports (`support`)
-            "prescribed engineering strain of the length: the outlet moves along its own normal by this share of the "
-            "length of the body",
-            column="axial_elongation",
-            above=-1.0,
-            doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
-        ),
-    }
-    columns: ClassVar[tuple[Column, ...]] = (
-        Column(
-            "lumen_volume",
-            "length^3",
-            "volume inside the deformed inner face, closed by flat caps at its ends; empty where it encloses none",
-            lambda m: m.lumen_volume(),
-        ),
-        *WalledMesh.columns,
-    )
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
-        Column(
-            "outer_area",
-            "length^2",
-            "area of the deformed outer face",
-            lambda m: m.face_area("outer", deformed=True),
-        ),
-        *WalledMesh.columns_on_request,
-    )
-    face_names: ClassVar[tuple[str, ...]] = ROLES
     supported_faces: ClassVar[tuple[str, ...] | None] = None
+    thickness_in_words: ClassVar[str] = "cube root of the volume"
 
-    shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
         description=(
             "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one of VTK or meshio "
@@ -220,7 +186,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         return _together(values) if isinstance(values, Mapping) else values
 
     @model_validator(mode="after")
-    def _units_are_both_there(self) -> MeshBody:
+    def _units_are_both_there(self) -> Any:
         if self.file_unit is not None and self.length_unit is None:
             raise fault("needs geometry.length_unit, the unit of the scene", "file_unit", self.file_unit)
         return self
@@ -277,7 +243,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
         from remodel_fenicsx.body.mesh_domain import shared
 
-        return shared(partial(self.checked, mesh), comm or MPI.COMM_WORLD)
+        return shared(partial(self.checked, mesh), comm or MPI.COMM_WORLD, self.name)
 
     def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, mesh_faces.Boundary, dict[str, int]]:
         """The mesh, its boundary, and its regions' numbers by name; on rank 0."""
@@ -294,14 +260,9 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
         except MeshFileError as error:
             raise self._fault(str(error)) from None
-        if pair := mesh_faces.likely_exchange(file.points, boundary):
-            words = f"inner and outer touch each other: are {pair[0]} and {pair[1]} swapped?"
-            raise SceneError(f"geometry.faces.{pair[0]} = {shown(self._asked(pair[0]))}: {words}")
-        inner, outer = boundary.area("inner"), boundary.area("outer")
-        if inner > outer:
-            words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
-            raise SceneError(f"geometry.faces.inner = {shown(self._asked('inner'))}: {words}")
-        self._say(file, boundary)
+        self.check_boundary(file, boundary)
+        counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
+        log.info("%s: %s, SHA-256 %s", ", ".join([self._name, *file.surfaces]), counts, file.sha256)
         if mesh is not None and (mesh.refinement, mesh.degree) != (1, file.degree):
             file, boundary = self._refined(file, mesh)
         return file, boundary, self._regions(file)
@@ -340,7 +301,7 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
     def _groups(self, file: MeshFile) -> dict[str, tuple[int, ...]]:
         """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
         names, there = file.names[2], set(distinct(file.facet_groups)) - {0}
-        asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*ROLES, *self.faces])}
+        asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*self.face_names, *self.faces])}
         groups = {face: tuple(_numbers("face", face, entries, names, there)) for face, entries in asked.items()}
         taken = {number for numbers in groups.values() for number in numbers}
         others = {name: number for name, number in names.items() if number in there and number not in taken}
@@ -384,26 +345,21 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         """Numbers of the volumes that a region has in the file."""
         return _numbers("region", region, entries, file.names[3], set(distinct(file.cell_groups)) - {0})
 
-    def _say(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
-        counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
-        log.info("%s: %s, SHA-256 %s", ", ".join([self._name, *file.surfaces]), counts, file.sha256)
-        if mesh_faces.through_the_wall(boundary):
-            log.warning(
-                "the wall is one element thick in places: bending, and how the fibre angle changes through it, are "
-                "lost there; try mesh.refinement = 2"
-            )
+    def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
+        """Refuse faces that cannot be those of the body. On rank 0."""
 
     # ------------------------------------------------------------ supports
+    def supports_of(self, supports: Mapping[str, Support]) -> dict[str, Support]:
+        """Those of a scene, and others that the body has where it says nothing."""
+        return dict(supports)
+
     def hold(self, loading: Loading) -> None:
         """By its faces alone (`hold_faces`)."""
 
     @classmethod
-    def loads_on(cls, faces: Mapping[str, str]) -> dict[str, LoadKind]:
-        """Pressures on faces beside its own loads; `hold_faces` adds them."""
-        return cls.loads | {
-            name: LoadKind(lambda shape, loading, name: None, f"pressure on the deformed face {face}", STRESS)
-            for name, face in faces.items()
-        }
+    def loads_on(cls, faces: Mapping[str, OnFace]) -> dict[str, LoadKind]:
+        """Loads on faces beside its own; `hold_faces` adds them."""
+        return cls.loads | {name: ON_FACES[on.kind](on.face) for name, on in faces.items()}
 
     def fills(self, regions: Collection[str]) -> bool:
         """Whether they are all volumes of the file."""
@@ -411,23 +367,33 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
 
     def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
         """All but those that are free."""
-        return [face for face, support in _with_ends(supports).items() if support.kind != "free"]
+        return [face for face, support in self.supports_of(supports).items() if support.kind != "free"]
 
     def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
         """Whether they are there, the body cannot move as a whole, and no support takes all of a pressure."""
         for name in supports:
             if name not in domain.faces:
                 raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
-        chosen = _with_ends(supports)
+        chosen = self.supports_of(supports)
         mesh_faces.check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
-        for name, face in faces_of(loads).items():
+        moved = {"outlet": "elongation"} if "elongation" in loads else {}
+        for name, (face, load) in faces_of(loads).items():
             key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
             if face not in domain.faces:
                 raise SceneError(f"{key}: the body has no such face; it has {', '.join(domain.faces)}")
-            if kind in HELD_ACROSS:
+            if load == "displacement" and kind not in HELD_ACROSS:
+                able = " or ".join(map(repr, HELD_ACROSS))
+                raise SceneError(f"{key}: its support ({kind!r}) lets it move; a face that is displaced must be {able}")
+            parts = [part for part in domain.parts if part.name == face]  # type: ignore[attr-defined]
+            if load == "displacement" and min(part.flatness for part in parts) < mesh_faces.NOT_AROUND:
+                raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
+            if load == "displacement" and face in moved:
+                raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
+            if load == "pressure" and kind in HELD_ACROSS:
                 raise SceneError(
                     f"{key}: its support ({kind!r}) takes all of the pressure; allowed are faces that move"
                 )
+            moved |= {face: name} if load == "displacement" else {}
 
     def hold_faces(
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
@@ -438,13 +404,83 @@ class MeshBody(WalledMesh, WithRegions, Unloads, FromFile):
         length = domain.length()
         unit = f" {self.length_unit}" if self.length_unit else ""
         if domain.comm.rank == 0:
-            words = f"mean thickness of the wall {domain.thickness:.6g}{unit}, with plane faces"
+            words = f"{self.thickness_in_words} {domain.thickness:.6g}{unit}, with plane faces"
             log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
-        for name, support in _with_ends(supports).items():
-            moves = ("elongation", length) if name == "outlet" and "elongation" in loads else None
-            mesh_faces.add_support(loading, name, support, mesh_faces.GUIDE * modulus / domain.thickness, moves)
-        for name, face in faces_of(loads).items():
-            loading.add_follower_pressure(name, face)
+        on_faces = faces_of(loads)
+        ways = {on.face: (name, 1.0) for name, on in on_faces.items() if on.kind == "displacement"}
+        if "elongation" in loads:
+            ways["outlet"] = "elongation", length
+        for name, support in self.supports_of(supports).items():
+            stiffness = mesh_faces.GUIDE * modulus / domain.thickness
+            mesh_faces.add_support(loading, name, support, stiffness, ways.get(name))
+        for name, on in on_faces.items():
+            if on.kind == "pressure":
+                loading.add_follower_pressure(name, on.face)
+
+
+class MeshBody(WalledMesh, Unloads, FileBody):
+    """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
+
+    The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
+    all of one kind. A run keeps a copy of the file.
+    """
+
+    loads: ClassVar[dict[str, LoadKind]] = {
+        "pressure": LoadKind(
+            lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
+            "pressure on the deformed inner face",
+            STRESS,
+        ),
+        "elongation": LoadKind(
+            lambda shape, loading, name: None,  # a part of the supports (`support`)
+            "prescribed engineering strain of the length: the outlet moves along its own normal by this share of the "
+            "length of the body",
+            column="axial_elongation",
+            above=-1.0,
+            doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
+        ),
+    }
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "lumen_volume",
+            "length^3",
+            "volume inside the deformed inner face, closed by flat caps at its ends; empty where it encloses none",
+            lambda m: m.lumen_volume(),
+        ),
+        *WalledMesh.columns,
+    )
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "outer_area",
+            "length^2",
+            "area of the deformed outer face",
+            lambda m: m.face_area("outer", deformed=True),
+        ),
+        *WalledMesh.columns_on_request,
+    )
+    face_names: ClassVar[tuple[str, ...]] = ROLES
+    thickness_in_words: ClassVar[str] = "mean thickness of the wall"
+
+    shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
+
+    def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
+        """Whether faces of the wall and ends have each other's names."""
+        if pair := mesh_faces.likely_exchange(file.points, boundary):
+            words = f"inner and outer touch each other: are {pair[0]} and {pair[1]} swapped?"
+            raise SceneError(f"geometry.faces.{pair[0]} = {shown(self._asked(pair[0]))}: {words}")
+        inner, outer = boundary.area("inner"), boundary.area("outer")
+        if inner > outer:
+            words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
+            raise SceneError(f"geometry.faces.inner = {shown(self._asked('inner'))}: {words}")
+        if mesh_faces.through_the_wall(boundary):
+            log.warning(
+                "the wall is one element thick in places: bending, and how the fibre angle changes through it, are "
+                "lost there; try mesh.refinement = 2"
+            )
+
+    def supports_of(self, supports: Mapping[str, Support]) -> dict[str, Support]:
+        """Inlet and outlet are guided."""
+        return {"inlet": Support(), "outlet": Support()} | dict(supports)
 
 
 # ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh

@@ -82,8 +82,9 @@ class MeshDomain(Domain):
 
     @property
     def thickness(self) -> float:
-        """Mean thickness of the wall: twice the volume over the areas of its two faces."""
-        return 2 * self.volume / (self.area("inner") + self.area("outer"))
+        """Mean thickness of the wall: twice the volume over the areas of its faces; without them of a cube."""
+        area = self.area("inner") + self.area("outer")
+        return 2 * self.volume / area if area else float(np.cbrt(self.volume))
 
     def length(self) -> float:
         """Of the body from inlet to outlet: volume over the integral of |grad psi|, psi harmonic from 0 to 1."""
@@ -100,7 +101,9 @@ class MeshDomain(Domain):
         return float(volume / total)
 
 
-def shared(read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm) -> MeshDomain:
+def shared(
+    read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm, shape: str = "mesh"
+) -> MeshDomain:
     """What rank 0 reads, on all ranks. Collective."""
     found = agreed(comm, lambda: read() if comm.rank == 0 else None)
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as in `domain`
@@ -121,7 +124,7 @@ def shared(read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: 
     values = np.repeat([faces[part.name] for part in parts], [len(part.facets) for part in parts])
     tags = _tags_of_facets(mesh, np.sort(facets[np.concatenate([part.facets for part in parts])], axis=1), values)
     domain = MeshDomain(
-        mesh, tags, faces, "mesh", {"extent": extent}, regions, np.empty(0, np.int32), parts, {}, lines, volume
+        mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), parts, {}, lines, volume
     )
     touched = {}
     for name in faces:

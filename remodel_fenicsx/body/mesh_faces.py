@@ -36,6 +36,7 @@ MIDDLES = {
     },
 }  # fmt: skip
 FLAT = 1e-12  # of the mean |det J| of the elements: below it one has no volume
+NOT_AROUND = 0.5  # length of the mean normal of a face that has a direction: that of a half sphere
 Groups = Mapping[str, Sequence[int]]
 
 

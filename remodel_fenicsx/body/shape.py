@@ -18,7 +18,17 @@ from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.schema.settings import NAME, TURNOVER_POWER, Load, Mesh, Region, Support, faces_of, in_region
+from remodel_fenicsx.schema.settings import (
+    NAME,
+    TURNOVER_POWER,
+    Load,
+    Mesh,
+    OnFace,
+    Region,
+    Support,
+    faces_of,
+    in_region,
+)
 from remodel_fenicsx.schema.tables import Table, fault, refuse
 from remodel_fenicsx.schema.units import Dimension, LengthUnit
 
@@ -715,7 +725,7 @@ class Shape(_Is):  # type: ignore[misc]
         return False
 
     @classmethod
-    def loads_on(cls, faces: Mapping[str, str]) -> dict[str, LoadKind]:
+    def loads_on(cls, faces: Mapping[str, OnFace]) -> dict[str, LoadKind]:
         """All loads by name: its own, and those that a scene puts on faces, where any may be held and loaded.
 
         Parameters
@@ -830,7 +840,7 @@ class WithRegions(Shape):
     --------
     >>> from remodel_fenicsx.extend import SHAPES, WithRegions
     >>> [name for name, shape in SHAPES.items() if issubclass(shape, WithRegions)]
-    ['tube', 'mesh']
+    ['tube', 'mesh', 'solid']
     """
 
     def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:

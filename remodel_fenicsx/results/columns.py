@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Column, Shape, columns_of
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.mesh_faces import cap_volume, of_parts
+from remodel_fenicsx.body.mesh_faces import NOT_AROUND, cap_volume, of_parts
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks

@@ -128,7 +128,7 @@ class Model(Table):
 
 
 class Support(Table):
-    """How a face of a body of your own (shape `'mesh'`) is held, such as `[supports.inlet]`.
+    """How a face of a body of your own (shapes `'mesh'`, `'solid'`) is held, such as `[supports.inlet]`.
 
     NAME is a face of `geometry.faces`, or one that the file names. N is the mean outward normal of the face, or of each
     part of it, in the reference body; c goes around the middle of the part. Where a scene says nothing, inlet and
@@ -155,7 +155,7 @@ class Support(Table):
 
 
 class Supports(Table):
-    """How the body is held. A body of your own (shape `'mesh'`) has a table for each face that is held. A tube may have
+    """How the body is held. A body of your own has a table for each face that is held. A tube may have
     `[supports.outer]`, for what surrounds it.
     """
 
@@ -1038,7 +1038,8 @@ Ramp = Annotated[
 class Load(Table):
     """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube. One that is left out is zero.
 
-    A body of your own (shape `'mesh'`) may have further loads under names of your choice, each on one of its faces.
+    A body of your own (shapes `'mesh'`, `'solid'`) may have further loads under names of your choice, each on one of
+    its faces.
 
     `force` is the total dead force along z on the top. `pressure` acts on the deformed inner face. `elongation` is the
     prescribed engineering strain of the length (0.1: 10 % longer). A tube may have `axial_force` in place of
@@ -1053,8 +1054,9 @@ class Load(Table):
     and constant before the first and after the last. Times up to time.end must be multiples of time.step; with
     time.tolerance a step ends at each."""
 
-    kind: Literal["pressure"] | None = None
-    """For a further load of a body of your own: 'pressure' acts against the outward normal of the deformed face."""
+    kind: Literal["pressure", "displacement"] | None = None
+    """For a further load of a body of your own: 'pressure' acts against the outward normal of the deformed face.
+    'displacement' moves a face that is held, guided or sliding along its mean outward normal."""
     face: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"})
     """For a further load of a body of your own: the face that it acts on."""
 
@@ -1131,13 +1133,25 @@ class LoadCase(Table):
             raise fault(rule, f"{key}.weight", self.weight)
 
 
-def faces_of(loads: Mapping[str, Any]) -> dict[str, str]:
+class OnFace(NamedTuple):
+    """Where a further load acts, and how."""
+
+    face: str
+    kind: str = "pressure"
+
+
+def faces_of(loads: Mapping[str, Any]) -> dict[str, OnFace]:
     """Of the further loads among a scene's by name, tables as they were read or as they are."""
-    found = {
-        name: load.get("face") if isinstance(load, Mapping) else getattr(load, "face", None)
-        for name, load in loads.items()
+
+    def said(load: Any, key: str) -> Any:
+        return load.get(key) if isinstance(load, Mapping) else getattr(load, key, None)
+
+    found = {name: (said(load, "face"), said(load, "kind")) for name, load in loads.items()}
+    return {
+        name: OnFace(face, "displacement" if kind == "displacement" else "pressure")
+        for name, (face, kind) in found.items()
+        if isinstance(face, str)
     }
-    return {name: face for name, face in found.items() if isinstance(face, str)}
 
 
 EQUILIBRIUM = "equilibrium"

@@ -409,7 +409,8 @@ def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypat
     with pytest.raises(SceneError, match="^mesh.degree = 2: the mesh has degree 1$"):
         Simulation(curved, MPI.COMM_SELF)
     with pytest.raises(
-        SceneError, match="^geometry.shape = 'rod': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'bar'$"
+        SceneError,
+        match="^geometry.shape = 'rod': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'solid', 'bar'$",
     ):
         Scene(geometry={"shape": "rod"}, time={"end": 1.0})
 

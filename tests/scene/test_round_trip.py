@@ -47,6 +47,7 @@ def bases(tmp_path_factory: pytest.TempPathFactory) -> list[Scene]:
         tube.with_values({"regions": {"media": {"outer_radius": 2.0}, "adventitia": {}}}),
         tube.with_values({"geometry.length_unit": "mm", "geometry.is": "loaded", "time.end": "equilibrium"}),
         scene_from_dict(mesh),
+        scene_from_dict({"geometry": {"shape": "solid", "file": str(file)}, "time": {"end": 3.0}}),
         *(preset_scene("consistent", shape) for shape in ("cube", "tendon", "sheet")),
     ]
 

@@ -220,7 +220,7 @@ def test_the_preset_is_the_printed_method(shape):
 def test_every_preset_gives_good_scenes_and_is_explained():
     assert set(PRESETS) == set(PRESET_NOTES)
     for name, shapes in PRESETS.items():
-        assert set(shapes) == set(SHAPES) - {"mesh"}
+        assert set(shapes) == set(SHAPES) - {"mesh", "solid"}
         for shape in shapes:
             values = changed(TUBE if shape == "tube" else CUBE, {"preset": name, "geometry.shape": shape})
             assert scene_from_dict(values).preset == name
@@ -323,7 +323,7 @@ def test_a_preset_by_name():
     ):
         preset_scene("none", "tube")
     with pytest.raises(
-        SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh'$"
+        SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'solid'$"
     ):
         preset_scene(PAPER, "heart")
 
