@@ -65,16 +65,6 @@ def test_one_case_is_none_to_the_last_bit(remodeling: dict[str, Any]) -> None:
         assert {**row, "seconds": 0} == {**other, "seconds": 0}
 
 
-@pytest.mark.parametrize("remodeling", GROWING)
-def test_two_equal_halves_turn_over_as_none(remodeling: dict[str, Any]) -> None:
-    tables = {"remodeling": remodeling, "columns": ["content", "natural_length", "inner_radius", *ANGLES]}
-    plain, halves = rows_of(artery((), **tables)), rows_of(artery(HALVES, **tables))
-    for row, other in zip(plain, halves, strict=True):
-        for name in row:
-            assert other[name] == pytest.approx(row[name], rel=TURNS, abs=TURNS, nan_ok=True), name
-    assert abs(plain[-1]["content"] - 1) > 0.01
-
-
 @pytest.mark.parametrize("mean", ["tensor", "target", "largest"])
 @pytest.mark.parametrize("law, coupling", LAWS)
 def test_two_equal_halves_are_none_to_rounding(law: str, coupling: str, mean: str) -> None:

@@ -11,12 +11,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from setuptools import Distribution
 
 import remodel_fenicsx.kernels
 from remodel_fenicsx.errors import RemodelError
@@ -104,20 +102,6 @@ def test_the_compiler_names_file_and_line(tmp_path: Path) -> None:
     lines = (kernels.FOLDER / "tensor.c").read_text().splitlines()
     number = next(i for i, line in enumerate(lines, start=1) if "double stiffness(" in line)
     assert f"tensor.c:{number}:" in done.stderr
-
-
-@pytest.mark.filterwarnings("ignore:pkg_resources:DeprecationWarning")
-def test_a_wheel_has_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What setuptools would put into it."""
-    monkeypatch.chdir(ROOT)
-    distribution = Distribution()
-    distribution.parse_config_files()
-    # with it a list of files would be written into the tree
-    distribution.include_package_data = False
-    command: Any = distribution.get_command_obj("build_py")
-    command.ensure_finalized()
-    listed = {Path(package.replace(".", "/"), name) for package, _, _, names in command.data_files for name in names}
-    assert {path.relative_to(ROOT) for path in kernels.FOLDER.glob("*.[ch]")} <= listed
 
 
 # ---------------------------------------------------------------- numpy in their place

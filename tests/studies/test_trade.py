@@ -92,14 +92,8 @@ def test_without_an_exact_coupling_orders_in_time_and_mesh_are_seen() -> None:
     assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
 
 
-def varies_one_factor(setting: trade.Setting) -> bool:
-    return {key.partition(".")[0] for key in setting.changes if key != trade.COUPLING} in (set(), {"time"}, {"mesh"})
 
 
-def test_a_budget_that_ends_early_still_estimates_both_factors() -> None:
-    """The finest of each sweep stand beside each other; nothing has both."""
-    results = [made_up(s) for s in trade.ladder(artery()) if s.mesh[0] == "radial" and varies_one_factor(s)]
-    assert_right(trade.estimated(results)[0])
 
 
 def test_doubts_are_said() -> None:
@@ -160,13 +154,6 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
         assert setting.scene.output == scene.output
 
 
-def test_a_scene_with_a_profile_has_a_ladder_too() -> None:
-    """With fixed steps on the profile's mesh, and other profiles."""
-    scene = artery().with_values({"profile": "balanced", "mesh.degree": 2})
-    settings = trade.ladder(scene)
-    assert {"fast", "reference"} <= {setting.profile for setting in settings}
-    assert len({setting.step for setting in settings if setting.mesh[2] == 2}) > 4
-    assert trade.compared_times(scene, settings)[-1] == 150.0
 
 
 def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
@@ -283,12 +270,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert verdict.endswith("is kept, the same command tries again what has failed")
 
 
-def test_words() -> None:
-    rows, notes = estimated()
-    text = trade.Trade(artery(), rows, notes).in_words()
-    assert "order 2" in text
-    assert sum(line.startswith("* ") for line in text.splitlines()) == sum(row.on_front for row in rows) > 2
-    assert "  profile-fast" in text and "  radial-1-degree-1-step-2.5" in text and "radii %" in text
 
 
 def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:

@@ -192,17 +192,6 @@ def test_a_start_that_is_indefinite_is_told_apart(
     assert sum("the equilibrium is not lost" in record.getMessage() for record in caplog.records) == 1
 
 
-def test_stop_ends_before_the_first_unstable_step() -> None:
-    with made(pushed_cube(-30.0, **{"solver.unstable": "stop"})) as simulation:
-        done = []
-        with pytest.raises(StepFailure, match="the equilibrium at time 2 is unstable: 1 negative eigenvalue") as caught:
-            for step in simulation.steps():
-                done.append(step.negative_eigenvalues)
-        assert done == [0] and simulation.state.time == 1.0 and simulation.loading.values == {"force": -10.0}
-    refusal = caught.value.refusal
-    assert refusal.kind == "lost stability" and 'solver.unstable = "warn"' in refusal.advice
-
-
 def test_what_was_not_counted_is_an_empty_field(tmp_path: Path) -> None:
     history = History(tmp_path / "history.csv")
     history.append({"time": 1.0, "negative_eigenvalues": np.nan})
