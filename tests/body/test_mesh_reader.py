@@ -198,16 +198,6 @@ def test_other_meshes_are_refused(tmp_path: Path, cells: Any, tags: Any, words: 
         read_mesh(tmp_path / "one.vtu")
 
 
-def test_numbers_in_another_file_are_refused(tmp_path: Path) -> None:
-    """Its SHA-256 would say nothing, and it would lead out of the folder."""
-    source = write_tube(tmp_path / "tube.msh")
-    mesh = meshio.read(source)
-    mesh.cell_sets = {}
-    meshio.write(tmp_path / "tube.xdmf", mesh, data_format="HDF")
-    with pytest.raises(MeshFileError, match="its numbers stand in another file"):
-        read_mesh(tmp_path / "tube.xdmf")
-
-
 # ---------------------------------------------------------------- smaller elements
 
 

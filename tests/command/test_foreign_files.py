@@ -31,7 +31,6 @@ from remodel_fenicsx.results.vtkhdf import recorded_steps
 from remodel_fenicsx.running import resume, run as run_scene
 from remodel_fenicsx.scene import preset_scene, read_scene
 from remodel_fenicsx.schema.text import LARGEST, MOST_PARTS
-from remodel_fenicsx.studies.study import Run
 from tests.command.test_run import demo, refusal_of, run
 from tests.forks import forked
 from tests.parts import pulled_cube
@@ -287,20 +286,6 @@ def test_a_field_without_end_in_a_history_is_refused(folder: Path) -> None:
     assert "history.csv: field larger than" in refusal_of("status", folder)
 
 
-@pytest.mark.parametrize(
-    "forge",
-    [lambda text: "".join(",".join(line.split(",")[:3]) + "\n" for line in text.splitlines()),
-     lambda text: text.replace("mean_stretch", "mine", 1),
-     lambda text: text.replace(text.splitlines()[2] + "\n", "", 1),
-     lambda text: text.replace("\n", "\n" + text.splitlines()[1] + "\n", 1)],
-    ids=["columns fewer", "columns others", "rows fewer", "rows more"],
-)  # fmt: skip
-def test_a_study_takes_no_history_that_is_not_its_scenes(forge: Callable[[str], str], folder: Path) -> None:
-    member = Run("run", Recording(folder).scene, folder)
-    assert member.is_complete()
-    (folder / "history.csv").write_text(forge((folder / "history.csv").read_text()))
-    with pytest.raises(RecordingError, match="its history has other columns or rows than its scene asks for"):
-        member.is_complete()
 
 
 @pytest.mark.parametrize("by", [10**9, -5])

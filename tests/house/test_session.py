@@ -1,4 +1,4 @@
-"""tests/session.py: sessions of pytest's of their own, with tests that hang and a stand-in for the launcher's tests."""
+"""tests/session.py: sessions of pytest's of their own, with tests that hang, and what it says at its end."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import mpirun, slowly
-from tests.forks import forked
 
 PROJECT = Path(__file__).resolve().parents[2]
 RANK = "import os, sys, time; from mpi4py import MPI; open(f'{sys.argv[1]}/{os.getpid()}', 'w'); MPI.COMM_WORLD.recv()"
@@ -80,31 +79,9 @@ def test_a_test_that_hangs_fails_and_the_others_go_on(name: str, workers: str, t
     assert all(has_ended(int(rank.name)) for rank in pids)
 
 
-MAIN = "import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))"
-
-
-def launcher_session(folder: Path, *arguments: str, **variables: str) -> dict[str, str]:
-    """What pytest says at its end, with a cache of the test's own; forked, for nothing in it looks at processes."""
-    words, environment = words_of(folder, *arguments), environment_of(XDG_CACHE_HOME=str(folder / "cache"), **variables)
-    plugins = ("pytest", "xdist.plugin", "pytest_timeout")
-    done = forked("python", MAIN, *words, cwd=folder, variables=environment, imports=plugins)
-    said = done.stdout.splitlines()
-    return {"summary": said[-1], "skipped": "\n".join(line for line in said if line.startswith("SKIPPED"))}
-
-
-def test_the_launchers_tests_are_skipped_after_they_have_passed_until_its_files_change(tmp_path: Path) -> None:
-    """And the number of kernels that all processes have compiled is said at the end."""
-    compile_one = "open(os.environ['REMODEL_FENICSX_COMPILED'], 'a').write('a form\\n')"
-    launcher = f"import os\ndef test_one(): {compile_one}\ndef test_two(): pass\n"
-    (tmp_path / "test_launcher.py").write_text(launcher)
-    (tmp_path / "test_other.py").write_text(f"import os\ndef test_three(): {compile_one}\n")
-    done = session(tmp_path, "-n", "2", "--dist", "loadfile", XDG_CACHE_HOME=str(tmp_path / "cache"))
-    assert "3 passed" in done.stdout
-    assert "\nkernels compiled: 2\n" in done.stdout  # by both workers
-    again = launcher_session(tmp_path)
-    assert "1 passed, 2 skipped" in again["summary"]
-    assert again["skipped"].startswith("SKIPPED [2] test_launcher.py: they passed here on 2")
-    assert "-m launcher runs them" in again["skipped"]
-    for arguments in (["-m", "launcher"], ["test_launcher.py"], ["-k", "test_launcher"]):
-        assert "2 passed" in launcher_session(tmp_path, *arguments)["summary"], arguments
-    assert "3 passed" in launcher_session(tmp_path, REMODEL_FENICSX_ROOT="another environment")["summary"]
+def test_how_many_kernels_all_workers_have_compiled_is_said(tmp_path: Path) -> None:
+    compile_one = "import os\ndef test(): open(os.environ['REMODEL_FENICSX_COMPILED'], 'a').write('a form\\n')\n"
+    for name in ("one", "two"):
+        (tmp_path / f"test_{name}.py").write_text(compile_one)
+    done = session(tmp_path, "-n", "2", "--dist", "loadfile")
+    assert "2 passed" in done.stdout and "\nkernels compiled: 2\n" in done.stdout

@@ -22,6 +22,7 @@ import pytest
 from tests.conftest import slowly
 from tests.processes import GROUP, members
 
+pytestmark = pytest.mark.launcher
 PROJECT = Path(__file__).resolve().parents[2]
 LONG = 200  # seconds, for what takes a few on an idle machine
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"

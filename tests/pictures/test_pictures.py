@@ -120,8 +120,6 @@ def test_a_quarter_is_less_than_a_half(drawn: Drawn) -> None:
     assert np.mean(np.any(low < 245, axis=2)) > 0.5 and np.mean(np.any(right < 245, axis=2)) < 0.01
 
 
-
-
 def test_the_ends_of_a_tendon_of_wedges_are_there(drawn: Drawn) -> None:
     body = panel(drawn("point", "--view=0,0,1"))
     rows, columns = outline(body)
@@ -215,10 +213,6 @@ def test_bad_input_is_one_line_and_writes_nothing(
     message = refused(*(folder if word == "DIR" else word for word in words.split()))
     assert message.startswith(said.replace("DIR", str(folder)))
     assert os.listdir() == [] and sorted(os.listdir(folder)) == before
-
-
-
-
 
 
 # ---------------------------------------------------------------- what belongs to others

@@ -258,17 +258,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert said.endswith("is kept, a larger budget goes on\n")
     assert said.count("\n") == 1
 
-    first = trade.ladder(read_scene(path))[:2]
-    monkeypatch.setattr(trade, "ladder", lambda scene: first)
-    lone = tmp_path / "lone"
-    lone.mkdir()
-    (lone / f"{first[0].name}-1").write_text("a file of the user's")
-    with forked_children():
-        assert cli.main(["trade", str(path), "-o", str(lone), "--jobs", "2", "-q"]) == 3
-    failure, verdict = capsys.readouterr().err.splitlines()
-    assert " has failed: -o " in failure and "1 of 2 settings reached the end" in verdict
-    assert verdict.endswith("is kept, the same command tries again what has failed")
-
 
 
 
