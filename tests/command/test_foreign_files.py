@@ -286,8 +286,6 @@ def test_a_field_without_end_in_a_history_is_refused(folder: Path) -> None:
     assert "history.csv: field larger than" in refusal_of("status", folder)
 
 
-
-
 @pytest.mark.parametrize("by", [10**9, -5])
 def test_elements_of_nodes_that_are_not_there_are_refused(by: int, folder: Path) -> None:
     with h5py.File(folder / "fields.vtkhdf", "r+") as file:

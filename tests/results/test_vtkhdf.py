@@ -123,8 +123,6 @@ def test_node_order_is_that_of_vtk(tmp_path, cell, degree):
     assert found["0 volumes"] == pytest.approx([{"hexahedron": 1.0, "tetrahedron": 1 / 6}[cell]], rel=1e-6)
 
 
-
-
 def random_cells(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     random = np.random.default_rng(3)
     axes = np.linalg.qr(random.standard_normal((m, 3, 3)))[0]
@@ -272,5 +270,3 @@ def test_files_take_turns_and_who_reads_one_keeps_it(tmp_path, monkeypatch):
     with h5py.File(path) as file:
         assert file["VTKHDF/CellData/depth"].shape == (1,)
     assert [found.name for found in tmp_path.iterdir()] == ["f.vtkhdf"]
-
-
