@@ -90,20 +90,6 @@ runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__"
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("module", ["running", "cli", *slowly("solver.equilibrium", "system.interrupts")])
-def test_an_import_changes_no_handler(module: str) -> None:
-    """What Python knows of; PETSc puts some of its own below (take_back_signals)."""
-    program = f"""
-import signal
-def handlers(): return [signal.getsignal(number) for number in signal.valid_signals()]
-before = handlers()
-import remodel_fenicsx.{module}
-assert handlers() == before
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stderr
-
-
 def test_the_applications_signals_are_its_own_again_with_petsc() -> None:
     """PETSc would abort the process, with pages of advice."""
     program = """

@@ -119,19 +119,6 @@ def test_time_left(capsys, time_passes):
     assert said == [[], ["49:20 min left"], ["2:27 min left"], ["2:26 min left"], ["2:25 min left"], ["2:24 min left"]]
 
 
-def test_time_left_of_a_run_that_goes_on(capsys, time_passes):
-    """By its own steps, which are parts of others where they are chosen."""
-    with Progress(100, "artery", 0, interval=0.0, done=50.0) as progress:
-        for index in (50.25, 50.5, 51.5):
-            time_passes[0] += 2.0
-            progress.step(index, index, count=f"{int(4 * index)} at {index:.0f}%")
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[1:] == [
-        "artery: step 202 at 50%, t = 50.5, 0 Newton, 6:36 min left",
-        "artery: step 206 at 52%, t = 51.5, 0 Newton, 1:37 min left",
-    ]
-
-
 def test_chosen_steps_are_counted_and_their_share_is_that_of_time(tmp_path):
     """Not as if they were the equal ones that time.step would make."""
     demo = Path(__file__).parents[2] / "demos" / "cube.toml"

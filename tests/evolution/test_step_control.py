@@ -144,17 +144,6 @@ def test_lengths_count_as_angles(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(found) > 0.1
 
 
-def test_smaller_tolerances_are_smaller_errors(exact: dict[str, dict[float, np.ndarray]]) -> None:
-    """In the proportion of the tolerances, whatever the order."""
-    errors, counts = [], []
-    for tolerance in (0.4, 0.1):
-        steps, angles = marched(tube("extrapolated", **{"time.tolerance": tolerance}))
-        errors.append(distance(angles.simulation, angles.by_time[END], exact["consistent"][END]))
-        counts.append(len(steps))
-    assert 2.5 < errors[0] / errors[1] < 6.5
-    assert counts[1] < 2.8 * counts[0]  # second order: twice as many
-
-
 def test_corners_and_asked_times_are_hit_and_no_step_is_left_over() -> None:
     asked = (7.3, 33.0)
     steps, _ = marched(tube("extrapolated", 61.7, **{"time.tolerance": 2.0, "output.times": asked}))

@@ -110,21 +110,6 @@ def test_closed_ends_carry_the_force_on_the_caps() -> None:
     assert free[-1]["axial_elongation"] < 0.0 < closed[-1]["axial_elongation"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["axisymmetric", "sector"])
-def test_the_other_kinematics_say_the_same(name: str) -> None:
-    """A half-plane is the ray; the quarter has plane elements around."""
-    for tables in (
-        {"supports": {"ends": "closed"}},
-        {"loads": {"axial_force": {"value": 20.0, "ramp": [[0, 0], [END, 1]]}}},
-    ):
-        tables = dict(tables)
-        loads = tables.pop("loads", {})
-        ray, other = (rows_of(scene_from_dict(values(kind, loads, **tables)))[0][-1] for kind in ("radial", name))
-        for column in ("axial_elongation", "inner_radius"):
-            assert other[column] == pytest.approx(ray[column], abs=1e-9 if name == "axisymmetric" else 0.01)
-
-
 def test_the_equilibrium_of_a_closed_tube() -> None:
     """The cells take the length with them."""
     tables = {"supports": {"ends": "closed"}, "output": {"columns": ["pass_residual"]}}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import pkgutil
 import re
 import shlex
 import shutil
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-import remodel_fenicsx.kernels
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx import kernels
@@ -30,16 +28,6 @@ from tests.runs import simulated
 ROOT = Path(__file__).parents[2]
 NUMBERS = {"factor.c": kernels.NO_NUMBERS, "spectral.c": kernels.NO_NUMBERS, "tensor.c": tensor.NUMBERS}
 CC = shlex.split(os.environ.get("CC", "cc"))
-
-
-def test_the_table_has_all_functions_and_names_what_is_there() -> None:
-    assert sorted(NUMBERS) == sorted(path.name for path in kernels.FOLDER.glob("*.c"))
-    text = str(remodel_fenicsx.kernels.__doc__)
-    rows = [line.split(None, 1) for line in text.split("\n=")[2].splitlines()[1:]]
-    declared = [line for name in NUMBERS for line in kernels.declarations(kernels.source(name, NUMBERS[name]))]
-    assert sorted(name for name, _ in rows) == sorted(re.findall(r" (\w+)\(", " ".join(declared)))
-    for name in (name for _, names in rows for name in names.split(", ")):
-        assert callable(pkgutil.resolve_name(f"remodel_fenicsx.{name}"))
 
 
 @pytest.mark.parametrize("name", NUMBERS)
