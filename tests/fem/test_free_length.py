@@ -18,7 +18,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
-from tests.runs import goes_on, made
+from tests.runs import AtSolved, goes_on, made
 from tests.values import isotropic, ramped
 
 SELF = MPI.COMM_SELF
@@ -38,22 +38,9 @@ def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]],
         domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
     with made(scene, domain) as simulation:
         rows, forces = [], []
-        for step in simulation.steps([Looking(simulation, force_of, forces)] if force_of else []):
+        for step in simulation.steps([AtSolved(lambda step: forces.append(force_of(simulation)))] if force_of else []):
             rows.append(step.row)
     return rows, forces
-
-
-class Looking:
-    """Watches solved states."""
-
-    def __init__(self, simulation: Simulation, force_of: Any, forces: list[float]):
-        self.simulation, self.force_of, self.forces = simulation, force_of, forces
-
-    def solved(self, step: Any) -> None:
-        self.forces.append(self.force_of(self.simulation))
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda step: None
 
 
 def nodal_reaction(simulation: Simulation) -> float:
