@@ -106,5 +106,3 @@ def has_ended(number: int, seconds: float) -> bool:
     while is_alive(number) and clock.monotonic() < end:
         clock.sleep(0.05)
     return not is_alive(number)
-
-

@@ -164,8 +164,6 @@ def test_bad_input_is_one_line(cube: Path, words: str, said: str, refused: Refus
     assert not (cube.parent / "out").exists()
 
 
-
-
 def test_two_equal_studies_do_not_share_a_folder(done: Path, tmp_path: Path, refused: Refused) -> None:
     """The second names the first; when that has ended it may."""
     shutil.copytree(done, tmp_path, dirs_exist_ok=True)

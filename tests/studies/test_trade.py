@@ -92,10 +92,6 @@ def test_without_an_exact_coupling_orders_in_time_and_mesh_are_seen() -> None:
     assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
 
 
-
-
-
-
 def test_doubts_are_said() -> None:
     rows, notes = estimated(jagged=1.0)
     assert any("no order seen" in note for note in notes)
@@ -152,8 +148,6 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
         run = trade.as_run(setting, 3, times)
         assert run.cells.seed == 3 and run.output.times == tuple(times) and not run.output.fields
         assert setting.scene.output == scene.output
-
-
 
 
 def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
@@ -257,8 +251,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
     assert said.endswith("is kept, a larger budget goes on\n")
     assert said.count("\n") == 1
-
-
 
 
 def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:
