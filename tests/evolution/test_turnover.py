@@ -358,3 +358,16 @@ def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: f
         wall_thickness = row["outer_radius"] - row["inner_radius"]
         found.append((wall_thickness, factor * row["inner_radius"] / wall_thickness))
     assert np.divide(found[1], found[0]) == pytest.approx([thickness, stress], rel=0.01)
+
+
+def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instability(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A deposition stretch that the load never reaches: the natural length falls too, and the rates with it."""
+    values = cube(200.0, 2.0, {"time": 10.0, "deposition_stretch": 1.59})
+    values["loads"]["force"]["value"] = 0.3
+    with caplog.at_level(NOTICE):
+        assert last_row(values)["content"] < 0.1
+    (said,) = (record for record in caplog.records if "factor of 10" in record.message)
+    assert said.levelno == NOTICE and "content has changed" in said.message
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
