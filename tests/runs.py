@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,22 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, Simulation
+from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import scene_from_dict
 
 SELF = MPI.COMM_SELF
 Rows = list[dict[str, float]]
+
+
+class AtSolved(Watcher):
+    """Looks at each solved state."""
+
+    def __init__(self, look: Callable[[Step], Any]):
+        self.look = look
+
+    def solved(self, step: Step) -> None:
+        self.look(step)
 
 
 @contextmanager

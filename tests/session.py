@@ -1,16 +1,13 @@
-"""A test session's own rules, as a plugin of pytest's: limits that find a hang, launcher tests only when its files have
-changed, how many kernels were compiled, and which files start first.
+"""A test session's own rules, as a plugin of pytest's: limits that find a hang, how many kernels were compiled, and
+which files start first.
 """
 
 from __future__ import annotations
 
 import contextlib
-import datetime
 import faulthandler
-import hashlib
 import importlib
 import os
-import platform
 import signal
 import tempfile
 from collections import defaultdict
@@ -27,7 +24,6 @@ from tests.forks import what_is_imported_stays
 PROJECT = Path(__file__).resolve().parents[1]
 SLOW_LIMIT = 3600  # seconds for a test marked slow; pyproject.toml has the limit of all others
 COMPILED = "REMODEL_FENICSX_COMPILED"  # names the file that gets one line for each kernel that is compiled
-LAUNCHER_TEST = "test_launcher.py"
 
 
 # ---------------------------------------------------------------- limits
@@ -91,61 +87,6 @@ def pytest_enter_pdb() -> None:
     faulthandler.cancel_dump_traceback_later()
 
 
-# ---------------------------------------------------------------- launcher tests
-class LauncherTests:
-    """They run when the launcher's files differ from those with which they last passed here, or when they are named.
-
-    The stamp of a pass is a file in the cache folder; its name is the hash of these files and of the machine's kernel.
-    """
-
-    def __init__(self, config: pytest.Config):
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        self.stamp = base / "remodel-fenicsx" / "launcher-tests" / launcher_key()
-        files = [Path(word.split("::")[0]).name for word in config.args]
-        selected = config.getoption("markexpr") + config.getoption("keyword")
-        self.named = LAUNCHER_TEST in files or "launcher" in selected
-        self.whole = not any("::" in word for word in config.args)
-        self.collected: set[str] = set()
-        self.passed: set[str] = set()
-
-    def pytest_itemcollected(self, item: pytest.Item) -> None:
-        """Mark them, and skip them with the reason."""
-        if item.path.name != LAUNCHER_TEST:
-            return
-        self.collected.add(item.nodeid)
-        item.add_marker("launcher")
-        if not self.named and self.stamp.exists():
-            day = self.stamp.read_text().strip()
-            reason = f"they passed here on {day}, the launcher's files are the same; -m launcher runs them"
-            item.add_marker(pytest.mark.skip(reason))
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """One phase of one test."""
-        if report.when == "call" and report.passed and report.nodeid in self.collected:
-            self.passed.add(report.nodeid)
-        elif not report.passed:
-            self.passed.discard(report.nodeid)
-
-    def pytest_sessionfinish(self) -> None:
-        """Leave the stamp if all have passed, none skipped, in this process."""
-        if self.whole and self.collected and self.collected == self.passed:
-            self.stamp.parent.mkdir(parents=True, exist_ok=True)
-            self.stamp.write_text(f"{datetime.date.today()}\n")
-
-
-def launcher_key() -> str:
-    """Hash of what these tests look at."""
-    files = ["with-fenicsx", "Dockerfile", "bin/remodel-fenicsx", ".ci/run", "tests/run", "tests/container/run"]
-    files += ["tests/processes.py", f"tests/launcher/{LAUNCHER_TEST}"]
-    for folder in ("environment", "tests/launcher/stand_ins"):
-        files += [f"{folder}/{path.name}" for path in (PROJECT / folder).iterdir()]
-    key = hashlib.sha256(f"{platform.platform()} {os.getuid()} {os.environ.get('REMODEL_FENICSX_ROOT')}".encode())
-    for name in sorted(files):
-        path = PROJECT / name
-        key.update(f"{name} {path.stat().st_mode:o} {path.stat().st_size}\n".encode() + path.read_bytes())
-    return key.hexdigest()[:16]
-
-
 # ---------------------------------------------------------------- which files start first
 class LongFilesFirst(LoadFileScheduling):  # type: ignore[misc]
     """One file goes to one worker, as with --dist loadfile; those of `start_first` (pyproject.toml) come first.
@@ -199,7 +140,6 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Before anything is collected or started."""
     config.stash[STANDARD_ERROR] = os.dup(2)  # during a test, 2 is a file that would be lost with the process
-    config.pluginmanager.register(LauncherTests(config))
     if COMPILED not in os.environ:  # pytest-xdist's workers have it from the process that starts them
         folder = tempfile.TemporaryDirectory(prefix="remodel-fenicsx-tests-")
         os.environ[COMPILED] = str(Path(folder.name) / "compiled")

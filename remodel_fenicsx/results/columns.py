@@ -26,7 +26,6 @@ from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
-NOT_AROUND = 0.5  # of the area of a face: its mean normal times area, that of a half sphere
 NO_LUMEN = 1e-9  # of the body's size cubed: what a flat inner face encloses by rounding
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import cli
-from tests.conftest import Refused
 
 DEMOS = Path(__file__).parents[2] / "demos"
 DEMO = DEMOS / "bent_vessel"
@@ -101,17 +100,3 @@ def test_the_forks_axes_follow_its_legs(fork: Path, capsys: pytest.CaptureFixtur
     assert cli.main(["validate", str(fork / "scene.toml")]) == 0
     said = capsys.readouterr()
     assert "WARNING" not in said.out + said.err
-
-
-def test_studies_of_it_go_on_where_they_were(vessel: Path, tmp_path: Path, refused: Refused) -> None:
-    """The runs' scenes name their own copies of the mesh; the second call finds them done."""
-    words = ["sweep", str(vessel / "scene.toml"), "material.lame_mu=35,40", "-o", str(tmp_path / "sweep")]
-    words += ["--set", "time.end=1", "--set", "output.fields=false"]
-    assert cli.main(words) == 0
-    before = (tmp_path / "sweep" / "sweep.csv").read_text()
-    logs = {path: path.stat().st_mtime_ns for path in (tmp_path / "sweep").rglob("run.log")}
-    assert cli.main(words) == 0 and len(logs) == 2
-    assert logs == {path: path.stat().st_mtime_ns for path in (tmp_path / "sweep").rglob("run.log")}
-    assert (tmp_path / "sweep" / "sweep.csv").read_text() == before
-    changed = [*words, "--set", "material.chain_density=1e25"]
-    assert "another scene" in refused(*changed)

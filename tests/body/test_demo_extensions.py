@@ -14,7 +14,6 @@ import pytest
 from remodel_fenicsx import Scene, SceneError, read_scene
 from remodel_fenicsx.extend import SHAPES
 from remodel_fenicsx.parts import Tube
-from tests.command.test_run import run
 from tests.runs import rows_of, simulated
 
 FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
@@ -65,16 +64,3 @@ def test_torsion_stands_beside_elongation_and_turns_the_collagen(scene: Any) -> 
     assert rows[-1]["shear_stress"] > 0.5 and rows[-1]["fibre_angle_inner"] < 44.0
     with pytest.raises(SceneError, match="model.kinematics = 'radial': loads.torsion would have to be applied"):
         turned.with_values({"model.kinematics": "radial"})
-
-
-@pytest.mark.parametrize(("name", "column"), [("torsion", "shear_stress")])
-def test_the_command_line_knows_it(name: str, column: str, tmp_path: Path) -> None:
-    """`validate` and `run` with the script; without it the scene is refused in one line."""
-    scene, script = str(FOLDER / f"{name}.toml"), ["--with", str(FOLDER / f"{name}.py")]
-    assert run("validate", scene, *script).returncode == 0
-    short = ["--set", "time.end=4.0", "--no-report", "-o", str(tmp_path / "run")]
-    done = run("run", scene, *script, *short)
-    assert done.returncode == 0, done.stderr
-    assert column in (tmp_path / "run" / "history.csv").read_text().splitlines()[0].split(",")
-    refused = run("validate", scene)
-    assert refused.returncode == 2 and len(refused.stderr.strip().splitlines()) == 1

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from pydantic import Field
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, extend, parts, run
-from remodel_fenicsx.parts import Cube, Domain, Remodeling, Tube
+from remodel_fenicsx.parts import Cube, Domain, Remodeling
 from tests.runs import rows_of, simulated
 
 KAPPA = 0.1
@@ -297,26 +297,6 @@ def test_a_prescribed_displacement_of_a_body_as_a_point(monkeypatch: pytest.Monk
     clamped = Scene(**values, geometry={"shape": "clamped"}, model={"kinematics": "point"})
     with pytest.raises(SceneError, match="^model.kinematics = 'point': z1 is held across"):
         rows_of(clamped)
-
-
-class Cased(Tube):
-    """A tube in a stiff case: seen along a ray, its outer radius stays."""
-
-    shape: Literal["cased"] = Field(default="cased", description="Which body it is.")
-
-    def hold(self, loading: Any) -> None:
-        super().hold(loading)
-        loading.hold_face("outer", 0)
-
-
-def test_a_radius_that_is_held_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(extend.SHAPES, "cased", Cased)
-    values = scene().model_dump(exclude={"geometry", "preset", "format", "model", "loads"}, exclude_none=True)
-    values["loads"] = {"pressure": {"value": 3.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}
-    radii = {"inner_radius": 1.0, "outer_radius": 2.0, "length": 1.0}
-    values["cells"]["axes"], values["remodeling"]["frame"] = "cylindrical", "material"
-    rows = rows_of(Scene(**values, geometry={"shape": "cased", **radii}, model={"kinematics": "radial"}))
-    assert rows[-1]["inner_radius"] > 1.02 and rows[-1]["outer_radius"] == pytest.approx(2.0, abs=1e-12)
 
 
 def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.body.axes import MOST_UNDEFINED, UndefinedAxes, area, facets_of
+from remodel_fenicsx.body.axes import MOST_UNDEFINED, UndefinedAxes
 from tests import own_bodies, parts
 from tests.own_bodies import KnownBody, apart, bent, elliptic, fork, found, ring, straight
 
@@ -166,10 +166,3 @@ def test_an_inner_face_that_is_also_outside_is_refused_with_a_place() -> None:
     text = re.search(r"first at \((.*)\);", str(refused.value))
     assert text is not None and float(text[1].split(",")[2]) > 3.0
     found(domain)  # one element through the wall is enough
-
-
-def test_areas_are_those_of_plane_facets() -> None:
-    domain = ring(straight(1.0, 3.0, 8.0).place, (16, 4, 12), "hexahedron")
-    around = 2 * 16 * np.sin(np.pi / 16)
-    for name, size in (("inner", around * 8), ("outer", 3 * around * 8), ("inlet", 64 * np.sin(np.pi / 8))):
-        assert area(domain.mesh, facets_of(domain, [name])) == pytest.approx(size, rel=1e-12)

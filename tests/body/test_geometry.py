@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
 import runpy
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import basix
@@ -19,15 +15,12 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body import Cube, Tendon, Tube
-from remodel_fenicsx.body.domain import lattice_domain
 from remodel_fenicsx.body.mesh_file import read_mesh
-from tests import parallel_geometry
 from tests.parts import cube, tendon, tube
 
 ROOT = Path(__file__).resolve().parents[2]
 TUBE = {"inner_radius": 1.0, "outer_radius": 2.0, "length": 3.0}
 BUILDERS = {"cube": cube, "tendon": tendon, "tube": tube}
-SIDES = {"cube": 1.0, "tendon": 10.0, "tube": 8.0}  # height of each shape
 KINDS = [(element, degree) for element in ("hexahedron", "tetrahedron") for degree in (1, 2)]
 _built = {}
 
@@ -59,10 +52,6 @@ def area(domain, face):
     one = dolfinx.mesh.meshtags(mesh, 2, facets, np.ones(len(facets), dtype=np.int32))
     measure = ufl.Measure("ds", domain=mesh, subdomain_data=one, metadata={"quadrature_degree": 8})
     return dolfinx.fem.assemble_scalar(dolfinx.fem.form(dolfinx.fem.Constant(mesh, 1.0) * measure(1)))
-
-
-def has_node(points, *wanted):
-    return [bool(np.any(np.linalg.norm(points - point, axis=1) < 1e-14)) for point in wanted]
 
 
 # ---------------------------------------------------------------- counts
@@ -122,27 +111,6 @@ def test_the_area_of_the_meshed_tendon_is_the_scenes(element, degree, refinement
         assert radius == pytest.approx(np.sqrt(10.0 / np.pi), rel=1e-4)
 
 
-@pytest.mark.parametrize(("element", "degree"), KINDS)
-def test_face_areas_of_cube_and_tube(element, degree):
-    cube_, domain = domain_of("cube", element, degree), domain_of("tube", element, degree)
-    assert [area(cube_, face) for face in Cube.face_names] == pytest.approx([1.0] * 6, rel=1e-12)
-    if degree == 1:
-        edge, plane, tolerance = 32 * np.sin(np.pi / 16), 8 * np.sin(np.pi / 8) * 8, 1e-12
-    else:
-        edge, plane, tolerance = 2 * np.pi, np.pi * 8, 1e-4
-    areas = [area(domain, face) for face in ("inner", "outer", "bottom", "top")]
-    assert areas == pytest.approx([8 * edge, 24 * edge, plane, plane], rel=tolerance)
-
-
-@pytest.mark.parametrize("refinement", [1, 2, 3])
-def test_no_hexahedron_of_the_tendon_is_distorted(refinement):
-    points, cells = domain_of("tendon", refinement=refinement).gather_mesh()
-    corner = points[cells][:, [0, 1, 3, 2]]  # bottom quadrilateral in cyclic order: the cells are right prisms
-    after, before = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
-    sine = np.cross(after, before)[..., 2] / np.linalg.norm(after, axis=2) / np.linalg.norm(before, axis=2)
-    assert np.abs(sine).min() > 0.8 and np.all(sine > 0) | np.all(sine < 0)
-
-
 # ---------------------------------------------------------------- faces and nodes
 @pytest.mark.parametrize("shape", BUILDERS)
 @pytest.mark.parametrize(("element", "degree"), KINDS)
@@ -152,30 +120,6 @@ def test_the_named_faces_cover_the_boundary_exactly_once(shape, element, degree)
     mesh.topology.create_connectivity(2, 3)
     named = np.concatenate([domain.facet_tags.find(tag) for tag in domain.faces.values()])
     assert sorted(named) == sorted(dolfinx.mesh.exterior_facet_indices(mesh.topology))
-
-
-def on_faces(shape, domain):
-    """name -> largest distance of the face's corners from the surface it should lie on."""
-    height, inner, outer = SIDES[shape], 1.0, 3.0
-    where = {
-        "x0": lambda x: x[:, 0],
-        "x1": lambda x: x[:, 0] - 1,
-        "y0": lambda x: x[:, 1],
-        "y1": lambda x: x[:, 1] - 1,
-        "z0": lambda x: x[:, 2],
-        "z1": lambda x: x[:, 2] - 1,
-        "bottom": lambda x: x[:, 2],
-        "top": lambda x: x[:, 2] - height,
-        "inner": lambda x: np.hypot(x[:, 0], x[:, 1]) - inner,
-        "outer": lambda x: np.hypot(x[:, 0], x[:, 1]) - outer,
-        "side": lambda x: np.hypot(x[:, 0], x[:, 1]) - domain.dimensions["radius"],
-    }
-    mesh = domain.mesh
-    mesh.topology.create_connectivity(2, 3)
-    mesh.topology.create_connectivity(2, 0)
-    for name, tag in domain.faces.items():
-        nodes = dolfinx.mesh.entities_to_geometry(mesh, 2, domain.facet_tags.find(tag))
-        yield name, np.abs(where[name](mesh.geometry.x[np.unique(nodes)])).max()
 
 
 @pytest.mark.parametrize(("element", "degree"), KINDS)
@@ -194,20 +138,6 @@ def test_the_tube_is_equally_divided_through_the_wall_around_and_along(element, 
     if (element, degree) == ("tetrahedron", 2):
         steps = steps[:, [0, 2]]  # the middle of a diagonal is not quite half-way around
     assert np.abs(steps - np.round(steps)).max() < 1e-12
-
-
-@pytest.mark.parametrize("kind", ["drawn", "points"])
-def test_ufls_side_of_a_mesh_is_ufls_own_but_for_the_number_of_its_cells(kind):
-    """The same forms, so that kernels have the same names; one cell, however often it is asked for."""
-    points, faces = np.linspace([1.0, 0, 0], [2.0, 0, 0], 7), {"inner": lambda x: np.isclose(x[0], 1.0)}
-    line = points, [3], 2, faces, "tube", {}, MPI.COMM_SELF
-    domain = domain_of("tube") if kind == "drawn" else lattice_domain(*line)
-    ours = domain.mesh.ufl_domain()
-    theirs = ufl.Mesh(ours.ufl_coordinate_element())
-    assert ours.ufl_cell() == theirs.ufl_cell() and ours.ufl_cell() is ours.ufl_cell()
-    assert ours.ufl_cargo() is domain.mesh._cpp_object and ours.ufl_id() != theirs.ufl_id()
-    signatures = {(ufl.SpatialCoordinate(mesh)[0] * ufl.dx(mesh)).signature() for mesh in (ours, theirs)}
-    assert len(signatures) == 1
 
 
 # ---------------------------------------------------------------- arguments
@@ -278,25 +208,3 @@ def test_the_script_makes_the_mesh_files_again(tmp_path):
     for name in script["MESHES"]:
         old, new = read_mesh(ROOT / "meshes" / name), read_mesh(tmp_path / name)
         assert np.abs(old.points - new.points).max() < 1e-12 and np.array_equal(old.cells, new.cells)
-
-
-# ---------------------------------------------------------------- ranks
-def test_two_ranks_gather_what_one_rank_has_and_fail_together():
-    alone = json.loads(json.dumps(parallel_geometry.digests(MPI.COMM_SELF)))
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM_", "PMIX_", "PRTE_JOB"))}
-    run = subprocess.run(
-        ["mpirun", "-n", "2", "--oversubscribe", sys.executable, "-m", "mpi4py", parallel_geometry.__file__],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment,
-    )
-    assert run.returncode == 0, run.stderr
-    together = json.loads(run.stdout)
-    assert together["ranks"] == 2
-    assert together["digests"] == alone
-    said = [
-        "Gmsh could not mesh the cube: no more ink",
-        "Gmsh could not mesh the cube: 0 named volumes, 0 types of elements, 0 named faces",
-    ]
-    assert together["failures"] == [said, said]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import SceneError, read_scene, running
 from remodel_fenicsx.body import Tube
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import free_motions
@@ -124,13 +123,6 @@ def test_held_ends_move_as_they_are_told(tube: Path) -> None:
     )
 
 
-def test_springs_around_a_body_push_back(tube: Path, of_the_file: Any) -> None:
-    supports = {"outer": {"kind": "elastic", "stiffness": 5.0}}
-    row, _, _ = solved(scene_of(tube, supports=supports))
-    start = 8 / 2 * np.sin(np.pi / 4) * LENGTH
-    assert start < row["lumen_volume"] < of_the_file[0]["lumen_volume"]
-
-
 # ---------------------------------------------------------------- rigid motions
 
 
@@ -205,23 +197,6 @@ def test_a_run_goes_on_with_its_copy_on_other_ranks(tmp_path: Path) -> None:
     refused = _command("run", "--resume", str(parts), "--set", "time.end=5")
     assert refused.returncode == 2
     assert "tube.msh': has changed" in refused.stderr
-
-
-def test_a_mesh_that_is_replaced_meanwhile_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the run keeps is what it has read."""
-    (tmp_path / "mesh").mkdir()
-    file = write_tube(tmp_path / "mesh" / "tube.msh")
-    (tmp_path / "vessel.toml").write_text(RUN)
-    built = running.Simulation
-
-    def replaced(*arguments: Any) -> Any:
-        simulation = built(*arguments)
-        file.write_text(file.read_text() + "\n")
-        return simulation
-
-    monkeypatch.setattr(running, "Simulation", replaced)
-    with pytest.raises(SceneError, match="tube.msh': has changed: its SHA-256 was "):
-        running.run(read_scene(tmp_path / "vessel.toml"), tmp_path / "run")
 
 
 # ---------------------------------------------------------------- pressures on other faces

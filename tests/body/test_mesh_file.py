@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import SceneError
-from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_file import read_mesh
 from remodel_fenicsx.scene import read_scene, scene_from_dict
 from tests.mesh_files import TUBE, changed, write_tube
@@ -113,51 +112,6 @@ def test_another_ending_is_refused_by_key_and_value(tmp_path: Path, file: str, k
     with pytest.raises(SceneError) as error:
         read_scene(tmp_path / "scene.toml", settings)
     assert str(error.value).startswith(f"geometry.file = {file!r}: must be the path of a mesh (.msh, ")
-
-
-SIDES = ("inner", "outer", "inlet", "outlet", "front", "back")
-
-
-def overlapping(path: Path, version: float) -> Path:
-    """Two boxes and their faces, with names for both boxes at once, for all of the boundary, and for two faces."""
-    with gmsh_model("boxes") as gmsh:
-        for z in (0, 1):
-            gmsh.model.occ.addBox(0, 0, z, 1, 1, 1)
-        gmsh.model.occ.fragment([(3, 1)], [(3, 2)])
-        gmsh.model.occ.synchronize()
-        centre = {tag: gmsh.model.occ.getCenterOfMass(2, tag) for _, tag in gmsh.model.getEntities(2)}
-
-        def at(axis: int, value: float) -> list[int]:
-            return [tag for tag, place in centre.items() if abs(place[axis] - value) < 1e-9]
-
-        places = [(0, 0.0), (0, 1.0), (2, 0.0), (2, 2.0), (1, 0.0), (1, 1.0)]
-        for number, (place, name) in enumerate(zip(places, SIDES, strict=True), 1):
-            gmsh.model.addPhysicalGroup(2, at(*place), number, name)
-        gmsh.model.addPhysicalGroup(2, [tag for tag in centre if tag not in at(2, 1.0)], 7, "boundary")
-        gmsh.model.addPhysicalGroup(2, at(1, 0.0) + at(1, 1.0), 8, "sides")
-        for number, (tags, name) in enumerate([([1], "lower"), ([2], "upper"), ([1, 2], "wall")], 11):
-            gmsh.model.addPhysicalGroup(3, tags, number, name)
-        gmsh.model.mesh.setSize(gmsh.model.getEntities(0), 0.5)
-        gmsh.model.mesh.generate(3)
-        gmsh.option.setNumber("Mesh.MshFileVersion", version)
-        gmsh.write(str(path))
-    return path
-
-
-@pytest.mark.parametrize("version", [2.2, 4.1])
-@pytest.mark.parametrize("refinement", [1, 2])
-def test_groups_that_the_scene_does_not_name_may_overlap(tmp_path: Path, version: float, refinement: int) -> None:
-    """They are left alone; those that it names may not."""
-    file = overlapping(tmp_path / "boxes.msh", version)
-    regions = {"lower": "lower", "upper": "upper"}
-    values = {"geometry": {"shape": "mesh", "file": str(file), "regions": regions}, "time": {"end": 1.0, "step": 1.0},
-              "mesh": {"refinement": refinement}}  # fmt: skip
-    scene = scene_from_dict(values)
-    _, boundary, found = scene.geometry.checked(scene.mesh)
-    assert {face.name for face in boundary.faces} == set(SIDES)
-    assert boundary.volume == pytest.approx(2.0) and set(found) == {"lower", "upper"}
-    assert "shares facets with the face" in refusal(file, regions=regions, faces={"all": "boundary"})
-    assert "in two named volumes" in refusal(file, regions={**regions, "all": "wall"})
 
 
 def test_a_body_of_another_unit_is_refused(tmp_path: Path) -> None:

@@ -137,24 +137,6 @@ def scene_of(file: Path, **geometry: Any) -> Any:
     )
 
 
-def test_a_run_of_it_is_that_of_gmsh_s_file(tmp_path: Path) -> None:
-    """With numbers in place of names, and two numbers that are one region."""
-    source = write_tube(tmp_path / "tube.msh")
-    mesh = meshio.read(source)
-    groups = [
-        np.where(np.arange(len(a)) % 2, a, a + 70) if "hexa" in block.type else a
-        for block, a in zip(mesh.cells, mesh.cell_data["gmsh:physical"], strict=True)
-    ]
-    file = converted(source, ".vtu", parts=groups)
-    volumes = sorted({int(n) for block, a in zip(mesh.cells, groups, strict=True) if "hexa" in block.type for n in a})
-    scene = scene_of(file, faces=numbers_of(source), tags="parts", regions={"wall": volumes})
-    expected, found = last_row(scene_of(source)), last_row(scene)
-    assert len(volumes) == 2
-    for name in ("lumen_volume", "fibre_angle_inner", "stored_energy"):
-        assert found[name] == pytest.approx(expected[name], rel=1e-10), name
-    assert scene.geometry.kept_files()[1].keys() == {"tube.vtu"}
-
-
 @pytest.mark.parametrize("sign", [1, -1])  # SALOME counts families of elements below zero
 def test_a_med_file_is_converted_as_the_docs_say(tmp_path: Path, sign: int) -> None:
     page = (Path(__file__).parents[2] / "docs" / "own_body.md").read_text()
@@ -214,16 +196,6 @@ def test_other_meshes_are_refused(tmp_path: Path, cells: Any, tags: Any, words: 
     mesh.write(tmp_path / "one.vtu")
     with pytest.raises(MeshFileError, match=words):
         read_mesh(tmp_path / "one.vtu")
-
-
-def test_numbers_in_another_file_are_refused(tmp_path: Path) -> None:
-    """Its SHA-256 would say nothing, and it would lead out of the folder."""
-    source = write_tube(tmp_path / "tube.msh")
-    mesh = meshio.read(source)
-    mesh.cell_sets = {}
-    meshio.write(tmp_path / "tube.xdmf", mesh, data_format="HDF")
-    with pytest.raises(MeshFileError, match="its numbers stand in another file"):
-        read_mesh(tmp_path / "tube.xdmf")
 
 
 # ---------------------------------------------------------------- smaller elements

@@ -90,43 +90,6 @@ def test_hoop_stress_carries_the_pressure_while_remodeling() -> None:
     np.testing.assert_allclose(carried, history.pressures * history.inner_radii, rtol=2e-5)
 
 
-def test_mesh_convergence() -> None:
-    """Radii: fourth order without remodeling, and far below the tolerance of any comparison with it."""
-    radii = [radial.solve_radial(end=25.0, law="none", elements=n).inner_radii[-1] for n in (40, 80, 160, 320)]
-    differences = np.abs(np.diff(radii))
-    assert differences[-1] < 1e-8
-    assert 9 < differences[0] / differences[1] < differences[1] / differences[2] < 16
-    assert differences[1] / differences[2] > 14
-    coarse, fine = radial.solve_radial(elements=50), run()
-    np.testing.assert_allclose(coarse.inner_radii, fine.inner_radii, rtol=1e-5)
-    np.testing.assert_allclose(coarse.outer_radii, fine.outer_radii, rtol=1e-6)
-    for place in (1.0, 1.5, 2.0, 3.0):
-        assert coarse.fibre_angle_at(place) == pytest.approx(fine.fibre_angle_at(place), abs=0.05)
-
-
-def test_parts_of_a_step_end_in_the_same_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exchange of cells first, loads afterwards; only the path differs from a single solve."""
-    tube = radial.Tube(1.0, 3.0, 20, MATERIAL)
-    isotropic = np.full((60, 3), 1 / 3)
-    circumferential = np.tile([0.8, 0.2, 0.0], (60, 1))
-    old, new = (isotropic, 1.0, 1.02), (circumferential, 2.0, 1.05)
-    start = tube.newton(tube.nodes, *old)
-    assert start is not None
-    direct = tube.newton(start, *new)
-    assert direct is not None and np.max(np.abs(direct - start)) > 0.05
-    calls: list[Any] = []
-    newton = tube.newton
-
-    def refuses_first(*arguments: Any) -> Any:
-        calls.append(arguments)
-        return None if len(calls) == 1 else newton(*arguments)
-
-    monkeypatch.setattr(tube, "newton", refuses_first)
-    parts = tube.advance(start, old, new)
-    assert tube.substeps == 4 and len(calls) == 5
-    np.testing.assert_allclose(parts, direct, rtol=1e-10)
-
-
 @pytest.mark.parametrize("density", [2e21, 1e24])
 def test_the_solvers_noise_does_not_remodel(density: float) -> None:
     """A tube that is only shortened: hoop and radial stress are zero up to the solver's tolerance, and no tension."""

@@ -9,11 +9,8 @@ import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
-import time as clock
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +23,8 @@ from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.results.run_folder import FolderTaken
 from remodel_fenicsx.results.vtkhdf import PatientFile, TransientGrid
 from remodel_fenicsx.running import resume, run
-from tests.conftest import mpirun
 from tests.forks import forked
-from tests.processes import members, wait_for_rows
-from tests.results.test_resume import LONGER, SELF, assert_close, assert_same, first_half, half, rows, scene, whole
+from tests.results.test_resume import LONGER, SELF, assert_same, first_half, half, rows, scene, whole
 
 __all__ = ["first_half", "half", "whole"]  # fixtures
 
@@ -133,22 +128,6 @@ def words_for(folder: Path, scene_file: Path) -> list[str]:
     return ["run", *map(str, begun), "-q"]
 
 
-def start(folder: Path, scene_file: Path, ranks: int = 1) -> subprocess.Popen[bytes]:
-    """On a tube of four layers, in a session of its own."""
-    program = str(Path(__file__).parents[1] / "forks.py")
-    command = mpirun(ranks, sys.executable, program, *words_for(folder, scene_file))
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
-
-
-def kill_all(session: int) -> None:
-    """mpirun's ranks too, which would go on for a while without it."""
-    while left := members(session):
-        for number in left:
-            with suppress(ProcessLookupError):
-                os.kill(number, signal.SIGKILL)
-        clock.sleep(0.01)
-
-
 TUBE = """
 preset = "kuhl-holzapfel-2007"
 geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 3.0, length = 2.0}
@@ -205,20 +184,6 @@ def test_load_cases_and_turnover_survive_kills(tmp_path: Path) -> None:
     killed_at_random(tmp_path, GROWING.replace("COLUMNS", str(columns)), "remodel-fenicsx", kills=8)
     table = read_history(tmp_path / "expected")
     assert table["content"][-1] > 1.3 and table["inner_radius@2"][-1] > table["inner_radius"][-1] + 0.05
-
-
-@pytest.mark.slow
-def test_one_and_two_ranks_by_turns_to_the_end(tmp_path: Path) -> None:
-    """150 steps of a tube of four layers, killed on one and two ranks by turns: rounding stays rounding."""
-    (tmp_path / "tube.toml").write_text(TUBE.replace("12.0", "150.0").replace("every = 4", "fields = false"))
-    assert start(tmp_path / "expected", tmp_path / "tube.toml").wait() == 0
-    for number, last in enumerate([30, 60, 90, 120]):
-        process = start(tmp_path / "run", tmp_path / "tube.toml", 1 + number % 2)
-        wait_for_rows(process, tmp_path / "run", last)
-        kill_all(process.pid)
-        process.communicate()
-    assert start(tmp_path / "run", tmp_path / "tube.toml", 2).wait() == 0
-    assert_close(tmp_path / "run", tmp_path / "expected", history=1e-7, values=1e-4)
 
 
 # ---------------------------------------------------------------- a full disk

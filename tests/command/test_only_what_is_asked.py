@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,15 +14,10 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, run
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.fem import assembly, jit
-from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results import run_folder
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import FIELDS_BY_NAME
-from remodel_fenicsx.solver.continuation import Blend, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.watch.warnings import LockingWarning
-from tests.parts import pulled_cube
 from tests.runs import made, rows_of
 
 SELF = MPI.COMM_SELF
@@ -47,33 +40,6 @@ class Calls:
             return function(*arguments, **options)
 
         patch.setattr(owner, name, counted)
-
-
-def test_a_state_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """How far it is from its limits: at the start of a step, of its solve, and for each Newton iteration."""
-    calls = Calls(monkeypatch, Equilibrium, "_look")
-    with made(scene()) as simulation:
-        iterations = sum(step.work.newton_iterations for step in simulation.stepper.march([1.0, 2.0, 3.0]))
-        assert iterations >= 6 and calls.number <= iterations + 2 * 3 + 1
-
-
-def test_a_state_is_evaluated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """r, J and F together where it is looked at, F and the driver in the pass; parameters only where they change."""
-    with made(scene()) as simulation:
-        march = simulation.stepper.march([1.0, 2.0, 3.0])
-        next(march)
-        evaluations = Calls(monkeypatch, Quadrature, "evaluate")
-        parameters = Calls(monkeypatch, assembly, "point_values")
-        iterations = sum(step.work.newton_iterations for step in march)
-        assert evaluations.number <= iterations + 2 * 2 and parameters.number == 0
-
-
-def test_energies_of_elements_are_summed_up_once_a_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They tell whether to look for elements that lock, and what such a look begins with."""
-    calls, looks = (Calls(monkeypatch, LockingWarning, name) for name in ("energies", "work"))
-    with made(pulled_cube(3.0)) as simulation:
-        assert [step.is_due for step in simulation.steps()] == [True, False, True]
-    assert calls.number == 2 and looks.number
 
 
 def test_what_is_remembered_follows_every_change() -> None:
@@ -155,52 +121,6 @@ def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None
         scene(output={"fields": ["stress"]})
 
 
-def test_stress_that_nobody_writes_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    from remodel_fenicsx.results.fields import ElementFields
-
-    sizes = []
-    for driver, name in (("cauchy", "cauchy_stress"), ("pk2", "cauchy_stress"), ("cauchy", "fibre_angle")):
-        with made(scene().with_values({"remodeling.driver": driver})) as simulation:
-            fields = ElementFields(simulation.scene.geometry, simulation.stepper, [name])
-            assert set(fields()) == {name}
-            sizes.append(None if fields._state is None else fields._state.components)
-            assert (fields._shared is simulation.stepper.remodeling) == (sizes[-1] is None)
-    assert sizes == [None, 18, 9]  # the stress that drives the cells is there already
-
-
-def test_rows_that_come_fast_are_flushed_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twice a second, before a checkpoint, and at the end; every row is in the file at once."""
-    flushes, now = Calls(monkeypatch, os, "fsync"), 0.0
-    monkeypatch.setattr(run_folder.clock, "monotonic", lambda: now)
-    written = run_folder.History(tmp_path / "history.csv")
-    for number in range(101):
-        now = number / 50
-        written.append({"time": float(number)})
-        assert (tmp_path / "history.csv").read_text().count("\n") == number + 2
-    assert flushes.number == 5  # at 0, 0.5, 1, 1.5, 2 s
-    written.append({"time": 101.0})
-    written.flush()
-    written.flush()
-    assert flushes.number == 6
-    written.append({"time": 102.0})
-    written.close()
-    written.close()
-    assert flushes.number == 7
-
-
-def test_the_rows_of_a_checkpoint_are_on_the_disk_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    order: list[str] = []
-    from remodel_fenicsx.results import checkpoint
-
-    write, flush = checkpoint.write_checkpoint, run_folder.History.flush
-    monkeypatch.setattr(checkpoint, "write_checkpoint", lambda *a: (order.append("checkpoint"), write(*a)))
-    monkeypatch.setattr(run_folder.History, "flush", lambda self: (order.append("rows"), flush(self)))
-    monkeypatch.setattr(run_folder, "FLUSHED_AFTER", 1e9)
-    run(scene(output={"fields": False, "checkpoint": 2}), tmp_path / "run", SELF)
-    assert [entry for entry in order if entry][-3:] == ["rows", "checkpoint", "rows"]
-    assert order.count("checkpoint") == 2
-
-
 def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
     """No Gmsh for a lattice, no HDF5 without fields, no bar without a terminal, no units where none are written."""
     text = dict(scene(output={"fields": False}, time={"end": 1.0}).model_dump(mode="json"))
@@ -215,34 +135,3 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
     assert {"dolfinx", "petsc4py", "ufl"} < imported
     assert not imported & {"gmsh", "h5py", "rich", "pint", "scipy", "matplotlib", "pyvista", "pandas", "PIL"}
     assert "gmsh 4" in (tmp_path / "run" / "scene.toml").read_text()  # its version is known all the same
-
-
-def test_the_printed_law_imports_no_other_coupling() -> None:
-    """Nor what chooses steps, goes to an equilibrium, looks after reductions, or draws on a terminal."""
-    program = (
-        "import sys\nfrom remodel_fenicsx import Simulation, preset_scene\n"
-        "Simulation(preset_scene('kuhl-holzapfel-2007', 'cube')).close()\n"
-        "print(*sorted(name for name in sys.modules if name.startswith('remodel_fenicsx.')))"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    imported = done.stdout.split()
-    assert "remodel_fenicsx.evolution.coupling" in imported
-    others = {"evolution.implicit", "model.implicit", "evolution.homeostasis",
-              "evolution.time_steps", "kernels.tensor", "system.terminal"}  # fmt: skip
-    assert all(importlib.util.find_spec(f"remodel_fenicsx.{name}") for name in others)
-    assert not {name.removeprefix("remodel_fenicsx.") for name in imported} & others
-
-
-def test_no_form_is_made_in_the_middle_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a step in parts needs is there before the first step."""
-    with made(scene()) as simulation:
-        forms, expressions = Calls(monkeypatch, jit, "form"), Calls(monkeypatch, jit, "expression")
-        coupling: Any = simulation.stepper.coupling
-        assert isinstance(coupling.blend, Blend)
-        list(simulation.stepper.march([1.0, 2.0]))
-        work, before = Work(), dict(simulation.state.loading.values)
-        loads = {name: 1.1 * value for name, value in before.items()}
-        coupling._solve_in_parts(3.0, before, loads, work, failure=None)
-        assert work.substeps >= 2  # the cells', the loads'
-        assert forms.number == 0 and expressions.number == 0

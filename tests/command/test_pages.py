@@ -131,14 +131,6 @@ def test_the_examples_of_the_readme_run(
     assert Path("results/artery/report.html").exists() and Path("tube/history.csv").exists()
 
 
-def test_output_that_was_not_printed_is_found() -> None:
-    printed = "tube: step 2/2, t = 2\nresults in tube\n"
-    assert list(printed_as("tube: step 100/100, t = 100\n...\n", printed)) == ["tube: step 2/2, t = 2", "..."]
-    for wrong in ("results in pipe\n", "results in tube\ntube: step 1/1, t = 1\n"):  # another word, another order
-        with pytest.raises(LookupError, match="was not printed"):
-            list(printed_as(wrong, printed))
-
-
 def test_numbers_of_an_experiment_go_into_the_tutorials_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """docs/which_numbers.md: its table in place of the one of `tube.toml`."""
     monkeypatch.chdir(tmp_path)

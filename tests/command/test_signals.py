@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -11,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx.fem import jit
 from remodel_fenicsx.results.recording import read_history
 from tests.conftest import slowly
 from tests.forks import forked
-from tests.processes import all_end, wait_for_compiler, wait_for_rows
+from tests.processes import wait_for_rows
 
 PROJECT = Path(__file__).parents[2]
 CUBE = ["run", str(PROJECT / "demos" / "cube.toml"), "--set", "time.end=10"]
@@ -92,20 +90,6 @@ runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__"
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("module", ["running", "cli", *slowly("solver.equilibrium", "system.interrupts")])
-def test_an_import_changes_no_handler(module: str) -> None:
-    """What Python knows of; PETSc puts some of its own below (take_back_signals)."""
-    program = f"""
-import signal
-def handlers(): return [signal.getsignal(number) for number in signal.valid_signals()]
-before = handlers()
-import remodel_fenicsx.{module}
-assert handlers() == before
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stderr
-
-
 def test_the_applications_signals_are_its_own_again_with_petsc() -> None:
     """PETSc would abort the process, with pages of advice."""
     program = """
@@ -142,90 +126,6 @@ sys.exit(cli.main({[*CUBE, "-o", str(tmp_path / "out")]!r}))
 
 
 # ---------------------------------------------------------------- while it compiles
-
-
-def start_cold(tmp_path: Path, *words: str) -> subprocess.Popen[str]:
-    """A run in a session and group of its own, with an empty cache of kernels."""
-    command = [*words, sys.executable, str(PROJECT / "bin" / "remodel-fenicsx"), *CUBE, "-o", str(tmp_path / "out")]
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment, start_new_session=True)
-
-
-def nothing_is_left(tmp_path: Path) -> bool:
-    """No results, and no kernel that the next start would have to wait for."""
-    sources = {path.name for path in (tmp_path / "cache").rglob("*.c")}
-    finished = {path.name.removesuffix(".cached") for path in (tmp_path / "cache").rglob("*.c.cached")}
-    return sources == finished and not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, *slowly(signal.SIGTERM)])
-def test_a_signal_to_the_group_while_the_compiler_runs(number: signal.Signals, tmp_path: Path) -> None:
-    process = start_cold(tmp_path)
-    wait_for_compiler(process)
-    os.killpg(process.pid, number)
-    output, errors = process.communicate(timeout=200)
-    lines = errors.splitlines()
-    assert (process.returncode, output) == (128 + number, "")
-    assert lines[-1] == f"remodel-fenicsx: stopped by {number.name}; nothing was computed"
-    assert lines[:-1] and all(line.startswith("compiling ") for line in lines[:-1])
-    assert nothing_is_left(tmp_path)
-
-
-def test_a_limit_of_time_while_the_compiler_runs(tmp_path: Path) -> None:
-    """timeout sends its signal to the process, then to the group; wherever the run is by then."""
-    process = start_cold(tmp_path, "timeout", "--preserve-status", "2")
-    errors = process.communicate(timeout=200)[1]
-    assert process.returncode == 143, errors
-    rest = [line for line in errors.splitlines() if not line.startswith("compiling ")]
-    assert len(rest) == 1 and rest[0].startswith("remodel-fenicsx: stopped by SIGTERM")
-    assert all_end(process.pid)
-    assert nothing_is_left(tmp_path)
-
-
-WHAT_IT_LOOKS_FOR = """
-import sys
-from remodel_fenicsx import cli
-from remodel_fenicsx.fem import jit
-is_cached = jit._is_cached
-def looked_for(kernel):
-    jit.log.info("looks for %s", kernel)
-    return is_cached(kernel)
-jit._is_cached = looked_for
-sys.exit(cli.main(sys.argv[1:]))
-"""
-
-
-def test_a_cold_quiet_run_leaves_what_it_compiled_in_the_log_alone(tmp_path: Path) -> None:
-    """Its cache is the usual one, in which the shortest form and the shortest expression are missing."""
-    count = tmp_path / "count"
-    own = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "REMODEL_FENICSX_COMPILED": str(count)}
-
-    def log_of(name: str, variables: dict[str, str]) -> str:
-        words = [*CUBE, "--set", "time.end=1", "-q", "-o", tmp_path / name]
-        done = forked("python", WHAT_IT_LOOKS_FOR, *words, variables={**os.environ, **variables})
-        assert (done.returncode, done.stderr) == (0, "")
-        return (tmp_path / name / "run.log").read_text()
-
-    usual = log_of("usual", {})
-    # all that a run needs is there before its first step
-    assert usual.rindex("looks for ") < usual.index("INFO time ")
-    kernels = set(re.findall("looks for (.*)", usual))
-    by_length = sorted(kernels, key=lambda kernel: jit._files(kernel)[0].stat().st_size)
-    missing = [next(kernel for kernel in by_length if kind in kernel) for kind in ("forms", "expressions")]
-    assert len(kernels) > 5
-    cache = tmp_path / "cache" / "fenics" / jit.cache_folder().name
-    cache.mkdir(parents=True)
-    for path in (path for kernel in kernels.difference(missing) for path in jit._files(kernel)):
-        (cache / path.name).symlink_to(path)
-
-    log = log_of("cold", own)
-    assert sorted(count.read_text().split()) == sorted(missing)
-    assert log.count("NOTICE compiling ") == log.count("INFO compiled ") == len(missing)
-    assert log.rindex("compiled ") < log.index("INFO time ")
-    assert {path.stem for path in cache.glob("*.c")} == kernels
-    assert "compil" not in log_of("again", own)
-    assert len(count.read_text().split()) == len(missing)
 
 
 def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:

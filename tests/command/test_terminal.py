@@ -77,27 +77,6 @@ def test_ctrl_c_puts_the_terminal_right(tmp_path):
     assert text.rindex("\x1b[?25h") < text.index("Traceback")
 
 
-@pytest.mark.parametrize(
-    ("columns", "shown"),
-    [
-        (120, "artery [4] BAR N/8 t = N, 3 Newton, pressure 0.192, axial_stretch 0.004 N:N:N N s left"),
-        (80, "artery [4] BAR N/8 t = N, 3 Newton, pres… N:N:N N s left"),
-        (60, "artery [4] BAR N/8 t = N, 3 Ne… N:N:N N s left"),
-        (50, "artery … BAR N/8 t = N, … N:N:N N s left"),
-    ],
-)
-def test_bar_and_time_left_stay_where_it_is_narrow(columns, shown, tmp_path):
-    script = SCRIPT.replace("pressure [0.5]", "pressure 0.192, axial_stretch 0.004")
-    _, text = run_in_terminal([sys.executable, "-c", script, str(tmp_path / "run.log"), "0"], columns)
-    lines = [line for line in re.split(r"[\r\n]+", plain(text)) if "━" in line]
-    # ^C is shown behind the line: where that would not fit, the terminal breaks it, and it stands there twice
-    assert max(len(line.rstrip("\n")) for line in lines) <= columns - 2
-    underway = [line.strip() for line in lines if "left" in line]
-    normal = re.sub(r"[━╸╺]+", "BAR", underway[-1])
-    assert re.sub(r"(?<=BAR )\d|(?<=t = )\d|\d+(?=:)|(?<=:)\d+|\d+(?= s left)", "N", normal) == shown
-    assert len(re.findall("[━╸╺]", underway[-1])) >= 8
-
-
 def test_output_that_goes_to_a_file_stays_there(tmp_path):
     command = f'{sys.executable} -c "$0" {tmp_path}/run.log 0 > {tmp_path}/out'
     script = SCRIPT.replace("time.sleep(0.06)", "print(k)")
@@ -130,16 +109,6 @@ def test_a_pipe_gets_plain_lines_now_and_then(capsys, time_passes):
     assert lines[-1] == "tendon: step 20/20, t = 10, force 25, 4 Newton"
 
 
-def test_the_last_step_of_an_interrupted_run_is_said(capsys, time_passes):
-    with pytest.raises(KeyboardInterrupt), Progress(20, "tendon", 0) as progress:
-        for k in (1, 2, 3):
-            progress.step(k, float(k), "", 4)
-        raise KeyboardInterrupt
-    assert [line.split(",")[0] for line in capsys.readouterr().err.splitlines()] == [
-        "tendon: step 1/20", "tendon: step 3/20",
-    ]  # fmt: skip
-
-
 def test_time_left(capsys, time_passes):
     """What the first steps compile is no time of a step, nor one long step among others."""
     with Progress(150, "artery", 0, interval=0.0) as progress:
@@ -148,19 +117,6 @@ def test_time_left(capsys, time_passes):
             progress.step(k, float(k))
     said = [line.split(", ")[3:] for line in capsys.readouterr().err.splitlines()]
     assert said == [[], ["49:20 min left"], ["2:27 min left"], ["2:26 min left"], ["2:25 min left"], ["2:24 min left"]]
-
-
-def test_time_left_of_a_run_that_goes_on(capsys, time_passes):
-    """By its own steps, which are parts of others where they are chosen."""
-    with Progress(100, "artery", 0, interval=0.0, done=50.0) as progress:
-        for index in (50.25, 50.5, 51.5):
-            time_passes[0] += 2.0
-            progress.step(index, index, count=f"{int(4 * index)} at {index:.0f}%")
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[1:] == [
-        "artery: step 202 at 50%, t = 50.5, 0 Newton, 6:36 min left",
-        "artery: step 206 at 52%, t = 51.5, 0 Newton, 1:37 min left",
-    ]
 
 
 def test_chosen_steps_are_counted_and_their_share_is_that_of_time(tmp_path):
@@ -201,21 +157,6 @@ def test_other_ranks_are_silent(capsys, tmp_path):
     assert not held and capsys.readouterr() == ("", "") and not list(tmp_path.iterdir())
 
 
-def test_a_closed_pipe_does_not_end_the_run(tmp_path):
-    script = SCRIPT.replace("open_log(sys.argv[1])", f"open_log({str(tmp_path / 'run.log')!r})").replace(
-        "time.sleep(0.06)", "pass"
-    )
-    script = script.replace('Progress(8, "artery [4]", 0)', 'Progress(8, "artery", 0, interval=0.0)')
-    # with PETSc, which would end the process
-    script = "from remodel_fenicsx.system.interrupts import take_back_signals\ntake_back_signals()\n" + script
-    reading, writing = os.pipe()
-    with subprocess.Popen([sys.executable, "-c", script, "", "0"], stdout=subprocess.PIPE, stderr=writing) as run:
-        os.close(writing)
-        os.close(reading)  # nobody will read what it says
-        assert run.stdout.read() == b"the end\n"
-    assert run.returncode in (0, 120)  # 120: Python could not flush stderr at exit
-
-
 def test_log_has_times_and_the_terminal_only_warnings(tmp_path, capsys):
     path = tmp_path / "run.log"
     path.write_text("an earlier run\n")
@@ -236,25 +177,6 @@ def test_log_has_times_and_the_terminal_only_warnings(tmp_path, capsys):
     assert "after the run" not in path.read_text() and "not wanted" not in path.read_text()
     err = capsys.readouterr().err
     assert err.startswith("WARNING: slow\nWARNING: ") and "from Python" in err and "iterations" not in err
-
-
-@pytest.mark.parametrize("quiet", [False, True])
-def test_what_is_logged_before_there_is_a_folder(quiet, tmp_path, capsys):
-    path = tmp_path / "run.log"
-    with hold_log(quiet=quiet) as held:
-        log = logging.getLogger("remodel_fenicsx.fem.jit")
-        log.log(NOTICE, "compiling")
-        log.info("compiled")
-        log.warning("slow")
-        seen = capsys.readouterr().err
-    log.warning("in between")
-    with open_log(path, quiet=quiet, held=held):
-        log.log(NOTICE, "compiling more")
-    again = capsys.readouterr().err.replace("in between\n", "")
-    notices = [] if quiet else ["compiling\n", "compiling more\n"]
-    assert (seen, again) == ("".join([*notices[:1], "WARNING: slow\n"]), "".join(notices[1:]))
-    said = [line.split(" ", 2)[2] for line in path.read_text().splitlines()]
-    assert said == ["NOTICE compiling", "INFO compiled", "WARNING slow", "NOTICE compiling more"]
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has a disk that is always full")

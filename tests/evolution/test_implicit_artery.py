@@ -11,7 +11,6 @@ from mpi4py import MPI
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.conftest import Case
-from tests.parts import tube
 
 pytestmark = pytest.mark.slow
 COLUMNS = ["newton_iterations", "substeps", "inner_radius", "outer_radius"]
@@ -57,13 +56,6 @@ def test_the_printed_law_to_the_end(driver: str, frame: str, inner: float, outer
     assert abs(found["inner_radius"][-1] - inner) < 2e-3 and abs(found["outer_radius"][-1] - outer) < 2e-3
 
 
-def test_the_end_does_not_depend_on_the_step() -> None:
-    """Eq. (11), steps of 5 and 1.25 to t = 50."""
-    ends = [history(scene_from_dict(artery(50.0, step, law="explicit", tables=SECTOR)))[1] for step in (5.0, 1.25)]
-    A, other = (simulation.cells.structure_tensor() for simulation in ends)
-    assert np.abs(A - other).max() < 1e-7
-
-
 @pytest.mark.parametrize("coupling", ["implicit", "extrapolated"])
 def test_the_consistent_law_on_one_and_two_ranks(case: Case, coupling: str) -> None:
     """The whole mesh, random cells, 24 steps of the ramp: no step in parts, five iterations a step."""
@@ -81,31 +73,3 @@ def test_the_consistent_law_from_random_cells_to_the_end() -> None:
     found, _ = history(scene_from_dict(artery(150.0)))
     assert found["substeps"].max() == 1
     assert found["newton_iterations"].mean() <= 4
-
-
-@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
-def test_isotropic_cells_stay_symmetric_with_the_consistent_law(driver: str) -> None:
-    """The whole mesh, 24 steps: lengths of a radius differ by rounding."""
-    whole = {"geometry": {"shape": "tube"}, "cells": {"initial": "isotropic"}}
-    _, simulation = history(scene_from_dict(artery(24.0, driver=driver, coupling="extrapolated", tables=whole)))
-    radii = np.round(np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1), 6)
-    squares = np.linalg.eigvalsh(simulation.cells.structure_tensor())
-    assert max(np.ptp(squares[radii == radius], axis=0).max() for radius in np.unique(radii)) < 1e-10
-
-
-def test_every_start_leads_to_the_same_equilibrium() -> None:
-    """One layer of the paper's mesh: from isotropic cells, two draws of random ones and cells along the axis."""
-    starts = [{"initial": "isotropic"}, *({"initial": "random", "seed": seed} for seed in (1, 2))]
-    starts += [{"initial": "aligned", "aligned_axis": 2}]
-    found = []
-    for cells in starts:
-        tables = {"geometry": {"shape": "tube", "length": 0.5}, "cells": cells, "time": {"end": "equilibrium"}}
-        scene = scene_from_dict(artery(150.0, coupling="staggered", tables=tables))
-        domain = tube(1.0, 3.0, 0.5, degree=1, divisions=(12, 8, 1), comm=MPI.COMM_SELF)
-        simulation = Simulation(scene, MPI.COMM_SELF, domain)
-        (step,) = simulation.steps()
-        found.append((simulation.unknown.x.array.copy(), simulation.cells.structure_tensor(), step.row["inner_radius"]))
-    assert found[0][2] > 1.35  # loaded and remodeled
-    for u, A, _ in found[1:]:
-        np.testing.assert_allclose(u, found[0][0], atol=1e-9)
-        np.testing.assert_allclose(A, found[0][1], atol=1e-9)

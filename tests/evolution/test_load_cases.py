@@ -65,16 +65,6 @@ def test_one_case_is_none_to_the_last_bit(remodeling: dict[str, Any]) -> None:
         assert {**row, "seconds": 0} == {**other, "seconds": 0}
 
 
-@pytest.mark.parametrize("remodeling", GROWING)
-def test_two_equal_halves_turn_over_as_none(remodeling: dict[str, Any]) -> None:
-    tables = {"remodeling": remodeling, "columns": ["content", "natural_length", "inner_radius", *ANGLES]}
-    plain, halves = rows_of(artery((), **tables)), rows_of(artery(HALVES, **tables))
-    for row, other in zip(plain, halves, strict=True):
-        for name in row:
-            assert other[name] == pytest.approx(row[name], rel=TURNS, abs=TURNS, nan_ok=True), name
-    assert abs(plain[-1]["content"] - 1) > 0.01
-
-
 @pytest.mark.parametrize("mean", ["tensor", "target", "largest"])
 @pytest.mark.parametrize("law, coupling", LAWS)
 def test_two_equal_halves_are_none_to_rounding(law: str, coupling: str, mean: str) -> None:
@@ -170,15 +160,6 @@ def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
     short = rows_of(fine)
     for name in ("inner_radius", "outer_radius@2", "fibre_angle_outer"):
         assert chosen[-1][name] == pytest.approx(short[-1][name], rel=5e-3, abs=0.5 if "angle" in name else 0.0), name
-
-
-def test_which_case_is_first_changes_no_step() -> None:
-    """The estimated error is that of the case that is worst."""
-    tables = {"time": {"end": 40.0, "step": 2.0, "tolerance": 0.5}, "remodeling": {"coupling": "staggered"}}
-    first, second = pulse(0.6)
-    one, two = rows_of(artery([first, second], **tables)), rows_of(artery([second, first], **tables))
-    for name in ("time", "time_error"):
-        assert [row[name] for row in two] == pytest.approx([row[name] for row in one], rel=1e-6, abs=1e-9), name
 
 
 def test_a_case_whose_loads_change_is_not_held() -> None:

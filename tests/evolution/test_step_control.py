@@ -144,42 +144,6 @@ def test_lengths_count_as_angles(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(found) > 0.1
 
 
-def test_smaller_tolerances_are_smaller_errors(exact: dict[str, dict[float, np.ndarray]]) -> None:
-    """In the proportion of the tolerances, whatever the order."""
-    errors, counts = [], []
-    for tolerance in (0.4, 0.1):
-        steps, angles = marched(tube("extrapolated", **{"time.tolerance": tolerance}))
-        errors.append(distance(angles.simulation, angles.by_time[END], exact["consistent"][END]))
-        counts.append(len(steps))
-    assert 2.5 < errors[0] / errors[1] < 6.5
-    assert counts[1] < 2.8 * counts[0]  # second order: twice as many
-
-
-@pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
-def test_a_predictor_spares_iterations_of_steps_of_all_lengths(coupling: str) -> None:
-    values = {"time.tolerance": 2.0, "time.step": 0.1}
-    steps, _ = marched(tube(coupling, **values))
-    plain, _ = marched(tube(coupling, **values, **{"solver.predictor": "none"}))
-    assert [step.time for step in steps] == pytest.approx([step.time for step in plain], rel=1e-2)
-    assert len(set(np.diff([step.time for step in steps]).round(6))) > 4
-    spent, before = (sum(step.work.newton_iterations for step in each) for each in (steps, plain))
-    assert spent <= 0.8 * before, (spent, before)
-
-
-def test_steps_are_kept_as_they_are_until_another_length_is_worth_it(
-    artery: dict[str, tuple[list[Step], Angles]],
-) -> None:
-    """Equal parts to every stop; nothing is refused once the first step has its length."""
-    steps, _ = artery["staggered"]
-    times = np.array([0.0, *(step.time for step in steps)])
-    lengths = np.diff(times)
-    changes = np.abs(np.diff(np.log(lengths))) > 1e-6
-    assert changes.sum() < len(lengths) / 3
-    for stop in (25.0, END):  # nothing that is left over
-        last = int(np.flatnonzero(times == stop)[0])
-        assert lengths[last - 1] == pytest.approx(lengths[last - 2], rel=1e-6)
-
-
 def test_corners_and_asked_times_are_hit_and_no_step_is_left_over() -> None:
     asked = (7.3, 33.0)
     steps, _ = marched(tube("extrapolated", 61.7, **{"time.tolerance": 2.0, "output.times": asked}))
@@ -249,25 +213,6 @@ def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytes
     errors = [step.time_error for step in steps]
     assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 110
     assert sum("does not fall to time.tolerance" in record.message for record in caplog.records) == 1
-
-
-def test_a_step_that_cannot_be_solved_is_tried_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulation = Simulation(tube("staggered", 4.0, **{"time.tolerance": 5.0, "time.step": 4.0}), MPI.COMM_SELF)
-    solve = simulation.stepper.coupling.solve
-
-    def fails(time: float, loads: Any) -> Any:
-        if time - simulation.state.time > 1.5:
-            raise StepFailure(time, "too long", TOO_LARGE)
-        return solve(time, loads)
-
-    monkeypatch.setattr(simulation.stepper.coupling, "solve", fails)
-    steps = list(simulation.steps())
-    assert steps[0].time == 1.0 and steps[-1].time == 4.0
-    monkeypatch.setattr(simulation.stepper.coupling, "solve", lambda *_: fails(1e9, {}))
-    simulation.control.stops.append(8.0)  # type: ignore[union-attr]
-    with pytest.raises(StepFailure):
-        list(simulation.steps())
-    assert simulation.state.time == 4.0
 
 
 def test_a_step_that_can_never_be_solved_is_tried_three_times_more(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -353,19 +298,6 @@ def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.
     assert len(times) < end + 150 and tried < 2 * len(times)
     said = [record.message for record in caplog.records if "does not fall to time.tolerance" in record.message]
     assert len(said) == 2 and "goes on" not in said[0] and "goes on with steps of 1.04" in said[1]
-
-
-def test_rows_within_the_tolerance_are_not_said_to_be_above_it(caplog: pytest.LogCaptureFixture) -> None:
-    """Steps of which the next ones would add up to more, however short; the rows are far from that."""
-    simulation = Simulation(tube("extrapolated", 100.0, **{"time.tolerance": 1.0}), MPI.COMM_SELF)
-
-    def measured(step: Step) -> Estimate:
-        step.time_error = 0.02
-        return Estimate(30.0, step.time_error)
-
-    simulation.control.error.measure = measured  # type: ignore[method-assign,union-attr]
-    list(simulation.steps())
-    assert "does not fall" not in caplog.text
 
 
 def test_the_tolerance_counts_again_when_errors_fall() -> None:

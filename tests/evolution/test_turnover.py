@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Recording, Simulation, cli
+from remodel_fenicsx import Simulation
 from remodel_fenicsx.body.tube import _opening_angle
-from remodel_fenicsx.model import residual_stress as closing
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import TurnoverRule, by_tension
@@ -68,13 +67,6 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> 
         assert known[name][[0, len(known[name]) // 2, -1]] == pytest.approx(expected, rel=0.03)
 
 
-def test_a_cut_of_a_soft_wall_is_found_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In 19 iterations: its bending is so soft that with coarser differences Newton's method took 25 and more."""
-    monkeypatch.setattr(closing, "ITERATIONS", 22)
-    _, known = simulated(wall(720.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}, []))
-    assert known["opening_angle"] == pytest.approx(114.5, abs=0.2)
-
-
 def at_rest(gain: float) -> tuple[Simulation, dict[str, float]]:
     """At the end of the way to the equilibrium."""
     values = wall(1440.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}, COLUMNS)
@@ -97,16 +89,6 @@ def test_the_equilibrium_is_that_rest(caplog: pytest.LogCaptureFixture) -> None:
     assert 40.0 * np.abs(turnover.rates()).max() < 2e-4
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     simulation.close()
-
-
-def test_the_demo(tmp_path: Path) -> None:
-    """Its row is that of docs/turnover.md, and nothing warns."""
-    demo = Path(__file__).parents[2] / "demos" / "turnover.toml"
-    assert cli.main(["run", str(demo), "-q", "--no-report", "-o", str(tmp_path / "run")]) == 0
-    history = Recording(tmp_path / "run").history
-    assert [history[name][-1] for name in ANGLES] == pytest.approx([6.5, 10.5, 14.7], abs=0.1)
-    assert [history[name][-1] for name in ("content", "opening_angle")] == pytest.approx([2.91, 115.5], rel=0.005)
-    assert "WARNING" not in (tmp_path / "run" / "run.log").read_text()
 
 
 def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
@@ -186,17 +168,6 @@ def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, f
     ends = [ends for ends, _ in found.values()]
     assert (ends[1] < ends[0]).all() and (ends[1][:2] < 0.4 * ends[0][:2]).all()
     np.testing.assert_allclose(np.log2(found["implicit", 4.0][1] / found["implicit", 2.0][1]), 1.0, atol=0.1)
-
-
-def test_long_implicit_steps() -> None:
-    """The ramp of a thick wall in one step; steps of 0.6 T come to the rest of small ones."""
-    values = wall(48.0, 24.0, GROWS, COLUMNS, coupling="implicit")
-    values["geometry"]["outer_radius"], values["loads"]["pressure"]["value"] = 3.0, 4.8
-    rows, known = simulated(values)
-    assert [row["time"] for row in rows] == [24.0, 48.0] and known["content"].max() > 2.0
-    rows, known = simulated(wall(1440.0, 24.0, GROWS, COLUMNS, coupling="implicit"))
-    assert [rows[-1][name] for name in COLUMNS] == pytest.approx([2.912, 1.311], rel=1e-3)
-    assert known["opening_angle"] == pytest.approx(115.3, abs=2.0)  # extrapolated 102, staggered 92
 
 
 def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces() -> None:
@@ -293,21 +264,6 @@ def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], t
     values["time"] |= time
     values["output"] |= {"times": [40.0], "report": False}
     assert goes_on(values, tmp_path, 40.0).history["content"][-1] > 1.1
-
-
-@pytest.mark.parametrize(("gain", "rests"), [(0.5, False), (0.2, False), (1.0, True)])
-def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
-    gain: float, rests: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
-    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}
-    simulated(wall(480.0, 4.0, turnover, COLUMNS))
-    found = [record.message for record in caplog.records if "has not come to rest" in record.message]
-    assert len(found) == (0 if rests else 1)
-    assert rests or ("fallen no faster than 1/t" in found[0] and "mechanobiological instability" in found[0])
-    caplog.clear()
-    simulated(wall(240.0, 4.0, turnover, COLUMNS))
-    assert "come to rest" not in caplog.text
 
 
 def test_the_figures_show_what_the_page_says() -> None:

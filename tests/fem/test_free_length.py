@@ -18,7 +18,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
-from tests.runs import goes_on, made
+from tests.runs import AtSolved, goes_on, made
 from tests.values import isotropic, ramped
 
 SELF = MPI.COMM_SELF
@@ -38,22 +38,9 @@ def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]],
         domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
     with made(scene, domain) as simulation:
         rows, forces = [], []
-        for step in simulation.steps([Looking(simulation, force_of, forces)] if force_of else []):
+        for step in simulation.steps([AtSolved(lambda step: forces.append(force_of(simulation)))] if force_of else []):
             rows.append(step.row)
     return rows, forces
-
-
-class Looking:
-    """Watches solved states."""
-
-    def __init__(self, simulation: Simulation, force_of: Any, forces: list[float]):
-        self.simulation, self.force_of, self.forces = simulation, force_of, forces
-
-    def solved(self, step: Any) -> None:
-        self.forces.append(self.force_of(self.simulation))
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda step: None
 
 
 def nodal_reaction(simulation: Simulation) -> float:
@@ -108,21 +95,6 @@ def test_closed_ends_carry_the_force_on_the_caps() -> None:
         np.testing.assert_allclose([row[name] for row in pulled], [row[name] for row in closed], rtol=1e-9)
     free, _ = rows_of(scene_from_dict(values("radial", ramped(END, axial_force=0.0))))
     assert free[-1]["axial_elongation"] < 0.0 < closed[-1]["axial_elongation"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["axisymmetric", "sector"])
-def test_the_other_kinematics_say_the_same(name: str) -> None:
-    """A half-plane is the ray; the quarter has plane elements around."""
-    for tables in (
-        {"supports": {"ends": "closed"}},
-        {"loads": {"axial_force": {"value": 20.0, "ramp": [[0, 0], [END, 1]]}}},
-    ):
-        tables = dict(tables)
-        loads = tables.pop("loads", {})
-        ray, other = (rows_of(scene_from_dict(values(kind, loads, **tables)))[0][-1] for kind in ("radial", name))
-        for column in ("axial_elongation", "inner_radius"):
-            assert other[column] == pytest.approx(ray[column], abs=1e-9 if name == "axisymmetric" else 0.01)
 
 
 def test_the_equilibrium_of_a_closed_tube() -> None:

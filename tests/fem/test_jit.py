@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remodel_fenicsx.fem import jit
 from tests.conftest import mpirun, slowly
 from tests.forks import forked
 from tests.processes import all_end, wait_for_compiler
@@ -99,15 +97,6 @@ def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
     assert waiting.returncode == 0
 
 
-def test_other_kernels_are_compiled_at_the_same_time(tmp_path: Path) -> None:
-    assert compile_and_use(tmp_path).returncode == 0
-    command, environment = program(tmp_path, PROGRAM.replace("x[0] ** 3 *", "x[1] * x[0] ** 2 * 3 / 2 *"))
-    with locked_by_this_process(tmp_path):
-        other = forked("python", command[-1], variables=environment)
-    assert other.returncode == 0, other.stderr[-2000:]
-    assert "compiling the moment" in other.stderr and "waiting" not in other.stderr
-
-
 @pytest.mark.parametrize(
     ("ranks", "lost"), [(1, ".c"), (1, ".c.cached"), *slowly((2, ".c.cached"), (2, ".c"), (1, ".so"))]
 )
@@ -121,25 +110,6 @@ def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: 
     assert "removing a compilation that was cut off" in again.stderr
     assert library.exists()
     assert "removing" not in compile_and_use(tmp_path, ranks).stderr
-
-
-AT_ONCE = """
-import os, sys
-other = os.fork()
-{}
-sys.stdout.flush()
-if other:
-    assert os.waitpid(other, 0)[1] == 0
-else:
-    os._exit(0)
-"""
-
-
-def test_runs_at_once_compile_one_after_the_other(tmp_path: Path) -> None:
-    done = forked("python", AT_ONCE.format(PROGRAM), variables=program(tmp_path)[1])
-    assert done.returncode == 0, done.stderr
-    assert "removing a compilation" not in done.stderr  # none takes another's work for cut off
-    assert sorted(done.stdout.split()) == ["0", "1"]
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
@@ -319,10 +289,3 @@ def test_the_simd_logarithm_is_the_scalar_one_and_lets_nothing_pass_the_guards(t
     assert np.abs(vectors - scalars).max() <= 1e-14 * np.abs(scalars).max()
     assert np.isnan(bad[[0, 3]]).all() and bad[1] == np.inf and bad[2] == -np.inf and np.isfinite(bad[4:]).all()
     np.testing.assert_array_equal(np.isfinite(bad), np.isfinite(bad_scalars))
-
-
-def test_kernels_have_a_simd_logarithm_here() -> None:
-    """On x86-64 with glibc; `info` says whether."""
-    said = forked("remodel-fenicsx", "info").stdout
-    assert jit.has_simd_logarithm() == ("of several points at once" in said)
-    assert jit.has_simd_logarithm() or platform.machine() != "x86_64" or platform.libc_ver()[0] != "glibc"

@@ -16,13 +16,12 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, run
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, objections
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, Refused, slowly
 from tests.reference.radial import solve_radial
-from tests.runs import columns_of, made, simulated
+from tests.runs import columns_of, made
 from tests.tables import rows as table, values as values_of
 
 SELF = MPI.COMM_SELF
@@ -103,24 +102,9 @@ def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
         np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
 
 
-@pytest.mark.slow
-def test_the_implicit_coupling_is_that_of_every_kinematics() -> None:
-    """A ray and a half plane of it; and eq. (11) has no error of the step."""
-    changes = {"coupling": "implicit", "frame": "material"}
-    assert difference(*(scene("tube", name, 3.0, remodeling=changes) for name in ("axisymmetric", "radial"))) < 1e-9
-    steps = (scene("tube", "radial", 10.0, remodeling=changes, time={"end": 10.0, "step": h}) for h in (1.0, 5.0))
-    ends = [columns_of(each)["inner_radius"][-1] for each in steps]
-    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-8)
-
-
 @pytest.mark.parametrize("cells", [ISOTROPIC, {"initial": [0.6, 0.0, 0.8]}, {"initial": "random"}])
 def test_a_cube_is_a_point(cells: dict[str, Any]) -> None:
     assert difference(*(scene("cube", name, 40.0, cells=cells) for name in ("point", "full"))) < 1e-9
-
-
-def test_a_point_needs_no_finer_mesh() -> None:
-    fine = scene("cube", "point", 10.0, mesh={"refinement": 4})
-    assert difference(fine, scene("cube", "point", 10.0)) < 1e-12
 
 
 @pytest.mark.parametrize("cells", [{"initial": [0.48, 0.6, 0.64]}, ISOTROPIC | {"axes": "cylindrical"}])
@@ -134,12 +118,6 @@ def test_a_quarter_is_the_whole_tube() -> None:
 
 def test_a_half_plane_is_a_ray() -> None:
     assert difference(*(scene("tube", name, 6.0) for name in ("axisymmetric", "radial"))) < 1e-9
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mesh", [{"degree": 2}, {"formulation": "selective-integration"}], ids=["degree 2", "J"])
-def test_elements_of_a_half_plane_are_those_of_a_ray(mesh: dict[str, Any]) -> None:
-    assert difference(*(scene("tube", name, 3.0, mesh=mesh) for name in ("axisymmetric", "radial"))) < 1e-9
 
 
 def clamped(name: str, end: float) -> float:
@@ -202,16 +180,6 @@ def test_every_rule_refuses_a_scene_and_allows_its_neighbour(
         base.with_values({**asked, "model.kinematics": name})
     chosen = base.with_values({**values_of(allowed), "model.kinematics": name})
     assert chosen.model.kinematics == name
-
-
-def test_loads_that_a_reduction_lacks_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from remodel_fenicsx.body import Cube, LoadKind
-
-    shear = LoadKind(lambda shape, loading, name: loading.add_dead_force(name, "x1", 1), "shear on a side")
-    monkeypatch.setitem(Cube.loads, "shear", shear)
-    sheared = scene("cube", AUTO, 2.0, loads={"shear": {"value": 1.0, "ramp": [[0, 0], [2, 1]]}})
-    assert choice(sheared).name == "full" and "loads.shear" in objections(sheared, "point")[0]
-    assert columns_of(scene("cube", "point", 2.0))["shear"].tolist() == [0.0, 0.0]
 
 
 def test_a_load_is_for_the_reductions_that_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,14 +258,6 @@ def test_what_the_symmetric_solution_cannot_show_is_said() -> None:
     assert not any("leaves it" in line for line in explained(scene("cube", AUTO, 2.0, remodeling={"driver": "pk2"})))
 
 
-# ---------------------------------------------------------------- runs
-def test_a_run_records_what_was_chosen_and_why(tmp_path: Path) -> None:
-    folder = run(scene("tube", AUTO, 1.0, supports={"ends": "clamped"}), tmp_path / "run", SELF)
-    assert Recording(folder).scene.model.kinematics == "axisymmetric"
-    log = (folder / "run.log").read_text()
-    assert "kinematics 'axisymmetric'" in log and "'radial' (about" in log and "'clamped': the sections are not" in log
-
-
 def test_validate_says_what_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "tube.toml"
     path.write_text(scene("tube", AUTO, 1.0, cells=ISOTROPIC | {"axes": "global"}).to_toml())
@@ -316,14 +276,6 @@ def test_another_size_compiles_nothing(shape: str, name: str, size: dict[str, fl
     before = len(jit.compiled_kernels())
     columns_of(scene(shape, name, 1.0, geometry={"shape": shape, **size}))
     assert len(jit.compiled_kernels()) == before
-
-
-def test_small_reduced_problems_are_factorised_by_petsc_itself() -> None:
-    """Whole bodies only where the choice is left to `auto`."""
-    for name, method, package in (("point", "direct", "petsc"), ("full", "auto", "petsc"), ("full", "direct", "mumps")):
-        with simulated(scene("cube", name, 1.0, solver={"method": method})) as (simulation, _):
-            factorisation = simulation.stepper.coupling.newton.factorisation()
-            assert factorisation is not None and factorisation.getFactorSolverType() == package
 
 
 def test_the_mesh_of_a_reduction_is_where_that_part_of_the_body_lies() -> None:
@@ -370,11 +322,6 @@ def test_two_ranks_give_the_same(
     for column in (*columns, "stored_energy", "max_chain_extension"):
         np.testing.assert_allclose(two[column], one[column], rtol=1e-12, err_msg=column)
     np.testing.assert_allclose(two["l"], one["l"], rtol=0, atol=1e-11)
-
-
-def test_every_kinematics_says_what_it_is() -> None:
-    assert list(KINEMATICS) == [kinematics.name for kinematics in KINEMATICS.values()]
-    assert all(kinematics.meaning and kinematics.cost > 0 for kinematics in KINEMATICS.values())
 
 
 # ---------------------------------------------------------------- records

@@ -85,19 +85,6 @@ def room(module: str) -> str:
     return module if module == "schema.settings" else module.split(".")[0]
 
 
-# ---------------------------------------------------------------- arrows
-def test_the_reader_of_imports_finds_them(tmp_path: Path) -> None:
-    """What the tests below rest on."""
-    text = "import a.b\nif TYPE_CHECKING:\n    from c import d\ntry:\n    import e\nexcept ImportError:\n    import f\n"
-    text += "def g():\n    with h:\n        from i import j, k\nclass L:\n    import m\n"
-    (tmp_path / "x.py").write_text(text)
-    found = imports_of(tmp_path / "x.py")
-    assert found == [("a.b", "module"), ("c.d", "types"), ("e", "module"), ("f", "module"), ("i.j", "function"),
-                     ("i.k", "function"), ("m", "module")]  # fmt: skip
-    assert Import("evolution.stepper", "state", "module") in arrows()
-    assert Import("body.cube", "body.domain", "function") in arrows()
-
-
 def test_every_file_is_in_a_room() -> None:
     assert {room(name) for name in modules()} == {*ROOMS, "__init__", "__main__"}
 

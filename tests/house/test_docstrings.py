@@ -154,32 +154,6 @@ def test_a_module_says_what_its_constants_are(module: Any) -> None:
     assert ">>> " in module.__doc__
 
 
-def test_what_a_docstring_lacks_is_found() -> None:
-    """Of a function that says too little."""
-
-    def bad(values: np.ndarray, factor: float) -> np.ndarray:  # type: ignore[name-defined]  # noqa: F821
-        """Do it.
-
-        Parameters
-        ----------
-        values
-            Some.
-
-        Returns
-        -------
-        The values.
-        """
-        raise ValueError(factor)
-
-    assert list(faults(bad)) == [
-        "no Examples",
-        "parameter values: no shape",
-        "parameter factor is not described",
-        "raises {'ValueError'}, which Raises does not say",
-        "no Returns with a type and, indented, what it is",
-    ]
-
-
 def documented_at_length() -> Iterator[str]:
     """Functions and classes of the package whose docstrings have several lines, as module.name."""
     for path in sorted((ROOT / "remodel_fenicsx").rglob("*.py")):

@@ -161,12 +161,6 @@ assert last["size"] < 1 < last["newton_iterations"], rows
 """
 
 
-@pytest.mark.slow
-def test_the_laws_beside_each_other_are_those_of_their_table_and_run(tmp_path: Path) -> None:
-    """A short run of the cube whose load turns: it becomes shorter along z, while it is pulled along x."""
-    script(["-c", LAWS], tmp_path)
-
-
 def test_the_studies_of_the_verification_page_run(tmp_path: Path) -> None:
     """Short ones; the comparisons with the radial reference are tests of their own."""
     done = forked("python", f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{STUDIES}", cwd=tmp_path)

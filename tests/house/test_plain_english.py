@@ -46,11 +46,6 @@ def test_lines_and_paragraphs_are_short(name: str) -> None:
     assert not long_lines(text) and not long_paragraphs(text)
 
 
-def test_what_is_long_is_found() -> None:
-    assert long_lines("a " * 60) == [120] and not long_lines("| " + "a " * 60) and not long_lines("a " * 40)
-    assert long_paragraphs("a\n" * 81) == [81] and not long_paragraphs("a\n" * 70 + "\n" + "a\n" * 70)
-
-
 FILLERS = re.compile(  # words of common use that say nothing, or less than the plain one
     r"\b(in order to|utili[sz]\w+|leverag\w+|facilitat\w+|it should be noted|please note|needless to say|"
     r"due to the fact that|prior to|a large number of|basically|obviously|in terms of|with regard to|and/or)\b",
@@ -61,10 +56,6 @@ FILLERS = re.compile(  # words of common use that say nothing, or less than the 
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_has_no_fillers(name: str) -> None:
     assert not FILLERS.findall(" ".join(PAGES[name].read_text(encoding="utf-8").split()))
-
-
-def test_fillers_are_found() -> None:
-    assert FILLERS.findall("Please note: in order to run, utilize it.") == ["Please note", "in order to", "utilize"]
 
 
 def test_words_are_spelled_right(tmp_path: Path) -> None:

@@ -104,17 +104,3 @@ def test_every_public_name_has_its_place(site: Path) -> None:
     wanted = public | {"Recording.history", "UnitCells.structure_tensor"}
     assert wanted <= set(found), wanted - set(found)
     assert len(found) == len(set(found)) and not [name for name in found if "model_config" in name]
-
-
-def test_a_wrong_link_is_an_error(tmp_path: Path) -> None:
-    """Of a copy in which a page links to nothing."""
-    import runpy
-
-    build = runpy.run_path(str(ROOT / "docs" / "build"))
-    assert build["staged"]("see docs/fit.md and `docs/fit.md`") == "see [](fit.md) and `docs/fit.md`"
-    (tmp_path / "conf.py").write_text('extensions = ["myst_parser"]\n')
-    (tmp_path / "index.md").write_text("# Title\n\n" + build["staged"]("see docs/nothing.md\n"))
-    code = "import sys; from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run([sys.executable, "-c", code, "-q", "-W", str(tmp_path), str(tmp_path / "out")],
-                          capture_output=True, text=True, timeout=100)  # fmt: skip
-    assert done.returncode != 0 and "nothing.md" in done.stderr

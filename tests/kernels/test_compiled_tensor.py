@@ -7,19 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import ufl
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx import SceneError, preset_scene
 from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
 from remodel_fenicsx.model import energy, implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS, Chain
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, Driver, Frame, cauchy_derivatives
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.implicit import CondensedPoints
-from remodel_fenicsx.model.laws import LAWS, Drive, Law, follow_tensor, tensor_target
+from remodel_fenicsx.model.laws import Drive, tensor_target
 from tests.model.test_condensed import deformations, points
 from tests.model.test_tensor_law import cells_of, right_cauchy_green, structures
 
@@ -153,12 +151,6 @@ SOFTER = energy.Matrix(
 )
 
 
-def kirchhoff(squared: np.ndarray, stress: np.ndarray, second: bool) -> Any:
-    """J times Cauchy's stress; Newton's method needs no better slope."""
-    J = np.sqrt(squared.prod(axis=1))[:, None, None]
-    return [None if part is None else J * part for part in cauchy_derivatives(squared, stress, second)]
-
-
 @pytest.mark.parametrize(
     "registry, name, part", [(CHAINS, "wormlike", SPRING), (energy.MATRICES, "neo-hookean", SOFTER)]
 )
@@ -177,41 +169,6 @@ def test_a_part_under_a_name_that_c_knows_is_numpys(
     np.testing.assert_array_equal(found.structure, expected.structure)
     of_c = compiled_twin(kernels, some).solve(F, start)
     assert np.abs(of_c.structure - expected.structure).max() > 1e-3
-
-
-@pytest.mark.parametrize("compiled", ["", "KIRCHHOFF", "solve", "WORMLIKE"])
-def test_a_driver_with_derivatives_that_c_does_not_know_is_numpys(
-    kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch, compiled: str
-) -> None:
-    """J times Cauchy's stress has the same target: the same cells, whatever it says that it is called in C."""
-    tensor = lambda F, s: ufl.det(F) * s.cauchy  # noqa: E731
-    mine = Driver(tensor, material=False, derivatives=kirchhoff, compiled=compiled)
-    monkeypatch.setitem(DRIVERS, "kirchhoff", mine)
-    F = deformations(COUNT, np.random.default_rng(3))
-    found = {}
-    for name in ("cauchy", "kirchhoff"):
-        some = points("tensor", "log", name, "material", COUNT, "random")
-        start = some.with_cells(F, some.step.cells).driving_tensor
-        found[name] = condensed_points(kernels, some.tissue, some.step).solve(F, start)
-        assert found[name].converged.all()
-    np.testing.assert_allclose(found["kirchhoff"].structure, found["cauchy"].structure, atol=1e-9)
-
-
-@pytest.mark.parametrize("registry, name, part", [
-    (DRIVERS, "cauchy", Driver(lambda F, s: -s.cauchy, material=False)),
-    (FRAMES, "material", Frame(lambda F, axes: axes, carries_axes=True)),
-    (energy.REPULSIONS, "log", energy.Repulsion(energy.length_sum, energy.log_derivatives)),
-    (LAWS, "tensor", Law(LAWS["tensor"].update, target=lambda drive: tensor_target(drive), follow=follow_tensor)),
-])  # fmt: skip
-def test_another_part_under_a_known_name_has_not_its_derivatives(
-    monkeypatch: pytest.MonkeyPatch, registry: Any, name: str, part: Any
-) -> None:
-    """The coupling "implicit" refuses the scene, and names what has them."""
-    implicit = {"remodeling.coupling": "implicit", "remodeling.law": "tensor", "material.repulsion": "log"}
-    scene = preset_scene("consistent", "cube").with_values(implicit)
-    monkeypatch.setitem(registry, name, part)
-    with pytest.raises(SceneError, match="^remodeling.coupling = 'implicit': needs a .*: '"):
-        scene.with_values({"time.end": 3.0})
 
 
 def test_another_repulsion_under_a_known_name_is_not_replaced_by_c(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
-import pkgutil
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from setuptools import Distribution
 
-import remodel_fenicsx.kernels
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx import kernels
@@ -32,16 +28,6 @@ from tests.runs import simulated
 ROOT = Path(__file__).parents[2]
 NUMBERS = {"factor.c": kernels.NO_NUMBERS, "spectral.c": kernels.NO_NUMBERS, "tensor.c": tensor.NUMBERS}
 CC = shlex.split(os.environ.get("CC", "cc"))
-
-
-def test_the_table_has_all_functions_and_names_what_is_there() -> None:
-    assert sorted(NUMBERS) == sorted(path.name for path in kernels.FOLDER.glob("*.c"))
-    text = str(remodel_fenicsx.kernels.__doc__)
-    rows = [line.split(None, 1) for line in text.split("\n=")[2].splitlines()[1:]]
-    declared = [line for name in NUMBERS for line in kernels.declarations(kernels.source(name, NUMBERS[name]))]
-    assert sorted(name for name, _ in rows) == sorted(re.findall(r" (\w+)\(", " ".join(declared)))
-    for name in (name for _, names in rows for name in names.split(", ")):
-        assert callable(pkgutil.resolve_name(f"remodel_fenicsx.{name}"))
 
 
 @pytest.mark.parametrize("name", NUMBERS)
@@ -104,20 +90,6 @@ def test_the_compiler_names_file_and_line(tmp_path: Path) -> None:
     lines = (kernels.FOLDER / "tensor.c").read_text().splitlines()
     number = next(i for i, line in enumerate(lines, start=1) if "double stiffness(" in line)
     assert f"tensor.c:{number}:" in done.stderr
-
-
-@pytest.mark.filterwarnings("ignore:pkg_resources:DeprecationWarning")
-def test_a_wheel_has_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What setuptools would put into it."""
-    monkeypatch.chdir(ROOT)
-    distribution = Distribution()
-    distribution.parse_config_files()
-    # with it a list of files would be written into the tree
-    distribution.include_package_data = False
-    command: Any = distribution.get_command_obj("build_py")
-    command.ensure_finalized()
-    listed = {Path(package.replace(".", "/"), name) for package, _, _, names in command.data_files for name in names}
-    assert {path.relative_to(ROOT) for path in kernels.FOLDER.glob("*.[ch]")} <= listed
 
 
 # ---------------------------------------------------------------- numpy in their place

@@ -64,20 +64,6 @@ def let_through(folder: Path) -> Iterator[str]:
         yield from filter(is_kept, paths)
 
 
-@pytest.mark.parametrize(("text", "kept", "left_out"), [
-    ("*\n!a", ["a", "a/b", "a/b/c"], ["b", "b/a"]),
-    ("**/a", ["b", "ba"], ["a", "b/a", "b/c/a/d"]),
-    ("*\n!a\n**/b\n!a/b/c", ["a/x", "a/b/c/d"], ["a/b", "a/b/d"]),
-    ("# a\n/a/*.p[yx]\n b? ", ["a/b.pz", "# a", "a/b/c.py", "b/c"], ["a/b.py", "a/b.px", "bc"]),
-    ("a/**", ["a", "b"], ["a/b", "a/b/c"]),
-    ("a.b\n*\\*", ["acb"], ["a.b", "a*"]),
-])  # fmt: skip
-def test_the_rules_are_read_as_docker_reads_them(text: str, kept: list[str], left_out: list[str]) -> None:
-    """Examples of Docker's documentation, and of its own tests."""
-    is_kept = judge(text)
-    assert [path for path in [*kept, *left_out] if is_kept(path)] == kept
-
-
 def test_the_image_has_the_package_and_nothing_of_a_user(tmp_path: Path) -> None:
     """The tree that is let through, elsewhere: every module can be imported, and the cube runs."""
     tree, work = tmp_path / "tree", tmp_path / "work"

@@ -22,6 +22,7 @@ import pytest
 from tests.conftest import slowly
 from tests.processes import GROUP, members
 
+pytestmark = pytest.mark.launcher
 PROJECT = Path(__file__).resolve().parents[2]
 LONG = 200  # seconds, for what takes a few on an idle machine
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
@@ -270,13 +271,6 @@ def test_a_new_environment_compiles_what_the_demos_need(with_demos):
     assert not folder.exists() and not folder.is_relative_to(with_demos.folder)
 
 
-def test_demos_that_do_not_compile_are_one_line_each(with_demos):
-    found = with_demos.run("echo", "done", environment={"STUB_DEMO": "fail"})
-    assert (found.returncode, found.stdout) == (0, "done\n")
-    lines = [line for line in found.stderr.splitlines() if "could not compile" in line]
-    assert [line.endswith("its runs will: no compiler") for line in lines] == [True, True]
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_no_compilation_outlives_the_launcher(with_demos, number):
     process = with_demos.start("true", environment={"STUB_DEMO": "hang"}, stderr=subprocess.DEVNULL)
@@ -407,49 +401,6 @@ def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
     assert list((tmp_path / "temporary").iterdir()) == []
     # what mmdebstrap leaves behind when it is killed must not hold up all later starts
     assert (rooted.record / "held").read_text() == ""
-
-
-def test_processes_of_mapped_users_that_a_killed_build_left_are_ended(rooted, tmp_path):
-    """mmdebstrap's own, without a parent, hold its pipes open: they wait for ever."""
-    become = [sys.executable, "-c", "import os; os.setuid(65534)"]
-    if subprocess.run(become, stderr=subprocess.DEVNULL).returncode != 0:
-        pytest.skip("starts a process of another user: needs the real root")
-    environment = a_user_builds(rooted, tmp_path)
-    left = killed_build(rooted, environment)
-    (record,) = (rooted.cache / "remodel-fenicsx").glob("*.building")
-    others = "import os, sys, time; os.setuid(65534); print(flush=True); time.sleep(100)"
-    leader = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {others!r}]).stdout"
-    dead = subprocess.Popen([sys.executable, "-c", leader], start_new_session=True, stdout=subprocess.PIPE)
-    other = subprocess.Popen([sys.executable, "-c", others], start_new_session=True, stdout=subprocess.DEVNULL)
-    try:
-        dead.stdout.readline()
-        dead.wait()
-        assert members(dead.pid, GROUP)
-        record.write_text(f"{dead.pid}\n{left}\n")
-        assert rooted.run("true", environment=environment).returncode == 0
-        wait_for(lambda: not members(dead.pid, GROUP), "the end of the mapped users' processes")
-        assert other.poll() is None
-    finally:
-        other.kill()
-        other.wait()
-    assert list((tmp_path / "temporary").iterdir()) == []
-
-
-@pytest.mark.parametrize("way", ["fail", "terminated", "killed"])
-def test_a_build_that_ends_too_early_takes_its_temporary_folder_along(rooted, tmp_path, way):
-    environment = a_user_builds(rooted, tmp_path)
-    if way == "terminated":
-        process = rooted.building("hang", **environment)
-        process.terminate()
-    else:
-        process = rooted.start("true", environment=environment | {"STUB_BUILD": way})
-    process.communicate(timeout=LONG)
-    assert process.returncode == {"fail": 5, "terminated": 143, "killed": 5}[way]
-    if way == "killed":
-        orphan = Path("/proc", (rooted.record / "orphan").read_text().strip())
-        wait_for(lambda: not orphan.exists() or "Z" in (orphan / "stat").read_text().split(")")[1], "the orphan's end")
-    assert list((tmp_path / "temporary").iterdir()) == []
-    assert sorted(path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()) == [".lock", ".log"]
 
 
 @pytest.mark.parametrize("as_user", [False, True])

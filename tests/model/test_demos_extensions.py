@@ -16,7 +16,6 @@ import pytest
 from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene, read_scene
 from remodel_fenicsx.extend import CHAINS, DRIVERS, LAWS
 from remodel_fenicsx.model.implicit import CondensedPoints
-from tests.command.test_run import demo, refusal_of, run
 from tests.model.test_condensed import deformations, points, solved, tangent_errors
 
 FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
@@ -127,20 +126,3 @@ def test_kappa_depends_on_the_temperature_of_each_region() -> None:
     tube = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"remodeling.law": "arrhenius", "regions": layers})
     cool, usual = (one.kappa for one in tube.properties().values())
     assert cool < usual == tube.remodeling.kappa
-
-
-@pytest.mark.parametrize(("file", "settings"), [
-    ("freely_jointed_chain", ["material.chain=freely-jointed", "material.links_per_persistence_length=0.6"]),
-    ("mandel_driver", ["remodeling.driver=mandel", "remodeling.law=tensor", "material.repulsion=log",
-                       "remodeling.coupling=implicit"]),
-    ("kappa_by_temperature", ["remodeling.law=arrhenius", "material.temperature=300", "remodeling.kappa=0.03"]),
-])  # fmt: skip
-def test_from_the_command_line(file: str, settings: list[str], tmp_path: Path) -> None:
-    """A run that is resumed, and validated only with its file."""
-    words = [f"--with={FOLDER / file}.py", *(f"--set={setting}" for setting in settings)]
-    first = run("run", demo("cube"), *words, "--set=time.end=2", "-q", "--no-report", "-o", tmp_path / "run")
-    assert (first.returncode, first.stderr) == (0, "")
-    more = run("run", "--resume", tmp_path / "run", words[0], "--set=time.end=3", "-q", "--no-report")
-    assert (more.returncode, more.stderr) == (0, "")
-    assert len((tmp_path / "run" / "history.csv").read_text().splitlines()) >= 4
-    assert settings[0].split(".")[0] in refusal_of("validate", demo("cube"), *words[1:])

@@ -8,7 +8,6 @@ n_I(0) -> Q n_I(0), which both are.
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import dolfinx.fem
 import dolfinx.mesh
@@ -224,11 +223,6 @@ def shared_points() -> Points:
     return Points()
 
 
-@pytest.fixture(name="points")
-def the_points() -> Points:
-    return shared_points()
-
-
 def deformations(rng: np.random.Generator, size: float = 0.12) -> np.ndarray:
     """Stretched and turned, (64, 3, 3)."""
     return parts.random_rotations(rng, 64) @ (np.eye(3) + rng.uniform(-size, size, (64, 3, 3)))
@@ -389,16 +383,3 @@ def test_a_driver_that_is_not_finite_is_refused(points: Points) -> None:
     with pytest.raises(FloatingPointError, match="not finite"):
         points.updated("cauchy", "material")
     points.deform(np.eye(3))
-
-
-# ---------------------------------------------------------------- registries
-def test_registries_are_what_the_scene_offers() -> None:
-    assert FRAMES["material"].axes is material_frame and FRAMES["spatial"].axes is spatial_frame
-    assert Remodeling().frame == "material"
-
-
-@pytest.mark.parametrize("key", ["driver", "frame", "law"])
-def test_what_is_not_registered_is_refused(key: str) -> None:
-    wrong: Any = {key: "rotated"}
-    with pytest.raises(ValueError, match="allowed are"):
-        Remodeling(**wrong)

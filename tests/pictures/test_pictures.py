@@ -16,7 +16,6 @@ from remodel_fenicsx import Recording, cli
 from remodel_fenicsx.pictures import bodies as rendering
 from remodel_fenicsx.pictures.bodies import AMBIENT, coloured
 from remodel_fenicsx.results.recording import ANGLE_COLOURS
-from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.results.whole_body import WholeBody
 from tests.conftest import Refused
 from tests.report.conftest import Recorded
@@ -121,19 +120,6 @@ def test_a_quarter_is_less_than_a_half(drawn: Drawn) -> None:
     assert np.mean(np.any(low < 245, axis=2)) > 0.5 and np.mean(np.any(right < 245, axis=2)) < 0.01
 
 
-@pytest.mark.parametrize("name", ["radial", "axisymmetric", "sector"])
-def test_reductions_are_shown_as_whole_tubes(drawn: Drawn, name: str) -> None:
-    body = panel(drawn(name, "--view=0,0,1"))
-    filled = np.any(body < 245, axis=2)
-    rows, columns = np.nonzero(filled)
-    centre = np.array([(rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2])
-    radius = np.ptp(columns) / 2
-    angles = np.linspace(0, 2 * np.pi, 36)
-    for share, is_wall in ((0.15, False), (0.7, True)):
-        at = np.rint(centre[:, None] + share * radius * np.stack([np.sin(angles), np.cos(angles)])).astype(int)
-        assert np.all(filled[at[0], at[1]] == is_wall), share
-
-
 def test_the_ends_of_a_tendon_of_wedges_are_there(drawn: Drawn) -> None:
     body = panel(drawn("point", "--view=0,0,1"))
     rows, columns = outline(body)
@@ -227,27 +213,6 @@ def test_bad_input_is_one_line_and_writes_nothing(
     message = refused(*(folder if word == "DIR" else word for word in words.split()))
     assert message.startswith(said.replace("DIR", str(folder)))
     assert os.listdir() == [] and sorted(os.listdir(folder)) == before
-
-
-def test_a_run_of_one_time_does_not_move(recorded: Recorded, tmp_path: Path, refused: Refused) -> None:
-    """It is drawn, and not animated."""
-    run = Recording(recorded("cube"))
-    folder = shutil.copytree(recorded("without fields"), tmp_path / "run")
-    with TransientGrid(folder / "fields.vtkhdf", run.points, run.elements, 12) as grid:
-        fields = run.fields(run.times[-1])
-        grid.append(0.0, {"displacement": fields.pop("displacement")}, fields)
-    assert f"{folder}: fields of one time alone are recorded, so nothing moves" in refused("animate", folder)
-    assert cli.main(["picture", str(folder)]) == 0 and (folder / "cube-t0.png").is_file()
-
-
-def test_what_cannot_be_drawn_is_exit_code_5(
-    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.setattr(rendering.sys, "executable", shutil.which("false"))
-    assert cli.main(["picture", str(recorded("cube")), "-o", str(tmp_path / "x.png")]) == 5
-    message = capsys.readouterr().err
-    assert message.startswith("remodel-fenicsx: no picture in space: ") and message.count("\n") == 1
-    assert os.listdir(tmp_path) == []
 
 
 # ---------------------------------------------------------------- what belongs to others

@@ -60,15 +60,6 @@ def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(recorded: Rec
     assert repr(recording) == f"Recording({str(recording.path)!r})"
 
 
-def test_the_page_goes_where_it_is_asked_for_and_overwrites_nothing(recorded: Recorded, tmp_path: Path) -> None:
-    recording, other = Recording(recorded("cube")), tmp_path / "page.html"
-    assert recording.report(other) == other
-    written = other.read_bytes()
-    with pytest.raises(ValueError, match="is there already"):
-        recording.report(other)
-    assert other.read_bytes() == written
-
-
 # ---------------------------------------------------------------- the grid
 @pytest.mark.parametrize("name", ["artery", "tetrahedra", "quadratic"])
 def test_the_grid_has_what_was_recorded(recorded: Recorded, name: str) -> None:

@@ -92,24 +92,6 @@ def test_profile_and_rose_are_volume_means(browser: Browser, recorded: Recorded,
         np.testing.assert_allclose(rose, counted, atol=1e-5)
 
 
-def test_labels_stand_at_the_lines_that_they_name(browser: Browser, recorded: Recorded) -> None:
-    """Moved apart both ways, each with a line to the end of its curve."""
-    browser.open(recorded("artery") / REPORT)
-    script = (
-        "(() => { const all = (name) => [...document.querySelectorAll(`#profile ${name}`)];"
-        " const number = (e, name) => Number(e.getAttribute(name));"
-        " return [all('.leader').map((e) => ['x1', 'y1', 'y2'].map((name) => number(e, name))),"
-        " all('text').filter((e) => e.textContent.startsWith('t = ')).map((e) => number(e, 'y')),"
-        " all('path[fill=none]').map((e) => e.getAttribute('d').split('L').at(-1).split(' ').map(Number))]; })()"
-    )
-    leaders, labels, ends = browser.value(script)
-    assert len(leaders) == len(labels) == 5 and min(np.diff(labels)) > 11
-    for (x, start, end), label in zip(leaders, labels, strict=True):
-        assert abs(end + 4 - label) < 0.1
-        assert min(np.hypot(x - 4 - a, start - b) for a, b in ends) < 0.2
-    assert max(abs(start - end) for _, start, end in leaders) < 36
-
-
 def test_curves_have_names_and_units_at_their_axes(browser: Browser, recorded: Recorded) -> None:
     browser.open(recorded("layers") / REPORT)
     values = browser.value("[...document.querySelectorAll('.curve .values')].map((e) => e.textContent).join(' ')")
@@ -141,17 +123,6 @@ def test_the_slider_leads_through_time_and_back(browser: Browser, recorded: Reco
     browser.press("Home")  # the slider has the focus
     assert browser.value("REPORT.clock.time") == 0.0
     assert browser.value("document.querySelector('#profile').innerHTML") != profile
-
-
-def test_keys_and_play(browser: Browser, recorded: Recorded) -> None:
-    browser.open(recorded("artery") / REPORT)
-    for key, t in (("ArrowLeft", 9.0), ("ArrowLeft", 8.0), ("ArrowRight", 9.0), ("Home", 0.0)):
-        browser.press(key)
-        assert browser.value("REPORT.clock.time") == t
-    browser.press(" ")
-    assert browser.value("document.querySelector('#play').getAttribute('aria-pressed')") == "true"
-    browser.wait_for("REPORT.clock.time === 10")
-    browser.wait_for("document.querySelector('#play').getAttribute('aria-pressed') === 'false'")
 
 
 def test_a_click_on_a_curve_goes_to_its_time(browser: Browser, recorded: Recorded) -> None:
@@ -207,18 +178,6 @@ def test_a_choice_changes_the_picture_and_back(browser: Browser, recorded: Recor
     np.testing.assert_array_equal(body(browser), before)
 
 
-def test_faces_go_round_their_corners(browser: Browser, recorded: Recorded) -> None:
-    """The cube from above is a rectangle of one colour, with no line across."""
-    browser.open(recorded("cube") / REPORT)
-    browser.choose("#shown", "shape")
-    browser.click("#above")
-    pixels = body(browser)
-    rows, columns = np.nonzero((pixels < 250).any(axis=2))
-    down, across = (slice(*np.quantile([x.min(), x.max()], [0.15, 0.85]).astype(int)) for x in (rows, columns))
-    inside = pixels[down, across]  # without a little of the front
-    assert min(inside.shape[:2]) > 150 and len(np.unique(inside.reshape(-1, 3), axis=0)) == 1
-
-
 def test_chains_are_drawn(browser: Browser, recorded: Recorded) -> None:
     """Black on the surface, by the rule of the figures."""
     browser.open(recorded("artery") / REPORT)
@@ -238,23 +197,6 @@ def test_downloads_are_the_files_of_the_run(browser: Browser, recorded: Recorded
     browser.click("#picture")
     browser.wait_until(lambda: (tmp_path / "cube-t10.png").exists())
     assert (tmp_path / "cube-t10.png").read_bytes().startswith(b"\x89PNG")
-
-
-# ---------------------------------------------------------------- where it is read
-@pytest.mark.parametrize("kind", ["phone", "dark", "print"])
-def test_other_places(browser: Browser, recorded: Recorded, kind: str) -> None:
-    page = recorded("artery") / REPORT
-    features = {"phone": {}, "dark": {"prefers_color_scheme": "dark"}, "print": {"type": "print"}}[kind]
-    width = 390 if kind == "phone" else 1000
-    browser.open(page, width=width, **features)
-    assert browser.value("document.documentElement.scrollWidth") <= width
-    ground = browser.value("getComputedStyle(document.body).backgroundColor")
-    assert (ground == "rgb(18, 22, 29)") is (kind == "dark")
-    assert browser.value("getComputedStyle(document.querySelector('.controls')).display") == (
-        "none" if kind == "print" else "flex"
-    )
-    assert len(drawn(browser.screenshot("#body"))) > 5000
-    assert quiet(browser, page)
 
 
 def test_a_browser_that_draws_nothing_in_space_shows_the_rest(recorded: Recorded) -> None:

@@ -8,8 +8,6 @@ import hashlib
 import html
 import json
 import re
-import shutil
-import subprocess
 import time
 import tomllib
 from pathlib import Path
@@ -21,10 +19,9 @@ import pytest
 from remodel_fenicsx import Recording, cli, run as run_scene
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
-from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, ReportedRun, of_angles
-from remodel_fenicsx.results.recording import ANGLE_COLOURS, HistoryColumns, kept_times
+from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, ReportedRun
+from remodel_fenicsx.results.recording import HistoryColumns, kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
-from remodel_fenicsx.results.recording import unit_of, with_unit
 from remodel_fenicsx.scene.scene import preset_scene
 from tests.conftest import Refused
 from tests.forks import forked
@@ -158,18 +155,6 @@ def test_tetrahedra_have_as_many_layers_as_lie_behind_one_another(recorded: Reco
     np.testing.assert_allclose(shares, 1 / 3, rtol=1e-5)
 
 
-def test_numbers_beside_each_other_have_as_many_digits_and_their_units() -> None:
-    assert [with_unit(value, "mm") for value in (3.4, 2.45, 12.0, 120.0, 0.0)] == [
-        "3.40 mm", "2.45 mm", "12.0 mm", "120 mm", "0 mm",
-    ]  # fmt: skip
-    units = {"material.stress_unit": "kPa", "geometry.length_unit": "mm"}
-    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(units)
-    found = [unit_of(scene, name) for name in ("stress", "force", "length^3", "stress length^3 / time", "s", "")]
-    assert found == ["kPa", "kPa mm²", "mm³", "kPa mm³ / time", "s", ""]
-    bare = preset_scene("kuhl-holzapfel-2007", "tube")
-    assert [unit_of(bare, name) for name in ("force", "length^3", "degrees")] == ["", "", "°"]
-
-
 def test_volumes_and_layers_are_those_of_the_body(recorded: Recorded) -> None:
     for name, layers in (("artery", 8), ("tendon", 10), ("cube", 1)):
         found = Decoded.of(recorded(name))
@@ -210,20 +195,6 @@ def test_reductions_are_shown_as_whole_bodies(recorded: Recorded, name: str) -> 
     parts = (edges @ around[..., None])[..., 0], edges[..., 2]
     tangential, axial = (np.linalg.norm(part, axis=1) for part in parts)
     np.testing.assert_allclose(np.degrees(np.arctan2(axial, tangential)), found.angle[-1], atol=1.5)
-
-
-def test_the_colours_are_those_of_matplotlibs_scale() -> None:
-    import matplotlib
-    from matplotlib.colors import to_hex
-
-    places = np.linspace(0, 1, len(ANGLE_COLOURS))
-    assert tuple(to_hex(colour) for colour in matplotlib.colormaps["RdYlBu"](places)) == ANGLE_COLOURS
-    # levels of a byte do not cross the borders of colours
-    degrees = np.array([0.0, 4.999, 5.0, 44.999, 45.0, 89.999, 90.0, np.nan])
-    steps = of_angles(degrees)
-    colours = steps[:-1].astype(int) * len(ANGLE_COLOURS) // ANGLE_STEPS
-    np.testing.assert_array_equal(colours, [0, 0, 1, 8, 9, 17, 17])
-    assert steps[-1] == NO_ANGLE
 
 
 # ---------------------------------------------------------------- size and time
@@ -392,9 +363,3 @@ def test_the_bundle_is_the_one_that_is_named() -> None:
     for package in vendor["package"]:
         assert "Permission is hereby granted" in (ASSETS / package["licence_file"]).read_text()
         assert package["licence"] == "MIT"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("npm") is None, reason="no npm: the bundle cannot be made anew")
-def test_the_bundle_is_what_its_packages_give() -> None:
-    subprocess.run(["python3", "docs/make", "--check", "bundle"], cwd=DEMOS.parent, check=True)

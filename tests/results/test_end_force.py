@@ -12,6 +12,7 @@ from remodel_fenicsx import Simulation, cli
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from tests.parts import tube
 from tests.reference.radial import solve_radial
+from tests.runs import AtSolved
 from tests.values import ramped, isotropic
 
 SELF = MPI.COMM_SELF
@@ -26,22 +27,11 @@ def scene(kinematics: str, **tables: Any) -> Scene:
 
 def rows_of(made: Scene, look: Any = None, domain: Any = None) -> tuple[list[dict[str, float]], list[Any]]:
     simulation, seen = Simulation(made, SELF, domain), []
-    for step in simulation.steps([_Looking(lambda: seen.append(look(simulation)))] if look else []):
+    for step in simulation.steps([AtSolved(lambda step: seen.append(look(simulation)))] if look else []):
         seen.append(step.row)
     simulation.close()
     rows = [found for found in seen if isinstance(found, dict)]
     return rows, [found for found in seen if not isinstance(found, dict)]
-
-
-class _Looking:
-    def __init__(self, look: Any):
-        self.look = look
-
-    def solved(self, step: Any) -> None:
-        self.look()
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda step: None
 
 
 def test_the_force_is_that_of_the_one_dimensional_reference() -> None:
@@ -111,7 +101,7 @@ def test_the_tensor_law_pulls_with_what_its_energy_says() -> None:
     column = next(column for column in simulation.observer.columns if column.name == "axial_force")
     energies = []
 
-    def look() -> None:
+    def look(step: Any) -> None:
         equilibrium, loading = simulation.stepper.coupling.equilibrium, simulation.loading
         loads, found = dict(loading.values), []
         for change in (1e-5, -1e-5):
@@ -120,7 +110,7 @@ def test_the_tensor_law_pulls_with_what_its_energy_says() -> None:
         loading.set(loads)
         energies.append((found[0] - found[1]) / 2e-5 / made.geometry.axial_length)
 
-    forces = [step.row[column.name] for step in simulation.steps([_Looking(look)])]
+    forces = [step.row[column.name] for step in simulation.steps([AtSolved(look)])]
     simulation.close()
     np.testing.assert_allclose(forces, energies, rtol=1e-7)
 

@@ -155,29 +155,6 @@ def test_a_scene_of_another_kind_is_damage_of_the_folder(folder: Path) -> None:
         _ = Recording(folder).scene
 
 
-def cut_short(path: Path) -> None:
-    os.truncate(path, path.stat().st_size - 100)
-
-
-def of_text(path: Path) -> None:
-    path.write_text("time\n")
-
-
-def of_another_program(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        file["Mesh"] = np.zeros(3)
-
-
-def without_last_values(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file["VTKHDF/CellData/fibre_angle"].resize(5, axis=0)
-
-
-def without_offsets(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        del file["VTKHDF/Steps/PointDataOffsets/displacement"]
-
-
 def test_a_step_that_was_not_finished_is_not_there(folder: Path) -> None:
     """The number of steps is written last."""
     with h5py.File(folder / "fields.vtkhdf", "r+") as file:

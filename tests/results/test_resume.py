@@ -32,14 +32,9 @@ from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.results.recording import FolderTaken, RunLock, writer
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
-from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state import State
 from remodel_fenicsx.system.interrupts import Paused
-from remodel_fenicsx.watch import stability as equilibrium_stability, over_correction
-from remodel_fenicsx.watch.stability import EquilibriumStability
-from remodel_fenicsx.watch.warnings import LockingWarning, Missing
-from remodel_fenicsx.watch.over_correction import OverCorrection
 from tests.conftest import mpirun
 from tests.parts import pulled_cube
 from tests.runs import made
@@ -466,48 +461,6 @@ def test_what_a_coupling_remembers_is_kept(tmp_path: Path, monkeypatch: pytest.M
     resume(tmp_path / "run", [], SELF)
     kept = read_checkpoint(tmp_path / "run")
     assert kept is not None and kept.numbers["part"] == 0.5**5
-
-
-# ---------------------------------------------------------------- what is said
-def test_runs_that_go_on_say_what_one_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stopped after every step: nobody has forgotten what was seen, nothing is said twice."""
-    push = {"loads.force.value": -30.0, "loads.force.ramp": [[0.0, 0.0], [3.0, 1.0]], "time.end": 8.0}
-    cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values({**push, "remodeling.kappa": 0.1})
-    monkeypatch.setattr(over_correction, "GROWTH", np.inf)  # five passes are warned of, whatever they do
-    monkeypatch.setattr(over_correction, "CELL_TOLERANCE", 0.0)
-    monkeypatch.setattr(over_correction, "RESTED_SHARE", 1.0)
-    monkeypatch.setattr(OverCorrection, "_advice", lambda watcher, factor: "nothing")
-    monkeypatch.setattr(LockingWarning, "stiffness_ratio", lambda watcher: 1e9)
-    monkeypatch.setattr(LockingWarning, "_missing", lambda watcher, *energies: Missing(1.0, 0.0))
-    monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 9)
-    counts: list[int] = []
-    count = EquilibriumStability._count
-
-    def counted(watcher: EquilibriumStability) -> float:
-        counts.append(watcher.state.number)
-        return count(watcher)
-
-    monkeypatch.setattr(EquilibriumStability, "_count", counted)
-    expected = said(run(cube, tmp_path / "whole", SELF))
-    looks = counts.copy()
-    counts.clear()
-    for words in ("over-corrects", "the elements lock", "the equilibrium is unstable"):
-        assert sum(words in line for line in expected) == (2 if "unstable" in words else 1), expected
-    solve, folder = Staggered.solve, tmp_path / "run"
-
-    def signalled(coupling: Staggered, *arguments: Any) -> Any:
-        signal.raise_signal(signal.SIGUSR1)
-        return solve(coupling, *arguments)
-
-    monkeypatch.setattr(Staggered, "solve", signalled)
-    with pytest.raises(Paused):
-        run(cube, folder, SELF)
-    for _ in range(6):
-        with pytest.raises(Paused):
-            resume(folder, [], SELF)
-    resume(folder, [], SELF)
-    assert rows(folder) == rows(tmp_path / "whole")
-    assert said(folder) == expected and counts == looks
 
 
 def said(folder: Path) -> list[str]:

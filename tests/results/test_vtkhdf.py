@@ -7,7 +7,6 @@ import os
 import re
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -122,20 +121,6 @@ def test_node_order_is_that_of_vtk(tmp_path, cell, degree):
     assert np.allclose(found["0 parametric"].reshape(-1, 3), element.points[cells[0]], atol=1e-12)
     assert found["0 types"].tolist() == [cell_type]
     assert found["0 volumes"] == pytest.approx([{"hexahedron": 1.0, "tetrahedron": 1 / 6}[cell]], rel=1e-6)
-
-
-@pytest.mark.filterwarnings("ignore:dofmap is deprecated:DeprecationWarning")
-@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
-def test_cells_of_a_dolfinx_mesh_have_positive_volumes(tmp_path, cell):
-    from dolfinx import mesh
-    from mpi4py import MPI
-
-    box = mesh.create_box(MPI.COMM_SELF, [[0, 0, 0], [1, 2, 3]], [2, 2, 3], mesh.to_type(cell))
-    cell_type, cells = vtk_cells(cell, 1, box.geometry.dofmap)
-    with TransientGrid(tmp_path / "f.vtkhdf", box.geometry.x, cells, cell_type) as grid:
-        grid.append(0.0)
-    volumes = read(grid.path)["0 volumes"]
-    assert volumes == pytest.approx(np.full(len(volumes), 6 / len(volumes)), rel=1e-6)
 
 
 def random_cells(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -285,24 +270,3 @@ def test_files_take_turns_and_who_reads_one_keeps_it(tmp_path, monkeypatch):
     with h5py.File(path) as file:
         assert file["VTKHDF/CellData/depth"].shape == (1,)
     assert [found.name for found in tmp_path.iterdir()] == ["f.vtkhdf"]
-
-
-def test_ctrl_c_waits_for_the_step(tmp_path, monkeypatch):
-    # an exception that comes up while HDF5 calls back into PatientFile would crash the process
-    write, calls = PatientFile.write, []
-
-    def interrupted(self, data):
-        calls.append(len(data))
-        signal.raise_signal(signal.SIGINT)
-        return write(self, data)
-
-    handler = signal.getsignal(signal.SIGINT)
-    with TransientGrid(tmp_path / "f.vtkhdf", CUBE, VTK_CUBE, 12) as grid:
-        grid.append(0.0, {"u": np.zeros(8)})
-        monkeypatch.setattr(PatientFile, "write", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            grid.append(1.0, {"u": np.ones(8)})
-        monkeypatch.setattr(PatientFile, "write", write)
-        assert calls and signal.getsignal(signal.SIGINT) is handler
-        grid.append(2.0, {"u": np.full(8, 2.0)})
-    assert np.array_equal(raw_series(grid.path, "u", 8), [np.zeros(8), np.ones(8), np.full(8, 2.0)])

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx.body import SHAPES, Cube, Tendon, Tube
+from remodel_fenicsx.body import SHAPES, Cube, Tube
 from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
-from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Solver, Time
+from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Time
 from remodel_fenicsx.schema.tables import SceneError, allowed, description, is_table, locate, sections, shown
 from tests.tables import rows, values
 
@@ -274,12 +274,6 @@ def test_without_a_preset_another_law_has_what_goes_with_it(law):
     assert scene.remodeling.frame == "material"
 
 
-def test_the_default_method_changes_no_preset():
-    scene = preset_scene(PAPER, "tube")
-    method = scene.material.repulsion, scene.remodeling.law, scene.remodeling.coupling
-    assert method == ("axes", "explicit", "staggered")
-
-
 def test_the_network_modulus():
     # c = k theta n / (4 A_p) by hand: 1.381e-23 * 310 * 2e21 / 5.46
     assert Material().network_modulus == pytest.approx(1.56817, rel=1e-5)
@@ -369,12 +363,6 @@ def test_a_scene_cannot_be_changed_in_place():
 # ---------------------------------------------------------------- loads and time
 
 
-def test_the_factor_of_a_load_is_linear_between_and_held_outside():
-    load = Load(value=3.0, ramp=[[2.0, 0.5], [4.0, 1.0], [5.0, 0.0]])
-    times = {0.0: 0.5, 2.0: 0.5, 3.0: 0.75, 4.0: 1.0, 4.25: 0.75, 5.0: 0.0, 100.0: 0.0}
-    assert {time: load.factor(time) for time in times} == times
-
-
 def test_good_ramps_and_times():
     assert Time(end=0.3, step=0.1).number_of_steps == 3
     assert Time(end=150).number_of_steps == 150
@@ -384,14 +372,6 @@ def test_good_ramps_and_times():
     assert scene_from_dict(values).loads["pressure"].factor(0.5) == pytest.approx(0.5)
     held = changed(TUBE, {"loads.elongation": {"value": -0.5, "ramp": [[0, 1]]}})
     assert scene_from_dict(held).loads["elongation"].factor(17.0) == 1.0
-
-
-def test_good_cells():
-    for initial in ("random", "isotropic", "aligned", [0.6, 0.0, 0.8], [1, 0, 0]):
-        assert scene_from_dict(changed(TUBE, {"cells.initial": initial})).cells.initial in (initial, tuple(initial))
-    assert scene_from_dict(changed(CUBE, {"cells": {"end_to_end_length": 0.5, "initial": [0.3, 0.4, 0]}}))
-    assert Tendon(length=1).length == 1.0
-    assert Solver(petsc_options={"snes_monitor": True}).petsc_options == {"snes_monitor": True}
 
 
 # ---------------------------------------------------------------- summary and warnings

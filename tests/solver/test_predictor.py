@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ import pytest
 
 from remodel_fenicsx import Recording, Simulation
 from remodel_fenicsx.evolution.coupling import PREDICTORS, Autoregressive, LoadStep, Predictor, Responsive
-from remodel_fenicsx.results.checkpoint_file import read_checkpoint
-from remodel_fenicsx.running import resume, run
+from remodel_fenicsx.running import run
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from tests.parts import pulled_cube
@@ -131,24 +129,6 @@ def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Pa
     for name in ("mean_stretch", "stored_energy", "max_chain_extension", "remodeling_power"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-8, err_msg=name)
     assert iterations(predicted) <= 0.9 * iterations(plain)
-
-
-def test_it_is_resumed_with_what_it_remembers(predicted: Path, tmp_path: Path) -> None:
-    folder = run(pulled_cube(11.0, solver=PREDICTED, output={"fields": False}), tmp_path / "run", SELF)
-    shutil.copytree(folder, tmp_path / "other")
-    resume(folder, ["time.end=16.0"], SELF)
-    assert rows(folder) == rows(predicted)
-    # and without it, and again with it
-    resume(tmp_path / "other", ["time.end=13.0", "solver.predictor='none'"], SELF)
-    resume(tmp_path / "other", ["time.end=16.0", "solver.predictor='autoregressive'"], SELF)
-    assert (
-        "not in the checkpoint, so they begin anew: predictor_increment_0"
-        in (tmp_path / "other" / "run.log").read_text()
-    )
-    kept, wanted = (read_checkpoint(one) for one in (tmp_path / "other", predicted))
-    assert kept is not None and wanted is not None and kept.numbers["predictor_increment_known"] == 3
-    displacements = [one.arrays["function/displacement"] for one in (kept, wanted)]
-    np.testing.assert_allclose(*displacements, rtol=0, atol=1e-9)
 
 
 def nearly_straight(predictor: Autoregressive, step: LoadStep) -> np.ndarray | None:

@@ -153,30 +153,6 @@ def test_lifting_is_the_tangent_times_the_way_to_the_prescribed_values() -> None
     assert np.abs(expected[free.ravel()]).max() > 0.1
 
 
-def test_the_matrix_has_all_tangents_and_ones_where_displacements_are_held() -> None:
-    """Also the second time, and PETSc knows that it has changed."""
-    made = parts.body(cube(refinement=2), RANDOM)
-    made.loading.hold_face("z0", 2)
-    made.loading.add_dead_force("force", "z1", component=2)
-    made.loading.add_follower_pressure("pressure", "x1")
-    problem = made.problem()
-    made.loading.set({"force": 3.0, "pressure": 4.8})
-    matrix, held = problem.create_matrix(), np.zeros((len(made.nodes), 3), dtype=bool)
-    held[np.isclose(made.nodes[:, 2], 0.0), 2] = True
-    states = []
-    for seed in (1, 2):
-        made.set_displacement(smooth(made.nodes, 0.05, seed))
-        problem.assemble_tangent(matrix)
-        expected = assembled_tangent(problem)
-        expected[held.ravel()] = expected[:, held.ravel()] = 0.0
-        expected += np.diag(held.ravel().astype(float))
-        every = range(held.size)
-        np.testing.assert_allclose(matrix.getValues(every, every), expected, rtol=0, atol=1e-12)
-        states.append(matrix.stateGet())
-    assert states[0] < states[1] and matrix.getBlockSize() == 3
-    matrix.destroy()
-
-
 def test_a_prescribed_elongation_is_reached_as_fast_as_newton_can() -> None:
     """Lifting spreads it over the body at once: without it, or with its sign wrong, the first layer takes it all."""
     made = parts.body(cube(refinement=4), Cells(initial="isotropic"))

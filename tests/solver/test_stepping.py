@@ -92,20 +92,6 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
     assert energy == pytest.approx(problem.stored_energy(), rel=1e-11)
 
 
-def test_a_step_that_needs_no_parts_is_one_solve() -> None:
-    made = clamped_cube()
-    stepper = made.stepper(lambda t: {"force": t}, parts.TIGHT.model_copy(update={"predictor": "none"}))
-    stepper.advance(1.0)
-    start = state(made)
-    work = solve(stepper, 2.0)
-    assert work.substeps == 1
-    found = made.displacement.x.array.copy()
-    made.displacement.x.array[:] = start["u"]
-    newton: GuardedNewton = stepper.coupling.newton  # type: ignore[attr-defined]
-    assert newton.solve().newton_iterations == work.newton_iterations
-    np.testing.assert_array_equal(made.displacement.x.array, found)
-
-
 @pytest.mark.parametrize("predicted", [True, False])
 def test_each_part_of_the_exchange_leaves_a_reserve_at_every_point(
     predicted: bool, monkeypatch: pytest.MonkeyPatch
@@ -187,28 +173,6 @@ def test_an_impossible_load_is_a_failure_that_changes_nothing() -> None:
     assert made.loading.values["pressure"] == 1.0
 
 
-def test_cells_that_cannot_be_exchanged_are_a_failure_that_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, stepper = loaded_and_remodeled("cauchy", "material", 60.0)
-    before = state(made)
-    real = GuardedNewton.solve
-
-    def refuse(newton: GuardedNewton, origin: Any = None) -> Solution:
-        real(newton, origin)
-        made.displacement.x.array[:] = before["u"]
-        raise SolveFailure("refused", 2, 3, Extension(0.9, 0.5, (0.25, 0.5, 1.0)))
-
-    monkeypatch.setattr(GuardedNewton, "solve", refuse)
-    with pytest.raises(StepFailure) as caught:
-        stepper.advance(FORCE + 1.0)
-    assert str(caught.value) == (
-        f"no equilibrium at time {FORCE + 1:g}: the change of the cells stops at 0 % of the step (refused; "
-        "largest r/L = 0.9000 at (0.250, 0.500, 1.000), smallest J = 0.5)"
-    )
-    assert_same(before, state(made))
-    monkeypatch.undo()
-    assert stepper.advance(FORCE + 1.0).work.substeps > 1  # nothing is left of the failed attempt
-
-
 # ---------------------------------------------------------------- bookkeeping
 class Refusing:
     """Stands for `GuardedNewton.solve`: refuses increments of the force above a limit; keeps a record."""
@@ -257,17 +221,6 @@ def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(monkeyp
     assert refusing.tried == [8.0, 4.0, 2.0, 6.0, 4.0, 8.0, 6.0, 8.0, 7.0, 8.0]
 
 
-def test_parts_that_do_not_divide_the_step_end_on_its_load_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = clamped_cube()
-    target = 0.1 + 0.2  # not what 3 * 0.1 or sums of parts of it give
-    stepper = made.stepper(lambda t: {"force": target if t else 0.0})
-    refusing = Refusing(made, target / 11)
-    monkeypatch.setattr(stepper.coupling.newton, "solve", refusing)  # type: ignore[attr-defined]
-    work = solve(stepper, 1.0)
-    assert made.loading.values["force"] == target == refusing.accepted[-1]
-    assert np.all(np.diff(refusing.accepted) > 0) and work.substeps == len(refusing.accepted) - 1
-
-
 @pytest.mark.parametrize("halvings", [0, 3])
 def test_the_number_of_halvings_is_the_scenes(halvings: int, monkeypatch: pytest.MonkeyPatch) -> None:
     made = clamped_cube()
@@ -310,17 +263,6 @@ def test_loads_are_hit_exactly_at_the_times_of_the_ramp() -> None:
     assert [factors[time] for time in (0.3, 0.6, 0.7)] == [1.0, 0.25, 0.25]
     assert load.factor(0.1 + 0.2) == load.factor(0.3 - 1e-16) == 1.0
     assert factors[0.5] == pytest.approx(0.5, rel=1e-14)
-
-
-def test_a_load_that_is_there_from_the_start_can_be_solved_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The body at t = 0 is unloaded: the first step goes from nothing to the load, whatever the ramp says of t = 0."""
-    made = clamped_cube()
-    stepper = made.stepper(lambda t: {"force": 8.0})
-    assert made.loading.values == {"force": 0.0}
-    refusing = Refusing(made, 5.0)
-    monkeypatch.setattr(stepper.coupling.newton, "solve", refusing)  # type: ignore[attr-defined]
-    assert solve(stepper, 1.0).substeps == 2
-    assert refusing.tried == [8.0, 4.0, 8.0]
 
 
 def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -107,28 +106,3 @@ def has_ended(number: int, seconds: float) -> bool:
     while is_alive(number) and clock.monotonic() < end:
         clock.sleep(0.05)
     return not is_alive(number)
-
-
-def test_a_run_whose_command_is_killed_before_it_begins_does_not_begin(tmp_path: Path) -> None:
-    """setpriv, which asks for the signal of that death, comes too late here."""
-    late, messages = tmp_path / "setpriv", tmp_path / "messages"
-    late.write_text(f"#!/bin/sh\nsleep 0.3\nexec {shutil.which('setpriv')} \"$@\"\n")
-    late.chmod(0o755)
-    code = f"""
-import os, pathlib, signal
-from remodel_fenicsx.system.children import Worker, wait_for_one
-child = Worker()
-child.begin(["info"], pathlib.Path({str(messages)!r}))
-print(child.process.pid, flush=True)
-if {{killed}}:
-    os.kill(os.getpid(), signal.SIGKILL)
-wait_for_one([child], 100.0)
-child.poll()
-child.stop()
-"""
-    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    for killed in (True, False):
-        command = [sys.executable, "-c", code.replace("{killed}", str(killed))]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
-        assert has_ended(int(done.stdout), 10.0)
-        assert (messages.read_text() == "") == killed

@@ -146,37 +146,6 @@ def test_what_was_stopped_goes_on(
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
 
 
-DIES = """
-import os, signal, sys
-from pathlib import Path
-from mpi4py import MPI
-from remodel_fenicsx import read_scene
-from remodel_fenicsx.results import run_folder
-from remodel_fenicsx.running import run
-where = {"lock": (run_folder, "write_whole"), "part": (os, "fsync")}[sys.argv[1]]
-setattr(*where, lambda *of: os.kill(os.getpid(), signal.SIGKILL))
-run(read_scene(sys.argv[2]), Path(sys.argv[3]), MPI.COMM_SELF)
-"""
-
-
-@pytest.mark.parametrize(("moment", "left"), [("lock", {"run.lock"}), ("part", {"run.lock", "scene.toml.part"})])
-def test_a_member_killed_before_its_scene_is_run_again(
-    moment: str, left: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In the folder that the study takes by itself."""
-    monkeypatch.chdir(tmp_path)
-    short = pulled_cube(1.0)
-    member = runs_of(short, Path("results", f"{short.name}-ensemble"), 2)[0]
-    Path("scene.toml").write_text(member.scene.to_toml())
-    done = forks.forked("python", DIES, moment, "scene.toml", member.folder.absolute(), cwd=tmp_path)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    assert {path.name for path in member.folder.iterdir()} == left
-    with forked_children():
-        place, found = study.ensemble(short, seeds=2)
-    assert (place, found.failed, found.seeds) == (member.folder.parent, {}, 2)
-    assert not left & {path.name for path in member.folder.iterdir()}
-
-
 def eight_seeds(last: float) -> study.Ensemble:
     """Stretches of mean 3 and standard deviation 1 at the end, and an extreme; `last` of isotropic cells."""
     ends = np.array([-1.0, 1.0] * 4) * np.sqrt(7 / 8) + 3.0

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +17,6 @@ import h5py
 import numpy as np
 import pytest
 import pyvista
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image
 
 import remodel_fenicsx
@@ -30,10 +27,8 @@ from remodel_fenicsx.results import vtkhdf
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.scene import Scene, SceneError, scene_from_dict
 from remodel_fenicsx.studies import page
-from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.studies.study import Run
 from tests.conftest import Refused
-from tests.studies.test_children import children_of, is_alive
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
 DOCS = PACKAGE.parent / "docs"
@@ -97,17 +92,6 @@ def test_every_figure_of_the_paper_is_there_and_every_run_is_drawn() -> None:
     known = figures.scenes()
     assert {run for figure in figures.FIGURES.values() for run in figure.runs} == set(known)
     assert all(scene.name == name for name, scene in known.items())
-
-
-@pytest.mark.parametrize("name", ["fig1.png", "fig1.csv", "fig5-mine.csv", "fig1.json"])
-def test_a_file_of_somebody_else_is_not_overwritten(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    theirs = tmp_path / name
-    theirs.write_text("a year of work")
-    assert draw(monkeypatch, "fig1", "fig5", "-o", tmp_path, "--runs", tmp_path / "runs") == 2
-    assert f"-o {tmp_path}: has files" in capsys.readouterr().err
-    assert theirs.read_text() == "a year of work" and os.listdir(tmp_path) == [name]
 
 
 def test_an_older_table_is_read(tmp_path: Path) -> None:
@@ -198,34 +182,12 @@ def test_a_damaged_run_is_not_complete(damage: str, tmp_path: Path) -> None:
     assert answers(tmp_path, scene) is not True
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_stopped_script_ends_its_runs(number: int, tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), "fig7", "--jobs", "1", "--runs", str(tmp_path / "runs")]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        said = process.stderr.readline()
-        workers = children_of(process.pid)
-        process.send_signal(number)
-        process.stderr.read()
-    assert said.startswith("figures: runs artery, 150 steps")
-    assert process.returncode == 128 + number and len(workers) == 1 and not is_alive(workers[0])
-    assert not (tmp_path / "figures").exists()
-
-
 def test_a_failing_run_ends_the_script_with_its_code(tmp_path: Path) -> None:
     # more than any chain can bear at once, and no part of the step is tried
     torn = tiny(name="torn", loads__force__value=1e9, solver__maximum_halvings=0)
     with pytest.raises(SystemExit) as end:
         figures.run_all([torn], tmp_path, 1)
     assert end.value.code == 3 and not figures.is_complete(torn, figures.run_folder(torn, tmp_path))
-
-
-def test_a_folder_that_cannot_be_written_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    assert draw(monkeypatch, "fig1", "-o", "/proc/nope") == 5
-    message = capsys.readouterr().err
-    assert "/proc/nope" in message and message.count("\n") == 1
 
 
 def test_a_damaged_run_ends_the_script_with_the_line_of_the_run(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
@@ -280,32 +242,6 @@ def test_fig5_is_the_closed_form_of_the_cells_before_the_pass(drawn: Path) -> No
         np.testing.assert_allclose(table[f"exact_kappa_{kappa:g}"], exact, rtol=1e-6)
 
 
-def test_figures_say_with_what_they_were_made(drawn: Path) -> None:
-    with Image.open(drawn / "fig5.png") as picture:
-        assert picture.size[0] > 800
-        notes = picture.text  # type: ignore[attr-defined]
-    spec = figures.FIGURES["fig5"]
-    assert (notes["Title"], notes["Description"]) == (spec.title, spec.caption)
-    for text in (notes["Source"], page.read_notes(drawn, "fig5")["fig5.csv"][0]):
-        assert f"remodel_fenicsx {remodel_fenicsx.__version__}, dolfinx " in text
-        assert "preset kuhl-holzapfel-2007 with kinematics point, frame spatial, isotropic cells" in text
-
-
-def test_panels_are_lettered_in_line_with_their_titles() -> None:
-    figure = Figure(figsize=(6, 4))
-    panels = [figure.add_axes((left, low, 0.3, 0.3)) for low in (0.6, 0.1) for left in (0.15, 0.6)]
-    panels[0].set_ylabel("a long way out")
-    panels[1].set_title("title")
-    page.panel_letters(*panels)
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    letters = [axes.texts[0] for axes in panels]
-    assert [letter.get_text() for letter in letters] == ["a", "b", "c", "d"]
-    boxes = [letter.get_window_extent(renderer) for letter in letters]
-    assert boxes[0].x0 == pytest.approx(boxes[2].x0) and boxes[1].x0 == pytest.approx(boxes[3].x0)
-    for axes, box in zip(panels, boxes, strict=True):
-        assert box.x0 < axes.get_window_extent().x0 and box.y0 >= axes.get_window_extent().y1
-
-
 def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     histories = sorted((drawn / "runs").glob("cube-*/history.csv"))
     assert len(histories) == 4
@@ -356,20 +292,6 @@ def outline(F: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return flat, np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
 
 
-@pytest.mark.parametrize("angle", [0.0, 5.0, 45.0, 85.0])
-@pytest.mark.parametrize("sheared", [0.0, 1.5])
-def test_chains_of_neighbours_do_not_join(angle: float, sheared: float) -> None:
-    """Whatever their direction and however long, they end before the edge of their face."""
-    cell = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0])
-    gradient = np.eye(3)
-    gradient[1, 2] = sheared
-    places, lengths = outline(gradient, cell)
-    assert np.abs(places).max() < 0.44
-    places, cut = outline(gradient, 3 * cell)
-    assert np.abs(places).max() < 0.44 and np.all(cut > 0.9 * lengths)
-    np.testing.assert_allclose(outline(gradient, 0.2 * cell)[1], lengths * 0.2, rtol=0.2 if sheared else 1e-5)
-
-
 def test_colours_go_from_red_along_to_blue_across() -> None:
     red, middle, blue = bodies.coloured(np.array([0.0, 45.0, 90.0]))
     assert red[0] > 0.6 and red[1:].max() < 0.2
@@ -408,24 +330,6 @@ def test_a_body_is_really_drawn(tiny_run: Recording) -> None:
     assert 0.02 < dark.sum() / body.sum() < 0.4 and not np.any(np.all(bare < 70, axis=2))
 
 
-def test_what_the_child_says_reaches_the_user() -> None:
-    view = bodies.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, (10, 10))
-    with pytest.raises(FigureError, match="no picture in space: pyvista ended with 1: .*boom") as failure:
-        bodies.render([Boom()], view)  # type: ignore[list-item]
-    assert failure.value.exit_code == 5
-
-
-class Boom:
-    """Cannot be read back."""
-
-    def __reduce__(self) -> tuple:
-        return (_raise, ())
-
-
-def _raise() -> None:
-    raise RuntimeError("boom")
-
-
 # ---------------------------------------------------------------- all of it
 
 
@@ -436,16 +340,6 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         assert draw(patch, "-o", folder, "--runs", folder / "runs") == 0
     return folder
-
-
-@pytest.mark.slow
-def test_every_figure_has_a_picture_and_its_data(everything: Path) -> None:
-    for name in figures.FIGURES:
-        with Image.open(everything / f"{name}.png") as picture:
-            colours = picture.convert("RGB").getcolors(100_000)
-        assert colours is not None and len(colours) > 50
-        assert len(next(iter(page.read_table(everything / f"{name}.csv").values()))) >= 5
-        assert (everything / f"{name}.png").stat().st_size < 300_000
 
 
 @pytest.mark.slow

@@ -234,20 +234,6 @@ def test_a_simulation_that_stays_says_what_a_new_one_does(folder: Path, changes:
             np.testing.assert_allclose(found[name], fresh[name], rtol=1e-9)
 
 
-def test_warnings_of_the_model_are_heard_where_the_fit_starts_and_where_it_ends(folder: Path) -> None:
-    """And not of each run between: elements that lock spoil the numbers that are fitted."""
-    stiff = {
-        "geometry.outer_radius": 3.0,
-        "material.lame_lambda": 3e4,
-        "mesh.degree": 1,
-        "mesh.formulation": "displacement",
-    }
-    sd = "fibre_angle_outer = 2.0, inner_radius = 0.01"
-    data = written(folder, {"remodeling.kappa": 0.05}, "history.csv", sd, "state = 'history'")
-    place, _ = fit(tube(**stiff), data, folder / "stiff", starts=1, profiles=False)
-    assert (place / "fit.log").read_text().count("the elements lock") == 2
-
-
 def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
     """Twice the standard deviations, twice the logarithmic bands; they cover the truth of noisy data."""
     path, scene = folder / "data.toml", read_scene(folder / "scene.toml")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,12 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.stability_map import report
 from benchmarks.stability_map.cases import Case, Finding, Run, all_cases
-from benchmarks.stability_map.command import main, measured
 from benchmarks.stability_map.homogeneous import CUBE
 from benchmarks.stability_map.judging import judged
-from benchmarks.stability_map.running import Runner, digest, evaluated, source_of
+from benchmarks.stability_map.running import Runner, evaluated
 from tests.reference.march import Bar, march, material
 from tests.reference.point import prescribed_path
 from tests.reference.solid import smallest_eigenvalue
@@ -80,28 +77,6 @@ def verdict(finding: Finding, **run: Any) -> Any:
     return judged(case, Run(**{"code": 0, **run}))
 
 
-def test_outcomes() -> None:
-    """Every way in which a case can end."""
-    alarm, saddle = ["the pass over-corrects"], ["2 negative eigenvalues of the tangent"]
-    assert verdict(Finding(0.5)).outcome == "right"
-    assert verdict(Finding(1.5)).outcome == "wrong"
-    assert verdict(Finding(1.5), warnings=alarm).outcome == "warned"
-    assert (
-        verdict(Finding(0.5), warnings=alarm).false_alarm and verdict(Finding(0.5), warnings=alarm).outcome == "right"
-    )
-    assert verdict(Finding(0.5, unstable=True)).outcome == "wrong"
-    assert verdict(Finding(0.5, unstable=True), warnings=alarm).outcome == "wrong"
-    assert verdict(Finding(0.5, unstable=True), warnings=saddle).outcome == "unstable"
-    assert verdict(Finding(0.5, unstable=False), warnings=saddle).false_alarm
-    assert verdict(Finding(np.nan)).outcome == "unchecked"
-    assert verdict(Finding(0.0), code=1).outcome == "wrong" and verdict(Finding(0.0), code=-1).outcome == "wrong"
-    assert verdict(Finding(0.0), code=-2).outcome == "unchecked"
-    assert verdict(Finding(np.inf), code=2, said="cells.seed = -1: must be").cause_named
-    stopped = "no equilibrium at time 3: the change of the loads stops at 5 % of the step"
-    assert verdict(Finding(0.0), code=3, said=stopped).cause_named is False
-    assert verdict(Finding(0.0), code=3, said=f"{stopped} (chain locking)").cause_named is True
-
-
 # ---------------------------------------------------------------- references
 def test_the_point_knows_the_closed_form() -> None:
     """The cube's angle (demos/cube.toml), whatever the stretch."""
@@ -127,31 +102,3 @@ def test_both_points_agree_where_axes_stay() -> None:
             A = prescribed_path(material(scene), F, np.array(path.times), np.full(3, 3**-0.5), driver, law)
             along = A[:, 2, 2]
             np.testing.assert_allclose(along, np.array(path.squares)[:, 0, 2], atol=1e-9, err_msg=f"{driver} {law}")
-
-
-# ---------------------------------------------------------------- the command
-def test_results_are_kept_and_belong_to_package_and_case(tmp_path: Path) -> None:
-    key = QUICK[0]
-    record = {"key": key, "source": "0.2.0+a", "digest": digest(CASES[key]), "outcome": "right"}
-    file = tmp_path / "0.2.0.jsonl"
-    file.write_text(json.dumps(record) + "\n" + json.dumps({**record, "outcome": "wrong"})[:40])  # cut off
-    assert measured(file, "0.2.0+a", CASES) == {key: record}
-    assert measured(file, "0.2.0+b", CASES) == {}
-    file.write_text(json.dumps({**record, "digest": "other"}) + "\n")
-    assert measured(file, "0.2.0+a", CASES) == {}
-
-
-def test_the_command_lists_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What is there is not run again: nothing is started here."""
-    key, source = QUICK[0], source_of()
-    assert main("", ["--list", "--only", key]) == 0
-    command = "remodel-fenicsx run demos/cube.toml --set remodeling.frame=spatial --set loads.force.value=10.0"
-    assert f"{key}\n    ./with-fenicsx {command}" in capsys.readouterr().out
-    record = {"key": key, "family": "load", "source": source, "digest": digest(CASES[key]), "outcome": "wrong",
-              "words": "off", "false_alarm": False, "cause_named": None}  # fmt: skip
-    (tmp_path / f"{source.partition('+')[0]}.jsonl").write_text(json.dumps(record) + "\n")
-    assert main("", ["--only", key, "--results", str(tmp_path)]) == 1
-    said = capsys.readouterr()
-    assert "1 cases, 0 to run" in said.err and "wrong: load: frame spatial, force 10.0: off" in said.out
-    assert report.counts([record])["**all**"]["wrong"] == 1
-    assert f"| {key} | off |\n" in report.listed([record], CASES, lambda one: True)

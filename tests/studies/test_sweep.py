@@ -5,22 +5,16 @@ from __future__ import annotations
 import csv
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from remodel_fenicsx import cli, preset_scene
-from remodel_fenicsx.results.recording import FolderTaken, RunLock
+from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.results.status import status
-from remodel_fenicsx import running
-from remodel_fenicsx.studies import stability
-from remodel_fenicsx.studies.sweep import ensemble, latin_hypercube, read_axes
-from remodel_fenicsx.studies.trade import trade
+from remodel_fenicsx.studies.sweep import latin_hypercube, read_axes
 from tests.conftest import Refused, forked_children
-from tests.parts import pulled_cube
 from tests.tables import rows as table
 
 PAPER = "kuhl-holzapfel-2007"
@@ -168,19 +162,6 @@ def test_bad_input_is_one_line(cube: Path, words: str, said: str, refused: Refus
     """Exit code 2, before any run."""
     assert said in refused("sweep", cube, *words.split(), "-o", cube.parent / "out", "-q")
     assert not (cube.parent / "out").exists()
-
-
-@pytest.mark.parametrize("study", [stability.stability, ensemble, trade])
-def test_a_study_of_any_kind_is_alone_in_its_folder(
-    study: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The second has found the folder empty before the first took it."""
-    for module in (stability, running):
-        monkeypatch.setattr(module, "chosen_folder", lambda folder, *_: folder)
-    scene = pulled_cube(1.0).with_values({"cells.initial": "random"})
-    with RunLock(tmp_path), pytest.raises(FolderTaken, match=f"process {os.getpid()} on .* writes in it"):
-        study(scene, tmp_path)
-    assert not list(tmp_path.iterdir())
 
 
 def test_two_equal_studies_do_not_share_a_folder(done: Path, tmp_path: Path, refused: Refused) -> None:

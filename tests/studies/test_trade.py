@@ -92,16 +92,6 @@ def test_without_an_exact_coupling_orders_in_time_and_mesh_are_seen() -> None:
     assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
 
 
-def varies_one_factor(setting: trade.Setting) -> bool:
-    return {key.partition(".")[0] for key in setting.changes if key != trade.COUPLING} in (set(), {"time"}, {"mesh"})
-
-
-def test_a_budget_that_ends_early_still_estimates_both_factors() -> None:
-    """The finest of each sweep stand beside each other; nothing has both."""
-    results = [made_up(s) for s in trade.ladder(artery()) if s.mesh[0] == "radial" and varies_one_factor(s)]
-    assert_right(trade.estimated(results)[0])
-
-
 def test_doubts_are_said() -> None:
     rows, notes = estimated(jagged=1.0)
     assert any("no order seen" in note for note in notes)
@@ -158,15 +148,6 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
         run = trade.as_run(setting, 3, times)
         assert run.cells.seed == 3 and run.output.times == tuple(times) and not run.output.fields
         assert setting.scene.output == scene.output
-
-
-def test_a_scene_with_a_profile_has_a_ladder_too() -> None:
-    """With fixed steps on the profile's mesh, and other profiles."""
-    scene = artery().with_values({"profile": "balanced", "mesh.degree": 2})
-    settings = trade.ladder(scene)
-    assert {"fast", "reference"} <= {setting.profile for setting in settings}
-    assert len({setting.step for setting in settings if setting.mesh[2] == 2}) > 4
-    assert trade.compared_times(scene, settings)[-1] == 150.0
 
 
 def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
@@ -270,25 +251,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
     assert said.endswith("is kept, a larger budget goes on\n")
     assert said.count("\n") == 1
-
-    first = trade.ladder(read_scene(path))[:2]
-    monkeypatch.setattr(trade, "ladder", lambda scene: first)
-    lone = tmp_path / "lone"
-    lone.mkdir()
-    (lone / f"{first[0].name}-1").write_text("a file of the user's")
-    with forked_children():
-        assert cli.main(["trade", str(path), "-o", str(lone), "--jobs", "2", "-q"]) == 3
-    failure, verdict = capsys.readouterr().err.splitlines()
-    assert " has failed: -o " in failure and "1 of 2 settings reached the end" in verdict
-    assert verdict.endswith("is kept, the same command tries again what has failed")
-
-
-def test_words() -> None:
-    rows, notes = estimated()
-    text = trade.Trade(artery(), rows, notes).in_words()
-    assert "order 2" in text
-    assert sum(line.startswith("* ") for line in text.splitlines()) == sum(row.on_front for row in rows) > 2
-    assert "  profile-fast" in text and "  radial-1-degree-1-step-2.5" in text and "radii %" in text
 
 
 def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:

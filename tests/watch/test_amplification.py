@@ -14,12 +14,13 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.cli import main
-from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.stability import AmplificationWatcher, LinearPass, verdict
 from tests.conftest import Refused, mpirun
+from tests.runs import AtSolved
 from tests.watch.test_over_correction import Tilt
 
 PAPER = "kuhl-holzapfel-2007"
@@ -32,18 +33,6 @@ def weak_cube(end: float, frame: str = "spatial") -> Simulation:
     return Simulation(preset_scene(PAPER, "cube").with_values(changes), MPI.COMM_SELF)
 
 
-class AtSolved(Watcher):
-    """Does something once, in the solved state of a time."""
-
-    def __init__(self, time: float, what: object):
-        self.time, self.what = time, what
-
-    def solved(self, step: Step) -> None:
-        """Do it."""
-        if step.time == self.time:
-            self.what(step)  # type: ignore[operator]
-
-
 @pytest.mark.parametrize("frame", ["spatial", "material"])
 def test_the_map_is_what_a_solve_and_a_pass_make_of_other_cells(frame: str) -> None:
     """Newton's method to the end, both ways, in place of the linear answer; and the state is left as it was."""
@@ -52,6 +41,8 @@ def test_the_map_is_what_a_solve_and_a_pass_make_of_other_cells(frame: str) -> N
     compared = []
 
     def compare(step: Step) -> None:
+        if step.time != SOLVED:
+            return
         change = np.random.default_rng(2).standard_normal((8, 3, 3))
         change = change + np.swapaxes(change, 1, 2)
         change[:, 0, 1] = change[:, 1, 0] = 0.0  # l_2 = l_3: a turn there is no change of A
@@ -73,7 +64,7 @@ def test_the_map_is_what_a_solve_and_a_pass_make_of_other_cells(frame: str) -> N
         unknown.x.array[:] = before[0]
         compared.append(((passed[0] - passed[1]) / 2e-5, expected))
 
-    for _ in simulation.steps([AtSolved(SOLVED, compare)]):
+    for _ in simulation.steps([AtSolved(compare)]):
         pass
     ((found, expected),) = compared
     assert np.abs(expected).max() > 1.0

@@ -116,15 +116,6 @@ def test_nobody_counts_without_a_sign_but_at_the_end() -> None:
     assert np.isnan(counts[:-1]).all() and counts[-1] == 0
 
 
-def test_a_definite_tangent_is_counted_by_cholmod(monkeypatch: pytest.MonkeyPatch) -> None:
-    """MUMPS, three times as dear, is asked for the others alone."""
-    asked = []
-    count = Inertia._negative_of
-    monkeypatch.setattr(Inertia, "_negative_of", lambda *arguments: asked.append(1) or count(*arguments))
-    assert run(pushed_cube(10.0))[-1].negative_eigenvalues == 0 and not asked
-    assert run(pushed_cube(-30.0))[-1].negative_eigenvalues > 0 and asked
-
-
 def test_a_large_body_is_counted_on_request_only(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -141,29 +132,6 @@ def test_a_large_body_is_counted_on_request_only(
 def test_the_sign_of_the_determinant_tells_at_once(caplog: pytest.LogCaptureFixture) -> None:
     steps = run(pushed_cube(-30.0, **{"time.end": 2.0, "loads.force.ramp": [[0.0, 0.0], [12.0, 4.0]]}))
     assert [step.negative_eigenvalues for step in steps][-1] == 1 and len(warnings(caplog)) == 1
-
-
-def collapsing_tube(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
-    """Suction on a tube of equal cells; nobody looks because it is time to."""
-    scene = read_scene(DEMOS / "artery.toml").with_values({
-        "geometry.length": 1.0, "cells.initial": "isotropic", "loads.elongation.value": 0.0, "time.end": 12.0,
-        "loads.pressure.value": -12.0, "loads.pressure.ramp": [[0.0, 0.0], [12.0, 1.0]], "solver.method": "auto",
-    })  # fmt: skip
-    monkeypatch.setattr(equilibrium_stability, "ITERATIONS_BETWEEN_LOOKS", 10**9)
-    return run(scene, tube(length=1.0, divisions=(8, 3, 1)))
-
-
-@pytest.mark.parametrize(
-    "without", [(equilibrium_stability, "negative_pivots", None), (equilibrium_stability.Signs, "_curvature", np.inf)]
-)
-def test_each_sign_alone_sees_a_pair(without: tuple[Any, str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the tube's modes two come at a time: the determinant does not change its sign."""
-    place, name, value = without
-    monkeypatch.setattr(place, name, lambda *arguments: value)
-    counts = [step.negative_eigenvalues for step in collapsing_tube(monkeypatch)]
-    found = np.flatnonzero(np.nan_to_num(counts) > 0)
-    assert found.size and found[0] < len(counts) - 1  # before the last step
-    assert counts[found[0]] % 2 == 0
 
 
 def test_a_dead_hydrostatic_load_beyond_rivlins(caplog: pytest.LogCaptureFixture) -> None:
@@ -190,17 +158,6 @@ def test_a_start_that_is_indefinite_is_told_apart(
     run(pushed_cube(-20.0, **COLUMN, **{"remodeling.law": "none", "solver.unstable": "stop"}))
     assert not warnings(caplog)
     assert sum("the equilibrium is not lost" in record.getMessage() for record in caplog.records) == 1
-
-
-def test_stop_ends_before_the_first_unstable_step() -> None:
-    with made(pushed_cube(-30.0, **{"solver.unstable": "stop"})) as simulation:
-        done = []
-        with pytest.raises(StepFailure, match="the equilibrium at time 2 is unstable: 1 negative eigenvalue") as caught:
-            for step in simulation.steps():
-                done.append(step.negative_eigenvalues)
-        assert done == [0] and simulation.state.time == 1.0 and simulation.loading.values == {"force": -10.0}
-    refusal = caught.value.refusal
-    assert refusal.kind == "lost stability" and 'solver.unstable = "warn"' in refusal.advice
 
 
 def test_what_was_not_counted_is_an_empty_field(tmp_path: Path) -> None:
