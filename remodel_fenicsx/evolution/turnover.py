@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 LEAST_VOLUME = 0.05  # of that at the start, below which a step is refused: then hardly anything is left
 GONE = Refusal("lost tissue", "take a smaller remodeling.turnover.volume or gain, or higher loads")
 LARGEST_TURNOVER = 0.5  # largest |change of ln rho| in a step: the prototype's; it does not act at rest
-MUCH = 10.0  # factor of content or natural length that is said
+MUCH = 10.0  # factor of the natural length, from which on a way to rest may be given up by its rates
 
 
 def turned_over(tissue: Tissue, state: State) -> Tissue:

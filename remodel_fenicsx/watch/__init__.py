@@ -68,7 +68,6 @@ WATCHERS = {
     "weak-tension": WatcherKind(_WARNINGS + "WeakTension.of"),
     "radial-chains": WatcherKind(_WARNINGS + "RadialChains.of"),
     "fronts": WatcherKind(_WARNINGS + "FrontsInLayers.of"),
-    "much-growth": WatcherKind(_WARNINGS + "MuchGrowth.of"),
     "growth": WatcherKind(_WARNINGS + "GrowthWithoutRest.of"),
 }
 """By name, in the order in which they see a step."""

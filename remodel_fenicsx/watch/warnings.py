@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.evolution.turnover import MUCH, Slowing
+from remodel_fenicsx.evolution.turnover import Slowing
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
-from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import cofactor
 from remodel_fenicsx.state import Numbers, at_points
 from remodel_fenicsx.system import NOTICE
@@ -145,7 +144,6 @@ DRIVEN = 0.9
 # Jumps between linear elements count so many times: at a wall, where strain varies most, an element has neighbours on
 # one side, and half of the jump
 JUMPS = 4.0
-NEWS = 0.1  # relative change of energies from which on the work, an assembly, is asked for again
 # Of the matrix's energy: less of it, lost inside elements, costs no noticeable part of the way. Energies go with
 # squares of displacements; where 5.1 % of the way are missing, 8e-4 was measured
 NOTICEABLE = 1e-4
@@ -176,7 +174,7 @@ class Missing(NamedTuple):
 class LockingWarning(WarnsOnce):
     """Says once that elements hold the body back, as soon as a solved state shows it."""
 
-    name, initial = "locking", {"energy": 0, "vain": 0}
+    name = "locking"
 
     def __init__(self, stepper: Stepper, locks: bool, remedy: str = REMEDY):
         super().__init__(stepper)
@@ -264,19 +262,8 @@ class LockingWarning(WarnsOnce):
 
     def look(self, step: Step) -> str:
         """Whether the body lacks more of its way than is noticed."""
-        energies = self.energies()
-        if not self._are_news(*energies):
-            return ""
-        missing = self._missing(*energies, WARNED_SHARE)
+        missing = self._missing(*self.energies(), WARNED_SHARE)
         return self.in_words(missing) if sum(missing) > WARNED_SHARE else ""
-
-    def _are_news(self, energy: float, *vain: float) -> bool:
-        """Whether energies differ from those of the last look."""
-        known = self._numbers["energy"], self._numbers["vain"]
-        news = any(abs(now - old) > NEWS * old for now, old in zip((energy, sum(vain)), known, strict=True))
-        if news:
-            self._numbers["energy"], self._numbers["vain"] = energy, sum(vain)
-        return news
 
     def in_words(self, missing: Missing) -> str:
         """What holds the body back, by how much, and what to set."""
@@ -496,30 +483,6 @@ class WeakTension(WarnsOnce):
                 f"the loads are weak: a tension of {weakness:.2g} times the largest stress of the body counts by half, "
                 "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains",
             )
-
-
-class MuchGrowth(WarnsOnce):
-    """Says once that content or natural length have changed by much."""
-
-    name, level = "much_growth", NOTICE
-
-    @classmethod
-    def of(cls, scene: Any, stepper: Any) -> MuchGrowth | None:
-        return None if stepper.turnover is None else cls(stepper)
-
-    def look(self, step: Step) -> str:
-        """By how much they have."""
-        turnover = self.stepper.turnover
-        for name in TURNED_OVER:
-            factors = turnover.factors(name)
-            if self.quadrature.maximum(factors) > MUCH:
-                percent = 100 * self.quadrature.maximum(turnover.fastest_changes()) * turnover.settings.time
-                changed, place = name.replace("_", " "), largest_at(self.quadrature, factors)
-                return (
-                    f"{changed} has changed by more than a factor of {MUCH:g} at {place}; content or natural length "
-                    f"now change by up to {percent:.2g} % in remodeling.turnover.time (docs/turnover.md)"
-                )
-        return ""
 
 
 class GrowthWithoutRest(WarnsOnce):

@@ -234,7 +234,6 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
     with caplog.at_level(NOTICE):
         rows, _ = simulated(wall(720.0, 4.0, turnover, COLUMNS))
     assert rows[-1]["outer_radius"] > 5.0
-    assert sum("by more than a factor of 10" in record.message for record in caplog.records) == 1
     (warned,) = (record.message for record in caplog.records if record.levelname == "WARNING")
     assert "has not come to rest" in warned and "without bound" in warned
 
@@ -243,15 +242,13 @@ def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -
 def test_a_growth_that_rests_is_no_instability_however_large(
     end: float | str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A second load makes the content more than ten times as large, and it rests: a notice, and no warning."""
+    """A second load makes the content more than ten times as large, and it rests: no warning."""
     values = wall(2400.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}, COLUMNS)
     values["loads"]["pressure"]["ramp"] += [[800.0, 1.0], [824.0, 1.6]]
     values["time"] = {"end": end, "step": 4.0, "tolerance": 3.0}
     with caplog.at_level(NOTICE):
         _, known = simulated(values)
     assert known["content"].max() > 10.0
-    said = [record for record in caplog.records if "changed by more than a factor of 10" in record.message]
-    assert [record.levelno for record in said] == [NOTICE] and "content has changed" in said[0].message
     assert not [record for record in caplog.records if record.levelname == "WARNING" and "rest" in record.message]
 
 
@@ -366,8 +363,5 @@ def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instabilit
     """A deposition stretch that the load never reaches: the natural length falls too, and the rates with it."""
     values = cube(200.0, 2.0, {"time": 10.0, "deposition_stretch": 1.59})
     values["loads"]["force"]["value"] = 0.3
-    with caplog.at_level(NOTICE):
-        assert last_row(values)["content"] < 0.1
-    (said,) = (record for record in caplog.records if "factor of 10" in record.message)
-    assert said.levelno == NOTICE and "content has changed" in said.message
+    assert last_row(values)["content"] < 0.1
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
