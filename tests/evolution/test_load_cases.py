@@ -162,6 +162,15 @@ def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
         assert chosen[-1][name] == pytest.approx(short[-1][name], rel=5e-3, abs=0.5 if "angle" in name else 0.0), name
 
 
+def test_which_case_is_first_changes_no_step() -> None:
+    """The estimated error is that of the case that is worst."""
+    tables = {"time": {"end": 40.0, "step": 2.0, "tolerance": 0.5}, "remodeling": {"coupling": "staggered"}}
+    first, second = pulse(0.6)
+    one, two = rows_of(artery([first, second], **tables)), rows_of(artery([second, first], **tables))
+    for name in ("time", "time_error"):
+        assert [row[name] for row in two] == pytest.approx([row[name] for row in one], rel=1e-6, abs=1e-9), name
+
+
 def test_a_case_whose_loads_change_is_not_held() -> None:
     """The first case has no load at all."""
     cases = [{"weight": 0.5, "loads": {"pressure": 0.0, "elongation": 0.0}}, {"weight": 0.5}]

@@ -263,6 +263,21 @@ def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], t
     assert goes_on(values, tmp_path, 40.0).history["content"][-1] > 1.1
 
 
+@pytest.mark.parametrize(("gain", "rests"), [(0.5, False), (0.2, False), (1.0, True)])
+def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
+    gain: float, rests: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
+    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}
+    simulated(wall(480.0, 4.0, turnover, COLUMNS))
+    found = [record.message for record in caplog.records if "has not come to rest" in record.message]
+    assert len(found) == (0 if rests else 1)
+    assert rests or ("fallen no faster than 1/t" in found[0] and "mechanobiological instability" in found[0])
+    caplog.clear()
+    simulated(wall(240.0, 4.0, turnover, COLUMNS))
+    assert "come to rest" not in caplog.text
+
+
 def test_the_figures_show_what_the_page_says() -> None:
     """docs/figures: both walls end at the independent solver's angles, with stress that varies less; and the map."""
     time, wall_of, of_map = (
