@@ -133,7 +133,7 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
     if missing:
         raise RecordingError(f"{recording.path}: output.fields was without {', '.join(missing)}")
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
-    if not recording.scene.natural.is_of_the_mesh and NATURAL_GRADIENT not in fields:
+    if NATURAL_GRADIENT not in {*fields, *recording.scene.lacking_fields}:
         log.warning("%s: output.fields was without %s: the prestretch is not written", recording.path, NATURAL_GRADIENT)
     others = {name: fields[name] for name in (NATURAL_GRADIENT, *TURNED_OVER) if name in fields}
     mesh = recording.points, recording.elements

@@ -31,7 +31,7 @@ from remodel_fenicsx.system.files import ClosedAtEnd
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains", NATURAL_GRADIENT))
+OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
 
 
 def field_names(
@@ -106,6 +106,9 @@ class ElementFields:
             REGION: lambda: state.loading.domain.element_region.astype(np.float64),
         }
         makers |= {name: partial(mean_axis, i) for i, name in enumerate(AXIS_FIELDS)}
+        G = state.natural_gradient
+        if G is not None:
+            makers[NATURAL_GRADIENT] = lambda: mean(G).reshape(-1, 9)
         turned = {name: getattr(self.tissue, name) for name in TURNED_OVER}
         makers |= {name: partial(mean_number, number) for name, number in turned.items() if number is not None}
         return {name: makers[name]() for name in OF_ELEMENTS if name in self.names and name in makers}
@@ -190,9 +193,6 @@ class Fields(Watcher, ClosedAtEnd):
         self._displacement = NodalGather(domain, self.state)
         quadrature, local_axes = self.state.cells.quadrature, self.state.cells.local_axes
         constant = local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
-        G = self.state.natural_gradient
-        if NATURAL_GRADIENT in self.names and G is not None:
-            constant[NATURAL_GRADIENT] = quadrature.element_mean(G).reshape(-1, 9)
         self._constant = {
             name: domain.gather_elements(values) for name, values in constant.items() if name in self.names
         }

@@ -21,6 +21,7 @@ from remodel_fenicsx.body.shape import Column, FromFile, columns_of, columns_on_
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.model.axes import NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER
 from remodel_fenicsx.model.laws import LAWS
@@ -417,6 +418,8 @@ class Scene(Table):
         found = {} if self.regions else {REGION: "the scene has no regions"}
         same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
         found |= dict.fromkeys(NO_PRESTRETCH, same) if self.natural.is_of_the_mesh else {}
+        if self.remodeling.turnover.grows:
+            found.pop(NATURAL_GRADIENT, None)
         stays = "it changes only with remodeling.turnover, which is not set"
         return found | ({} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays))
 

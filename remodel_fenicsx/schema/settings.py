@@ -409,6 +409,7 @@ class Natural(Table):
                 f"{key}.opening_angle or layers are there too; one of them is enough": self.opening_angle
                 or self.layers,
                 "must be false unless mesh.formulation is 'displacement'": scene.formulation != "displacement",
+                "must be false unless remodeling.turnover has volume = 0": scene.remodeling.turnover.grows,
             }
             refuse(f"{key}.fibres", True, reasons)
             return

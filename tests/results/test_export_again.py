@@ -20,7 +20,7 @@ LAYERS = [
     {"from": 0.0, "to": 0.5, "prestretch": {"axial": 1.05}},
     {"from": 0.5, "prestretch": {"circumferential": 1.1}},
 ]
-TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0}
+TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0, "volume": 0.0}
 COLUMNS = ("lumen_volume", "fibre_angle_inner", "content", "natural_length", "stored_energy")
 
 
@@ -87,6 +87,20 @@ def test_the_arrays_are_those_of_the_wall(first: tuple[Path, Path], tmp_path: Pa
         rows = [[float(word) for word in (entry.text or "").split(",")] for entry in data]
         assert data.get("data_type") == kind
         np.testing.assert_allclose(np.reshape(rows, (len(G), -1)), written.cell_data[name][0].reshape(len(G), -1))
+
+
+def test_what_has_grown_is_written_as_it_is(first: tuple[Path, Path], tmp_path: Path) -> None:
+    """G of each time: its determinant falls as the wall grows. No run begins with that."""
+    mesh, _ = first
+    grows = {"law": "tensor", "coupling": "staggered", "turnover": {**TURNOVER, "volume": 0.5, "time": 2.0}}
+    started = run(scene(mesh, 3.0, remodeling=grows, natural={}), tmp_path / "run", SELF)
+    ends = [meshio.read(export(started, "vtu", tmp_path / f"{time:g}.vtu", time)).cell_data for time in (0.0, 3.0)]
+    volumes = [1 / np.linalg.det(data["natural_gradient"][0].reshape(-1, 3, 3)) for data in ends]
+    np.testing.assert_allclose(volumes[0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(volumes[1], 1 + 0.5 * (ends[1]["content"][0] - 1), rtol=1e-2)
+    assert np.abs(volumes[1] - 1).max() > 0.02
+    with pytest.raises(SceneError, match="natural.fibres = true: must be false unless remodeling.turnover has volume"):
+        again(mesh, tmp_path / "3.vtu", 3.0, remodeling=grows)
 
 
 def test_what_has_no_place_is_said(first: tuple[Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
