@@ -11,8 +11,8 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, SceneError, read_scene
-from remodel_fenicsx.extend import SHAPES
+from remodel_fenicsx import Recording, Scene, SceneError, cli, read_scene
+from remodel_fenicsx.extend import MATRICES, SHAPES
 from remodel_fenicsx.parts import Tube
 from tests.runs import rows_of, simulated
 
@@ -64,3 +64,32 @@ def test_torsion_stands_beside_elongation_and_turns_the_collagen(scene: Any) -> 
     assert rows[-1]["shear_stress"] > 0.5 and rows[-1]["fibre_angle_inner"] < 44.0
     with pytest.raises(SceneError, match="model.kinematics = 'radial': loads.torsion would have to be applied"):
         turned.with_values({"model.kinematics": "radial"})
+
+
+FIBRES = {
+    "preset": "consistent", "geometry.outer_radius": 1.3, "cells.initial": "isotropic", "model.kinematics": "radial",
+    "mesh.degree": 2, "mesh.refinement": 2, "material.matrix": "holzapfel-gasser-ogden", "material.lame_mu": 3.0,
+    "material.lame_lambda": 3e4, "material.fibre_stiffness": 5.0, "material.fibre_exponent": 2.0,
+    "material.fibre_dispersion": 0.1, "material.fibre_angle": 40.0, "time.step": 1.0, **ELASTIC, "time.end": 3.0,
+}  # fmt: skip
+LOADS = ["loads.pressure={value=3.0,ramp=[[0.0,0.0],[3.0,1.0]]}", "loads.elongation.ramp=[[0.0,0.0],[1.0,1.0]]"]
+
+
+@pytest.mark.parametrize("regions", [{}, {"regions": {"media": {"outer_radius": 1.1}, "adventitia": {}}}])
+def test_fibres_that_stay_bear_a_tube_as_pymecht_says(regions: Any, tmp_path: Path) -> None:
+    """pymecht 1.1.3, `goh` and `nh`, a tube of 1 to 1.3 that is 10 % longer; two layers of one tissue are none."""
+    script, demo = FOLDER / "holzapfel_gasser_ogden.py", FOLDER.parent / "artery.toml"
+    words = [f"{key}={toml(value)}" for key, value in (FIBRES | regions).items()]
+    asked = [part for word in (*words, *LOADS) for part in ("--set", word)]
+    with patch.dict(MATRICES):
+        folder = str(tmp_path / "run")
+        assert cli.main(["run", str(demo), "--with", str(script), *asked, "-q", "--no-report", "-o", folder]) == 0
+        radii = Recording(folder).history["inner_radius"]
+    np.testing.assert_allclose(radii[1:], [1.23184606, 1.42517281, 1.52797886], rtol=1e-5)
+
+
+def toml(value: Any) -> str:
+    """An inline value."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {toml(part)}" for key, part in value.items()) + "}"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
