@@ -1,0 +1,369 @@
+"""docs/validation.md: the program against other codes and closed forms, and the model against measurements.
+
+The numbers of others are typed here with their sources; those of the model are from runs and stay in docs/figures. The
+page is validation.template.md with tables that are made of these files alone.
+"""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.optimize import brentq
+from scipy.special import ive
+
+from docs.making.pages import DOCS, FIGURES, Columns, by_column, drawn, filled, markdown, rows_of
+from remodel_fenicsx import RemodelError, extend, preset_scene, read_scene
+from remodel_fenicsx.studies.page import COLOURS, Page, read_table
+from remodel_fenicsx.system.children import cores
+
+from tests.body.test_peers import passive
+from tests.runs import last_row
+from tests.runs import rows_of as run
+from tests.values import isotropic, ramped
+
+PAGE = DOCS / "validation.md"
+DEMOS = DOCS.parent / "demos"
+Row = dict[str, Any]
+BANDS = ("fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")
+FORCE = "reduced_axial_force"
+CAROTID = {"mean": 0.7, "b": (3.4, 1.9)}  # Fischer et al. 2024, abstract: von Mises, mean +- standard deviation
+SHEET = {"before": (25.3, 37.4), "after": (7.1, 18.5)}  # Nguyen et al. 2009, abstract: mean and dispersion, degrees
+DAYS = 5.0
+CAPTION = (
+    "Fibre angles of walls against the human common carotid artery",
+    "Angle of the mean structure tensor of the inner, middle and outer eighth of the wall, in equilibrium. Grey: "
+    "Fischer et al. 2024, mean concentration and one standard deviation to each side.",
+)
+WALLS = {
+    "1 to 1.3": (1.3, 1.2, 0.0),
+    "1 to 1.3, opening angle 90": (1.3, 1.2, 90.0),
+    "1 to 3 (the paper's)": (3.0, 4.8, 0.0),
+    "1 to 3, opening angle 120": (3.0, 4.8, 120.0),
+}
+"""Label -> outer radius, pressure, opening angle."""
+TWO_LAYERS = "1 to 1.3, media and adventitia"
+LAYERS = {
+    "media": {"outer_radius": 1.2, "material": {"lame_mu": 4.65}},
+    "adventitia": {"material": {"lame_mu": 1.55, "chain_density": 4e21}},
+}
+MAP = (0.6, 1.2, 1.8, 2.4), (0.0, 0.1, 0.2, 0.3)
+"""Pressures and elongations of the thin wall."""
+LENGTHS = (0.0, 0.05, 0.1, 0.2, 0.3)
+"""Elongations of the thin wall."""
+STIFFER = 2.0
+"""Factor of all moduli of the thin wall, 10 % longer, in one more run."""
+MODULI = ("lame_lambda", "lame_mu", "chain_density")
+DRIVERS, EXPONENTS, SHARES = ("cauchy", "pk2", "finger"), (2.0, 4.0, 6.0, 10.0), (0.0, 0.5)
+PYMECHT, FELUPE = "pymecht 1.1.3", "FElupe 11.3"
+GOH = {0.5: 1.11531899, 1.0: 1.19358498, 1.5: 1.23428423}
+"""Pressure -> inner radius in pymecht: walls of 1 to 1.3, 10 % longer, mu 1, k1 5, k2 15, kappa 0.1, angles 0.7 rad."""
+SHEETS = {
+    ("isotropic", 8, 8): (0.5175315317, 0.5175315317), ("isotropic", 8, 4): (0.7212825113, 0.0580510195),
+    ("in plane", 8, 8): (0.4756195849, 0.1821463399), ("in plane", 8, 4): (0.6439287993, -0.0381871828),
+}  # fmt: skip
+"""Cells and forces on a cube of side 1 -> its two elongations in FElupe, lambda/mu 1e4."""
+
+
+# ---------------------------------------------------------------- what must agree
+def agreements() -> Iterator[Row]:
+    """Against others and closed forms: a row for each number."""
+
+    def row(case: str, source: str, theirs: float, ours: float, tolerance: float, relative: bool = True) -> Row:
+        difference = abs(ours - theirs) / (abs(theirs) if relative else 1.0)
+        return {"case": case, "source": source, "theirs": theirs, "ours": ours, "difference": difference,
+                "tolerance": tolerance}  # fmt: skip
+
+    columns = {"output.columns": ["inner_radius", "outer_radius", "axial_force"]}
+    rows = passive(**columns)
+    for found, radius in zip(rows, (1.16158, 1.49517, 1.96467, 2.25815), strict=True):
+        yield row(f"V1 tube, p = {found['pressure']:.1f}, radius", PYMECHT, radius, found["inner_radius"], 1e-4)
+    yield row("V1 tube, axial force", PYMECHT, 62.867, rows[-1]["axial_force"], 5e-4)
+    for opening, radius in ((60, 2.43220), (120, 2.54422), (160, 2.57366)):
+        found = passive(**columns, **{"natural.opening_angle": opening})[-1]
+        yield row(f"V1 tube, opening angle {opening}, radius", PYMECHT, radius, found["inner_radius"], 1e-4)
+    for (cells, x, y), elongations in SHEETS.items():
+        found = last_row({
+            "geometry": {"shape": "sheet", "length_x": 1.0, "length_y": 1.0, "thickness": 1.0},
+            "material": {"lame_lambda": 31030.0, "lame_mu": 3.103, "repulsion": "log"},
+            "cells": {"initial": "isotropic" if cells == "isotropic" else [0.6, 0.8, 0.0]},
+            "remodeling": {"law": "none"}, "loads": ramped(4.0, force_x=float(x), force_y=float(y)),
+            "time": {"end": 4.0}, "solver": {"relative_tolerance": 1e-12},
+        })  # fmt: skip
+        for axis, theirs in zip("xy", elongations, strict=True):
+            label = f"V2 sheet, {cells}, forces {x} and {y}, stretch {axis}"
+            yield row(label, FELUPE, 1 + theirs, 1 + found[f"elongation_{axis}"], 1e-6)
+    found = passive(**columns, **{"cells.initial": [0.8, 0.6, 0.0], "loads.pressure.value": 2.4,
+                                  "material.lame_lambda": 27.293, "mesh.formulation": "displacement"})[-1]  # fmt: skip
+    for name, theirs in (("inner_radius", 1.313393), ("outer_radius", 3.012636), ("axial_force", 34.79425)):
+        yield row(f"V2 tube, {name.replace('_', ' ')}", FELUPE, theirs, found[name], 1e-6)
+    for exponent, theirs in ((1.0, 35.26), (2.0, 26.57), (3.5, 16.56), (4.0, 14.04)):
+        found = last_row(isotropic(
+            "consistent", geometry={"shape": "tube", "inner_radius": 100.0, "outer_radius": 100.5, "length": 10.0},
+            supports={"ends": "closed"}, remodeling={"exponent": exponent, "kappa": 0.1},
+            loads=ramped(10.0, pressure=0.005, elongation=0.0), time={"end": 300.0, "step": 5.0},
+        ))  # fmt: skip
+        label = f"V5 closed membrane, exponent {exponent:g}, degrees"
+        yield row(label, "tan a = 2^(-n/2)", theirs, found["fibre_angle_middle"], 0.5, False)
+    runpy.run_path(str(DEMOS / "extensions" / "gasser_ogden_holzapfel.py"))
+    for pressure, theirs in GOH.items():
+        found = passive(**columns, **{
+            "geometry.outer_radius": 1.3, "material.matrix": "gasser-ogden-holzapfel", "material.chain_density": 0.0,
+            "material.lame_mu": 1.0, "material.lame_lambda": 1e4, "material.family_angle": float(np.degrees(0.7)),
+            "loads.pressure.value": pressure,
+        })[-1]  # fmt: skip
+        yield row(
+            f"V9 tube of Gasser, Ogden and Holzapfel, p = {pressure}", PYMECHT, theirs, found["inner_radius"], 1e-4
+        )
+    for forces in ((0.4, 0.2), (0.4, 0.4), (0.4, 0.1), (0.1, 0.3)):
+        changes = {f"loads.force_{axis}.value": f"{force} N" for axis, force in zip("xy", forces, strict=True)}
+        found = last_row(read_scene(DEMOS / "sheet.toml").with_values({**changes, "remodeling.half_life": 2.0}))
+        theirs = np.degrees(np.arctan2(found["cauchy_stress_y"], found["cauchy_stress_x"]))
+        label = "V10 sheet at rest, forces {} and {} N, degrees".format(*forces)
+        yield row(label, "tan a = sigma_y / sigma_x", theirs, found["fibre_angle"], 0.05, False)
+    force = 1.381e-23 * 310.0 / 14.5e-9 * 0.5 * extend.CHAINS["wormlike"].stiffness(0.5, 1.0)
+    yield row("Wormlike chain, 14.5 nm, half extended, pN", "Marko, Siggia 1995", 0.369, 1e12 * force, 1e-3)
+
+
+# ---------------------------------------------------------------- against measurements
+def von_mises_angle(mean: float, concentration: float) -> float:
+    """Angle of the second moment of the density exp(b cos 2(t - mean)), in degrees: cos 2a = I1(b)/I0(b) cos 2 mean."""
+    cosine = ive(1, concentration) / ive(0, concentration) * np.cos(2 * np.radians(mean))
+    return float(np.degrees(np.arccos(cosine)) / 2)
+
+
+def normal_angle(mean: float, deviation: float) -> float:
+    """The same of a wrapped normal distribution: cos 2a = exp(-2 s^2) cos 2 mean, in degrees."""
+    cosine = np.exp(-2 * np.radians(deviation) ** 2) * np.cos(2 * np.radians(mean))
+    return float(np.degrees(np.arccos(cosine)) / 2)
+
+
+def wall(
+    outer_radius: float, pressure: float, opening_angle: float, elongation: float = 0.1, stiffer: float = 1.0
+) -> dict[str, float]:
+    """Bands of the angle of a tube that has come to rest, and its axial force without that of its closed ends."""
+    tissue = preset_scene("consistent", "tube").material
+    found = last_row({
+        "preset": "consistent", "mesh": {"refinement": 4, "degree": 2}, "model": {"kinematics": "radial"},
+        "geometry": {"shape": "tube", "outer_radius": outer_radius, "length": 1.0},  # short: it does not buckle
+        "cells": {"initial": "isotropic"}, "natural": {"opening_angle": opening_angle},
+        "material": {name: stiffer * getattr(tissue, name) for name in MODULI},
+        "loads": {"pressure": {"value": pressure}, "elongation": {"value": elongation}},
+        "time": {"end": "equilibrium"}, "output": {"fields": False, "columns": [*BANDS, FORCE]},
+    })  # fmt: skip
+    return {name: found[name] for name in (*BANDS, FORCE)}
+
+
+def sheet(kappa: float) -> float:
+    """Angle of a sheet's fibres to the load after the days of the test, from that before it, in degrees."""
+    before = np.radians(normal_angle(*SHEET["before"]))
+    found = last_row({
+        "geometry": {"shape": "cube"}, "model": {"kinematics": "point"},
+        "cells": {"initial": [float(np.sin(before)), 0.0, float(np.cos(before))]},
+        "loads": {"force": {"value": 1.0, "ramp": [[0.0, 1.0]]}}, "remodeling": {"law": "tensor", "kappa": kappa},
+        "time": {"step": DAYS / 20, "end": DAYS}, "output": {"fields": False},
+    })  # fmt: skip
+    return float(found["mean_fibre_angle"])
+
+
+def walls() -> dict[str, Any]:
+    """Columns of the walls at rest, and of the sheet."""
+    rows = {label: wall(*numbers) for label, numbers in WALLS.items()}
+    thin = WALLS["1 to 1.3"]
+    rows |= {f"{100 * elongation:g} % longer": wall(*thin, elongation) for elongation in LENGTHS}
+    rows["10 % longer, all moduli doubled"] = wall(*thin, stiffer=STIFFER)
+    before, after = (np.radians(normal_angle(*SHEET[name])) for name in ("before", "after"))
+    kappa = float(np.log(np.sin(before) ** 2 / np.sin(after) ** 2) / DAYS)
+    table: dict[str, Any] = {"case": [*rows, "sheet"]}
+    table |= {name: [*(row[name] for row in rows.values()), sheet(kappa)] for name in BANDS}
+    table[FORCE] = [*(row[FORCE] for row in rows.values()), 0.0]
+    return table | {"kappa": [0.0] * len(rows) + [kappa]}
+
+
+def at_rest(label: str, driver: str, exponent: float, elongation: float, pulse: bool = False) -> list[Row]:
+    """Rows of a wall that comes to rest; with a pulse the pressure then goes to 3/4 and 5/4 within no time."""
+    outer, pressure, opening = WALLS[WALL_OF.get(label, label)]
+    times = [[0.0, 0.0], [10.0, 1.0], [150.0, 1.0]] + ([[150.01, 0.75], [150.02, 1.25]] if pulse else [])
+    return run({
+        "preset": "consistent", "mesh": {"refinement": 4, "degree": 2}, "model": {"kinematics": "radial"},
+        "geometry": {"shape": "tube", "outer_radius": outer, "length": 1.0},
+        "regions": LAYERS if label == TWO_LAYERS else {},
+        "cells": {"initial": "isotropic"}, "natural": {"opening_angle": opening},
+        "remodeling": {"exponent": exponent, "driver": driver, "kappa": 0.2},
+        "loads": ramped(10.0, elongation=elongation) | {"pressure": {"value": pressure, "ramp": times}},
+        "time": {"end": times[-1][0], "tolerance": 2.0, "step": 5.0},
+        "output": {"fields": False, "columns": ["inner_radius", *BANDS, FORCE]},
+    })  # fmt: skip
+
+
+WALL_OF = {TWO_LAYERS: "1 to 1.3"}
+PULLED = ("1 to 1.3", "1 to 1.3, opening angle 90", TWO_LAYERS, "1 to 3, opening angle 120")
+
+
+def share_of(row: Row) -> float:
+    """The reduced axial force over that of the pressure on the lumen."""
+    return float(row[FORCE] / (np.pi * row["pressure"] * row["inner_radius"] ** 2))
+
+
+def pulled(case: tuple[str, str, float, float]) -> Row:
+    """The wall at the length at which its reduced axial force has this share: angles, and what a pulse does to it."""
+    label, driver, exponent, share = case
+    found: Row = {"wall": label, "driver": driver, "exponent": exponent, "share": share}
+    nothing = dict.fromkeys(("elongation", *BANDS, "pulse"), np.nan)
+    try:
+        low = -0.1
+
+        def excess(elongation: float) -> float:
+            return share_of(at_rest(label, driver, exponent, elongation)[-1]) - share
+
+        while excess(low + 0.1) < 0:
+            low += 0.1
+            if low > 0.55:
+                return found | nothing
+        length = brentq(excess, low, low + 0.1, xtol=1e-4)
+        rows = at_rest(label, driver, exponent, length, pulse=True)
+    except (RemodelError, ValueError):
+        return found | nothing
+    rest, less = (next(row for row in rows if row["time"] >= time - 1e-9) for time in (150.0, 150.01))
+    return found | {
+        "elongation": length,
+        **{name: rest[name] for name in BANDS},
+        "pulse": rows[-1][FORCE] / less[FORCE],
+    }
+
+
+def mapped(loads: tuple[float, float]) -> Row:
+    """The thin wall at rest under another pressure and length."""
+    pressure, elongation = loads
+    try:
+        found = wall(1.3, pressure, 0.0, elongation)
+    except RemodelError:
+        found = dict.fromkeys((*BANDS, FORCE), np.nan)
+    return {"pressure": pressure, "elongation": elongation} | found
+
+
+def growth(volume: float) -> Row:
+    """How much the wall of demos/hypertension.toml changes from one rest to the next, under half more pressure."""
+    scene = read_scene(DEMOS / "hypertension.toml").with_values(
+        {"remodeling.turnover.volume": volume, "time.end": 4000.0, "output.columns": [*GROWN]}
+    )
+    rows = run(scene)
+    before, after = (next(row for row in rows if row["time"] >= time - 1e-9) for time in (1600.0, 4000.0))
+    return {"volume": volume} | {name: after[name] / before[name] for name in GROWN}
+
+
+GROWN = ("wall_thickness", "inner_radius", "mean_hoop_stress")
+
+
+def runs(page: Page) -> None:
+    """Make the tables."""
+    page.save_table(by_column(agreements()), ["the program against other codes and closed forms"], "agreed")
+    page.save_table(walls(), list(CAPTION))
+    page.save_table(by_column(map(growth, (0.0, 0.3, 0.5))), ["after over before a pressure x 1.5"], "growth")
+    page.save_table(by_column(map(mapped, product(*MAP))), ["the thin wall at rest over pressure and length"], "map")
+    cases = [*product(PULLED, DRIVERS, EXPONENTS, SHARES)]
+    with ProcessPoolExecutor(cores(), get_context("spawn")) as pool:
+        page.save_table(by_column(pool.map(pulled, cases)), ["walls that pull along their axis"], "pulled")
+
+
+# ---------------------------------------------------------------- the page
+def measured() -> tuple[float, float, float]:
+    """The angle of the carotid artery, and one standard deviation of its concentration to each side."""
+    mean, spread = CAROTID["b"]
+    middle, narrow, wide = (von_mises_angle(CAROTID["mean"], b) for b in (mean, mean + spread, mean - spread))
+    return middle, narrow, wide
+
+
+def of_wall(row: Row) -> float:
+    """The angle of the second moment of the three bands together, in degrees."""
+    return float(np.degrees(np.arcsin(np.sqrt(np.mean([np.sin(np.radians(row[name])) ** 2 for name in BANDS])))))
+
+
+def fitted(rows: list[Row], angle: float) -> str:
+    """The least exponent at which the wall has this angle: ln tan goes with it, exactly in a thin wall."""
+    known = [(row["exponent"], np.log(np.tan(np.radians(of_wall(row))))) for row in rows if np.isfinite(row[BANDS[0]])]
+    asked = np.log(np.tan(np.radians(angle)))
+    for (n, value), (next_n, next_value) in zip(known, known[1:], strict=False):
+        if (value - asked) * (next_value - asked) <= 0:
+            return f"{n + (next_n - n) * (asked - value) / (next_value - value):.1f}"
+    return "none"
+
+
+def tables() -> dict[str, str]:
+    """What the template names, from the kept tables alone."""
+    found = read_table(FIGURES / "validation.csv")
+    parts = ("agreed", "pulled", "growth", "map")
+    agreed, pulling, grown, maps = (rows_of(FIGURES / f"validation-{part}.csv") for part in parts)
+    over = [f"{row[BANDS[1]]:.0f} ({row[FORCE]:.1f})" if np.isfinite(row[FORCE]) else "-" for row in maps]
+    rows = {str(case): [f"{found[name][i]:.1f}" for name in BANDS] for i, case in enumerate(found["case"])}
+    loads = ([case, *rows[case], f"{force:.2f}"] for case, force in zip(rows, found[FORCE], strict=True)
+             if case not in WALLS and case != "sheet")  # fmt: skip
+    before, after = (normal_angle(*SHEET[name]) for name in ("before", "after"))
+    of_sheet = [
+        ["measured: mean, dispersion", *("{}, {}".format(*SHEET[name]) for name in ("before", "after"))],
+        ["measured: angle of the second moment", f"{before:.1f}", f"{after:.1f}"],
+        [f"model, kappa = {found['kappa'][-1]:.3f} per day", f"{before:.1f}", rows["sheet"][0]],
+    ]
+    middle, narrow, wide = measured()
+    fits = []
+    for label, driver, share in product(PULLED, DRIVERS, SHARES):
+        some = [row for row in pulling if (row["wall"], row["driver"], row["share"]) == (label, driver, share)]
+        angles = ("/".join("-" if np.isnan(row[name]) else f"{row[name]:.0f}" for name in BANDS) for row in some)
+        fits.append([label, driver, f"{share:g}", *angles, fitted(some, middle)])
+    pulses = [[row["wall"], row["driver"], f"{row['elongation']:.2f}", f"{row['pulse']:.2f}"] for row in pulling
+              if row["share"] == SHARES[-1] and row["exponent"] == 2 and np.isfinite(row["pulse"])]  # fmt: skip
+    places = ["inside", "half-way", "outside"]
+    return {
+        "agreed": markdown(["case", "source", "theirs", "here", "difference", "tolerance"], (
+            [row["case"], row["source"], f"{row['theirs']:.6g}", f"{row['ours']:.6g}", f"{row['difference']:.0e}",
+             f"{row['tolerance']:g}"] for row in agreed)),
+        "measured_middle": f"{middle:.1f}",
+        "closed": f"{2 * np.log(np.tan(np.radians(middle))) / np.log(0.5):.1f}",
+        "closed_pulled": f"{2 * np.log(np.tan(np.radians(middle))) / np.log(0.75):.1f}",
+        "measured": f"{middle:.1f} degrees, and {narrow:.1f} to {wide:.1f} for one standard deviation of b",
+        "walls": markdown(["wall, 10 % longer, in equilibrium", *places], ([case, *rows[case]] for case in WALLS)),
+        "loads": markdown(["the thin wall", *places, "axial force less p pi r_i^2"], loads),
+        "map": markdown(["pressure", *(f"{100 * length:g} % longer" for length in MAP[1])], (
+            [f"{pressure:g}", *over[len(MAP[1]) * k : len(MAP[1]) * (k + 1)]] for k, pressure in enumerate(MAP[0]))),
+        "sheet": markdown(["", "before", "after 5 days"], of_sheet),
+        "growth": markdown(["volume", "thickness", "inner radius", "hoop stress, mean"], (
+            [f"{row['volume']:g}", *(f"{row[name]:.2f}" for name in GROWN)] for row in grown)),
+        "fits": markdown(["wall", "driver", "force", *(f"n = {n:g}" for n in EXPONENTS),
+                          f"n for {middle:.1f}"], fits),
+        "pulses": markdown(["wall", "driver", "elongation", "force at 5/4 p over that at 3/4 p"], pulses),
+    }  # fmt: skip
+
+
+def page_text() -> str:
+    """The template with its tables."""
+    return filled(DOCS / "validation.template.md", tables())
+
+
+def draw(found: Columns) -> Figure:
+    """Bands of the four walls over the measured range."""
+    figure = Figure(figsize=(5.2, 3.2), layout="constrained")
+    axes = figure.subplots()
+    middle, narrow, wide = measured()
+    axes.axhspan(narrow, wide, color="0.85", label="carotid arteries, measured")
+    axes.axhline(middle, color="0.6")
+    for number, label in enumerate(WALLS):
+        style = {"color": COLOURS[number // 2], "linestyle": "-" if number % 2 else "--", "marker": "o"}
+        axes.plot(["inside", "half-way", "outside"], [found[name][number] for name in BANDS], label=label, **style)
+    axes.set(ylabel="angle to the circumference, degrees", ylim=(0, 90))
+    axes.legend(fontsize=7)
+    return figure
+
+
+def make(keep: bool) -> None:
+    """Runs, tables, picture and page."""
+    page = Page(FIGURES, "validation", *CAPTION)
+    if not keep:
+        runs(page)
+    drawn(page, draw, read_table(FIGURES / "validation.csv"))
+    PAGE.write_text(page_text(), encoding="utf-8")
