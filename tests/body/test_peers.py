@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from remodel_fenicsx import preset_scene
-from remodel_fenicsx.extend import MATRICES
 from tests.runs import rows_of
 
 PRESSURES = (1.2, 2.4, 3.6, 4.8)
@@ -44,16 +40,3 @@ def test_so_is_one_that_was_closed_from_a_sector(angle: float, radius: float, fo
     row = passive(**{**FORCES, "natural.opening_angle": angle})[-1]
     assert row["inner_radius"] == pytest.approx(radius, rel=1e-4)
     assert force is None or row["axial_force"] == pytest.approx(force, rel=5e-4)
-
-
-def test_so_is_one_of_gasser_ogden_and_holzapfel() -> None:
-    """demos/extensions has the matrix; walls of 1 to 1.3, families at 0.7 rad, k1 = 5, k2 = 15, kappa = 0.1."""
-    changes = {
-        "geometry.outer_radius": 1.3, "material.matrix": "gasser-ogden-holzapfel", "material.chain_density": 0.0,
-        "material.lame_mu": 1.0, "material.lame_lambda": 1e4, "material.family_angle": np.degrees(0.7),
-        "loads.pressure.value": 1.5,
-    }  # fmt: skip
-    with patch.dict(MATRICES):
-        runpy.run_path(str(Path(__file__).parents[2] / "demos" / "extensions" / "gasser_ogden_holzapfel.py"))
-        rows = passive(**FORCES, **changes)
-    assert rows[-1]["inner_radius"] == pytest.approx(1.23428423, rel=1e-4)
