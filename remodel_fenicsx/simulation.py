@@ -23,12 +23,12 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import MATRICES, TURNED_OVER, Tissue, mixed
-from remodel_fenicsx.model.axes import NATURAL_GRADIENT, LocalAxes
+from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
-from remodel_fenicsx.schema.settings import Cells, Properties, missing_for_steps_of_cells
+from remodel_fenicsx.schema.settings import Cells, Properties, Turnover, missing_for_steps_of_cells
 from remodel_fenicsx.state import Snapshot, State, UnitCells, by_region
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
@@ -41,7 +41,7 @@ TIME_ERROR = "time_error"  # the column
 Fibres = Mapping[str, Mapping[str, Any]]  # measured: by region and name, a row for each element of the mesh
 NO_FIBRES: Fibres = {}
 # what files of fibres may have beside the fibres, as it is at the start of a run
-UNCHANGED: Mapping[str, Any] = {NATURAL_GRADIENT: np.eye(3), "content": 1.0, "natural_length": 1.0}
+UNCHANGED: Mapping[str, Any] = {NATURAL_GRADIENT: np.eye(3), "content": 1.0, "natural_length": 1.0, GROWTH: 1.0}
 NEVER_LOCKED = 1e12  # link lengths: contour length of chains that are not there; infinity times zero is no number
 BEYOND = 0.5
 """Widths of the innermost layer: points that lie so far inside of a thin wall have rounding for stretches, for
@@ -188,6 +188,8 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
         settings = settings.model_copy(update={"coupling": "relaxed"})
     first, *more = (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, settings, solver, first, coupling, kappa)
+    if settings.turnover.grows:
+        stepper.remodeling.turnover.begin_with(in_files(fibres, GROWTH, state.cells.quadrature, domain))
     if others:
         given = enumerate(zip(others, more, strict=True), start=2)
         cases = [OtherCase(number, *part, stepper, solver, kappa) for number, part in given]
@@ -331,7 +333,9 @@ def natural_gradient(
 
     natural, shape, found = scene.natural, scene.geometry, None
     if natural.fibres:
-        return in_files(fibres, NATURAL_GRADIENT, quadrature, domain), None
+        present, ratio = (in_files(fibres, name, quadrature, domain) for name in (NATURAL_GRADIENT, GROWTH))
+        across = np.einsum("...j,...k->...jk", *(2 * [local_axes.axes[..., 2, :]]))
+        return present @ (np.eye(3) + (ratio - 1.0)[..., None, None] * across), None  # G_0 of `evolution.turnover`
     for index, layer in enumerate(natural.layers):
         if layer.region is not None and layer.region not in domain.regions:
             known = ", ".join(map(repr, domain.regions))
@@ -384,7 +388,18 @@ def _with_prestretch(measured: dict[str, Any], key: str, scene: Scene) -> dict[s
     of_turnover = [name for name in TURNED_OVER if name in changed]
     if wanted and of_turnover and not scene.remodeling.turnover.is_on:
         raise SceneError(f"{key}: has {' and '.join(of_turnover)}, which only remodeling.turnover knows; it is not set")
+    if wanted and GROWTH in changed:
+        _check_growth(measured[GROWTH], key, scene.remodeling.turnover)
     return {name: values for name, values in measured.items() if wanted or name not in held}
+
+
+def _check_growth(growth: Any, key: str, turnover: Turnover) -> None:
+    """Whether tissue that has grown in an earlier run can go on as the scene says."""
+    if getattr(turnover, "from"):
+        raise SceneError(f"{key}: has {GROWTH} of an earlier run; remodeling.turnover.from must be 0 with it")
+    if growth.min() <= 1.0 - turnover.volume:
+        volume = f"remodeling.turnover.volume must be above {1.0 - growth.min():.3g} with it"
+        raise SceneError(f"{key}: has {GROWTH} of an earlier run, {growth.min():.3g} at the least; {volume}")
 
 
 def in_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Any:

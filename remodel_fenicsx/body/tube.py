@@ -226,7 +226,9 @@ def _opening_angle(m: Any) -> float:
     points = m.observer.stepper.remodeling.parameters.at_points()
     turnover = m.observer.stepper.turnover
     turned = [getattr(points, name) for name in TURNED_OVER]
-    turned += [turnover.growth.ratio.reshape(-1)] if turnover is not None and turnover.growth is not None else []
+    turned += (
+        [turnover.growth.of_content(points.content)] if turnover is not None and turnover.growth is not None else []
+    )
     squared = np.column_stack([squared, *(values for values in turned if values is not None)])
     parts = comm.allgather((radius, squared, m.quadrature.volumes.reshape(-1)))
     radius, squared, volumes = (np.concatenate(columns) for columns in zip(*parts, strict=True))

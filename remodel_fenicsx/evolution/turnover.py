@@ -67,17 +67,30 @@ class Growth:
         """m_ref J_g, the content over which the volume is that of the start, (elements, points)."""
         return self._reference * self.ratio
 
+    def begin_with(self, content: Array, ratio: Array) -> None:
+        """Content and J_g of an earlier run: m_ref is such that they belong together."""
+        volume = self.settings.volume
+        self._reference[:] = content * volume / (ratio - 1.0 + volume)
+        self._set(ratio)
+
+    def of_content(self, content: Array) -> Array:
+        """J_g at every point by itself, as the content has it; of all points in one row, or (elements, points)."""
+        return np.asarray(1.0 + self.settings.volume * (content / self._reference.reshape(content.shape) - 1.0))
+
     def follow(self, content: Array) -> None:
         """J_g = 1 + phi (m/m_ref - 1) of the content (elements, points), and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
         if self.state.time < getattr(self.settings, "from"):
             self._reference[:] = content
-        ratio = 1.0 + self.settings.volume * (content / self._reference - 1.0)
+        ratio = self.of_content(content)
         if self.quadrature.shape[1] > 1:
             # as much as the strain of an element can follow: more of it alternates from point to point
             ratio = ratio - self.quadrature.beyond(self.quadrature.element_degree - 1, ratio[..., None])[..., 0]
         if (least := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
             text = f"after time {self.state.time:g} less than {100 * LEAST_VOLUME:g} % of the tissue's volume is left"
             raise StepFailure(self.state.time, f"{text}: J_g = {least:.3g}", GONE)
+        self._set(ratio)
+
+    def _set(self, ratio: Array) -> None:
         self._gradient[:] = self._initial - (1.0 - 1.0 / ratio)[..., None, None] * self._across
 
 
@@ -113,6 +126,11 @@ class TurnoverPass:
         self.growth = Growth(state, settings) if state.kinematics.grows else None
         self._start = self._before = self.row = self.better = self.logarithms()  # before: of the last solved state
         self._start_rates: Array | None = None  # where those of both ends together are better
+
+    def begin_with(self, ratio: Array) -> None:
+        """J_g of an earlier run, where it had this content."""
+        assert self.growth is not None
+        self.growth.begin_with(self._values("content"), ratio)
 
     # ------------------------------------------------------------ over a step
     def lag(self, time: float) -> None:

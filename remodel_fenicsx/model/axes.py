@@ -150,8 +150,9 @@ AXES: dict[str, Callable[[LocalAxes], Array]] = {
 
 # name of what is measured: numbers that a row of it may have
 NATURAL_GRADIENT = "natural_gradient"
+GROWTH = "growth"  # J_g
 MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
-MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,)}  # beside one of SOURCES
+MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}  # beside one of SOURCES
 SOURCES = ("structure_tensor", "fibre", "angle")  # one of these is needed
 SYMMETRIC = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
 # eigenvalue below zero, over the trace, that may be rounding of files with 7 digits
@@ -179,7 +180,7 @@ def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:
     weight = measured.get("weight", np.zeros((1, 1)))[:, 0]
     if not (fine := (weight >= 0) & (weight <= 1)).all():
         return _row("weight", fine, "is not from 0 to 1")
-    for name in ("content", "natural_length"):
+    for name in ("content", "natural_length", GROWTH):
         if name in measured and not (fine := measured[name][:, 0] > 0).all():
             return _row(name, fine, "is not above 0")
     if NATURAL_GRADIENT in measured:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.model.axes import NATURAL_GRADIENT
+from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
@@ -128,14 +128,15 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     time = float(recording.times[-1]) if time is None else time
     needed = ("cell_dimensions", *AXIS_FIELDS)
-    fields = recording.fields(time, (*needed, "displacement", NATURAL_GRADIENT, *TURNED_OVER))
+    kept = (NATURAL_GRADIENT, *TURNED_OVER, GROWTH)
+    fields = recording.fields(time, (*needed, "displacement", *kept))
     missing = [name for name in needed if name not in fields]
     if missing:
         raise RecordingError(f"{recording.path}: output.fields was without {', '.join(missing)}")
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     if NATURAL_GRADIENT not in {*fields, *recording.scene.lacking_fields}:
         log.warning("%s: output.fields was without %s: the prestretch is not written", recording.path, NATURAL_GRADIENT)
-    others = {name: fields[name] for name in (NATURAL_GRADIENT, *TURNED_OVER) if name in fields}
+    others = {name: fields[name] for name in kept if name in fields}
     mesh = recording.points, recording.elements
     return Fibres(*mesh, fields["cell_dimensions"], axes, fields.get("displacement"), others)
 

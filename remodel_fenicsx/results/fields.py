@@ -18,7 +18,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
-from remodel_fenicsx.model.axes import NATURAL_GRADIENT, LocalAxes
+from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
@@ -36,7 +36,7 @@ OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacemen
 
 def field_names(
     asked: bool | Sequence[str],
-    lacking: Collection[str] = (REGION, *NO_PRESTRETCH, *TURNED_OVER),
+    lacking: Collection[str] = (REGION, *NO_PRESTRETCH, *TURNED_OVER, GROWTH),
     constant: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks."""
@@ -59,6 +59,7 @@ class ElementFields:
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
         self.shape, self.state, self.names = shape, stepper.state, tuple(names)
         self.quadrature = self.state.cells.quadrature
+        self.turnover = stepper.turnover
         self.tissue, self._parameters = stepper.tissue, stepper.coupling.equilibrium.parameters
         state = self.state
         F = state.kinematics.deformation_gradient(state.unknown)
@@ -103,6 +104,7 @@ class ElementFields:
             UNLOADED: lambda: angle(state.elastic_axes(axes), local.axes),
             "fibre_angle_deformed": lambda: angle(state.elastic_axes(axes, F), local.deformed(F)),
             "chain_extension": extension,
+            GROWTH: lambda: mean(self.turnover.growth.ratio),
             REGION: lambda: state.loading.domain.element_region.astype(np.float64),
         }
         makers |= {name: partial(mean_axis, i) for i, name in enumerate(AXIS_FIELDS)}

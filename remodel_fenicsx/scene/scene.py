@@ -21,7 +21,7 @@ from remodel_fenicsx.body.shape import Column, FromFile, columns_of, columns_on_
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.model.axes import NATURAL_GRADIENT
+from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER
 from remodel_fenicsx.model.laws import LAWS
@@ -421,7 +421,9 @@ class Scene(Table):
         if self.remodeling.turnover.grows:
             found.pop(NATURAL_GRADIENT, None)
         stays = "it changes only with remodeling.turnover, which is not set"
-        return found | ({} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays))
+        found |= {} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays)
+        room = "tissue grows only with a remodeling.turnover.volume above 0"
+        return found | ({} if self.remodeling.turnover.grows else {GROWTH: room})
 
     @property
     def has_free_length(self) -> bool:
@@ -491,11 +493,11 @@ class Scene(Table):
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
         if chosen or COUPLINGS[self.remodeling.coupling].solves_cells or step <= (turnover.time or math.inf):
             return [*found]
+        remedy = " or time.tolerance" if turnover.grows else ", time.tolerance, or remodeling.coupling = 'implicit'"
         return [
             *found,
             f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
-            "length overshoot in each step; set a shorter time.step, time.tolerance, or remodeling.coupling = "
-            "'implicit'",
+            f"length overshoot in each step; set a shorter time.step{remedy}",
         ]
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:

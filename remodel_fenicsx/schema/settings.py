@@ -31,7 +31,7 @@ from remodel_fenicsx.fem.solver_methods import (
     SOLVER_METHODS,
     fault_of_option,
 )
-from remodel_fenicsx.model.axes import AXES, NATURAL_GRADIENT
+from remodel_fenicsx.model.axes import AXES, GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
@@ -384,9 +384,9 @@ class Natural(Table):
     and comes to the given tube at its end; it needs time.end = 'equilibrium'."""
 
     fibres: bool | None = Field(default=None, json_schema_extra={"allowed": "true or false"})
-    """Whether the run begins with the prestretch that the file of cells.fibres has too, and with its content and
-    natural length (these with remodeling.turnover), as `export` writes them. A file with any is refused where this is
-    not said."""
+    """Whether the run begins with the prestretch that the file of cells.fibres has too, and with its content,
+    natural length and growth (these with remodeling.turnover), as `export` writes them. A file with any is refused
+    where this is not said."""
 
     @property
     def is_of_the_mesh(self) -> bool:
@@ -409,7 +409,6 @@ class Natural(Table):
                 f"{key}.opening_angle or layers are there too; one of them is enough": self.opening_angle
                 or self.layers,
                 "must be false unless mesh.formulation is 'displacement'": scene.formulation != "displacement",
-                "must be false unless remodeling.turnover has volume = 0": scene.remodeling.turnover.grows,
             }
             refuse(f"{key}.fibres", True, reasons)
             return
@@ -1335,13 +1334,13 @@ class Solver(Table):
 
 FIELDS_BY_NAME = (
     "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
-    "fibre_angle", "fibre_angle_unloaded", "fibre_angle_deformed", "chain_extension", *TURNED_OVER, NATURAL_GRADIENT,
-    "region", "chains",
+    "fibre_angle", "fibre_angle_unloaded", "fibre_angle_deformed", "chain_extension", *TURNED_OVER, GROWTH,
+    NATURAL_GRADIENT, "region", "chains",
 )  # fmt: skip
 """What `output.fields` may name (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
 REGION = "region"  # the field of bodies with regions
 TURNOVER_POWER = "turnover_power"  # the column of bodies with turnover, beside means of what is turned over
-GROWTH_COLUMNS = ("growth", "collagen_share")  # of bodies whose volume changes with turnover
+GROWTH_COLUMNS = (GROWTH, "collagen_share")  # of bodies whose volume changes with turnover
 UNLOADED = "fibre_angle_unloaded"  # the field of bodies whose tissue is free of stress in another configuration
 NO_PRESTRETCH = (UNLOADED, NATURAL_GRADIENT)  # fields that bodies whose mesh is free of stress have not
 CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")

@@ -106,6 +106,7 @@ def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None
         "natural_gradient",
         "content",
         "natural_length",
+        "growth",
     }
     two = Recording(folders["two"]).fields(3.0)
     assert set(two) == {"displacement", "fibre_angle"}

@@ -146,6 +146,19 @@ def test_kinematics_agree() -> None:
             assert row[name] == pytest.approx(rows[0][name], rel=1e-4), name
 
 
+def test_linear_elements_know_what_a_cut_shows() -> None:
+    """J_g is one number in each of them; the cut takes what the content has at every point."""
+    opened = [
+        last_row(
+            wall(0.5, 12.0, None, **SHORT, model={"kinematics": name}, mesh={"degree": degree}).with_values(
+                {"output.columns": ["opening_angle"]}
+            )
+        )["opening_angle"]
+        for name, degree in (("radial", 2), ("sector", 1))
+    ]
+    assert opened[1] == pytest.approx(opened[0], rel=0.2)
+
+
 def test_whole_tubes_and_their_files_agree(tmp_path: Path) -> None:
     """Linear elements; the file's wall grows along the radial axis that is found in it."""
     geometry = {"inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
@@ -220,6 +233,12 @@ def test_validate_says_which_gains_rest(
     printed = capsys.readouterr()
     found = [line for line in (printed.out + printed.err).splitlines() if "come" in line and "rest" in line]
     assert says in found[0] if says else not found
+
+
+def test_steps_that_are_too_long_are_said_without_what_does_not_grow() -> None:
+    """The coupling `implicit` takes no volume."""
+    (line,) = (line for line in wall(0.3, 40.0, None, turnover={"time": 1.0}).warnings() if "turnover.time" in line)
+    assert line.endswith("set a shorter time.step or time.tolerance")
 
 
 def test_the_time_to_rest_is_that_of_the_formula() -> None:

@@ -36,6 +36,11 @@ def scene(vessel: Path, end: float, loaded: float = 2.0, **tables: Any) -> Scene
     return Scene(**values | tables)
 
 
+def grown(**turnover: Any) -> dict[str, Any]:
+    """The table of remodeling with a wall that grows."""
+    return {"law": "tensor", "coupling": "staggered", "turnover": TURNOVER | {"volume": 0.6} | turnover}
+
+
 def again(vessel: Path, file: Path, end: float, **tables: Any) -> Scene:
     """The scene that begins with an exported file, all loads in its first step."""
     values: dict[str, Any] = {"cells": {"fibres": str(file)}, "natural": {"fibres": True}}
@@ -90,7 +95,7 @@ def test_the_arrays_are_those_of_the_wall(first: tuple[Path, Path], tmp_path: Pa
 
 
 def test_what_has_grown_is_written_as_it_is(first: tuple[Path, Path], tmp_path: Path) -> None:
-    """G of each time: its determinant falls as the wall grows. No run begins with that."""
+    """G of each time: its determinant falls as the wall grows."""
     mesh, _ = first
     grows = {"law": "tensor", "coupling": "staggered", "turnover": {**TURNOVER, "volume": 0.5, "time": 2.0}}
     started = run(scene(mesh, 3.0, remodeling=grows, natural={}), tmp_path / "run", SELF)
@@ -99,8 +104,23 @@ def test_what_has_grown_is_written_as_it_is(first: tuple[Path, Path], tmp_path: 
     np.testing.assert_allclose(volumes[0], 1.0, atol=1e-6)
     np.testing.assert_allclose(volumes[1], 1 + 0.5 * (ends[1]["content"][0] - 1), rtol=1e-2)
     assert np.abs(volumes[1] - 1).max() > 0.02
-    with pytest.raises(SceneError, match="natural.fibres = true: must be false unless remodeling.turnover has volume"):
-        again(mesh, tmp_path / "3.vtu", 3.0, remodeling=grows)
+
+
+def test_a_body_that_grew_from_a_time_goes_on(first: tuple[Path, Path], tmp_path: Path) -> None:
+    """The file has J_g beside content and G, so that nothing need know when growth began."""
+    columns = {"columns": [*COLUMNS, "growth"], "report": False}
+    began = run(scene(first[0], 20.0, output=columns, remodeling=grown(**{"from": 2.0})), tmp_path / "first", SELF)
+    file = export(began, "vtu", tmp_path / "a.vtu", 19.0)
+    second = run(again(first[0], file, 2.0, output=columns, remodeling=grown()), tmp_path / "second", SELF)
+    original, read = (Recording(folder).history for folder in (began, second))
+    assert read["growth"][0] == pytest.approx(original["growth"][-2], rel=1e-6) and read["growth"][0] < 0.9
+    for name in (*COLUMNS, "growth"):
+        np.testing.assert_allclose(read[name][1:], original[name][-2:], rtol=2e-6, err_msg=name)
+    for turnover, line in (({"volume": 0.0}, "volume must be above"), ({"from": 1.0}, "from must be 0")):
+        refused = again(first[0], file, 1.0, remodeling=grown(**turnover), output={})
+        with pytest.raises(SceneError, match=f"^cells.fibres = .*: has growth of .*remodeling.turnover.{line}"):
+            with made(refused):
+                pass
 
 
 def test_what_has_no_place_is_said(first: tuple[Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
