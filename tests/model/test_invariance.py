@@ -223,6 +223,11 @@ def shared_points() -> Points:
     return Points()
 
 
+@pytest.fixture(name="points")
+def the_points() -> Points:
+    return shared_points()
+
+
 def deformations(rng: np.random.Generator, size: float = 0.12) -> np.ndarray:
     """Stretched and turned, (64, 3, 3)."""
     return parts.random_rotations(rng, 64) @ (np.eye(3) + rng.uniform(-size, size, (64, 3, 3)))

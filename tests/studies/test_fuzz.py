@@ -50,7 +50,7 @@ def test_all_scenes(seed: int, runner: Runner) -> None:
 
 
 # ---------------------------------------------------------------- the scenes
-OF_FILES = {"cells.fibres", "cells.fibres_sha256"}  # a seed makes a scene and no files beside it
+OF_FILES = {"cells.fibres", "cells.fibres_sha256", "natural.fibres"}  # a seed makes a scene and no files beside it
 OTHER_WORDS = {
     "material.initial_stiffness",
     "material.locking_stretch",
