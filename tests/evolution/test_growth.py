@@ -16,6 +16,8 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
+from tests.reference.radial import RadialMaterial
+from tests.reference.wall import Wall
 from tests.runs import goes_on, last_row, made, rows_of, simulated
 from tests.values import ANGLES, isotropic, ramped
 
@@ -128,6 +130,33 @@ def test_growth_does_not_alternate_from_point_to_point(monkeypatch: pytest.Monke
     projected = swing()
     monkeypatch.setattr(Quadrature, "beyond", lambda self, degree, values: np.zeros_like(values))
     assert swing() > 3 * projected
+
+
+@pytest.mark.parametrize("case", ["growth", "opening angle", "random tissue", "residual stress alone"])
+def test_walls_are_those_of_the_reference(case: str) -> None:
+    """At a time on the way to rest, with fine steps; where tissue does not turn over, the opened sector too."""
+    rng, tissue, opening, volume, gain, stretch = np.random.default_rng(3), RadialMaterial(), 0.0, 0.5, 1.0, 1.1
+    if case == "random tissue":
+        numbers = [float(rng.uniform(*ends)) for ends in ((10, 60), (1, 6), (1, 4), (1.5, 2.5), (0.9, 1.1))]
+        tissue, volume, gain, stretch = RadialMaterial(*numbers), 0.8, 1.4, 1.15
+    elif case != "growth":
+        opening = 90.0
+    turns = case != "residual stress alone"
+    reference = Wall(tissue, (1.0, 1.3), opening, 0.025, 10.0 if turns else 1e12, stretch, gain, volume)
+    reference.run(1.2, 0.1, 8.0, 20.0, 0.5)
+    turnover = {"time": reference.time, "gain": gain, "deposition_stretch": stretch}
+    moduli = {name: getattr(tissue, name) for name in ("lame_lambda", "lame_mu", "contour_length")}
+    density = tissue.network_modulus / (1.381e-23 * 310.0 / (4 * 1.365))
+    tables: Any = {"loads": ramped(8.0, pressure=1.2, elongation=0.1), "material": moduli | {"chain_density": density}}
+    scene = wall(volume, 20.0, None, turnover=turnover, natural={"opening_angle": opening}, **tables).with_values(
+        {"time.step": 0.5, "mesh.refinement": 6, "cells.end_to_end_length": tissue.end_to_end_length}
+    )
+    expected = reference.row()
+    row = last_row(scene.with_values({"output.columns": [*expected, "opening_angle"]}))
+    for name, value in expected.items():
+        assert row[name] == pytest.approx(value, rel=2e-3), name
+    if case in ("random tissue", "residual stress alone"):  # the angle is that sensitive to steps elsewhere
+        assert row["opening_angle"] == pytest.approx(reference.cut(), abs=1.0)
 
 
 # ---------------------------------------------------------------- bodies
