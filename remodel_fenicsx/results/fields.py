@@ -104,13 +104,14 @@ class ElementFields:
             UNLOADED: lambda: angle(state.elastic_axes(axes), local.axes),
             "fibre_angle_deformed": lambda: angle(state.elastic_axes(axes, F), local.deformed(F)),
             "chain_extension": extension,
-            GROWTH: lambda: mean(self.turnover.growth.ratio),
             REGION: lambda: state.loading.domain.element_region.astype(np.float64),
         }
         makers |= {name: partial(mean_axis, i) for i, name in enumerate(AXIS_FIELDS)}
         G = state.natural_gradient
         if G is not None:
             makers[NATURAL_GRADIENT] = lambda: mean(G).reshape(-1, 9)
+        if state.kinematics.grows:
+            makers[GROWTH] = lambda: mean(self.turnover.growth.ratio)
         turned = {name: getattr(self.tissue, name) for name in TURNED_OVER}
         makers |= {name: partial(mean_number, number) for name, number in turned.items() if number is not None}
         return {name: makers[name]() for name in OF_ELEMENTS if name in self.names and name in makers}
