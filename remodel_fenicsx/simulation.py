@@ -395,7 +395,7 @@ def _with_prestretch(measured: dict[str, Any], key: str, scene: Scene) -> dict[s
 
 def _check_growth(growth: Any, key: str, turnover: Turnover) -> None:
     """Whether tissue that has grown in an earlier run can go on as the scene says."""
-    if getattr(turnover, "from"):
+    if turnover.start:
         raise SceneError(f"{key}: has {GROWTH} of an earlier run; remodeling.turnover.from must be 0 with it")
     if growth.min() <= 1.0 - turnover.volume:
         volume = f"remodeling.turnover.volume must be above {1.0 - growth.min():.3g} with it"

@@ -45,10 +45,8 @@ class Growth:
     def __init__(self, state: State, settings: Turnover):
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
         kinematics: Any = state.kinematics
-        shape = (3, 3)
-        self._gradient, self._initial = (
-            self.quadrature.values(function, shape) for function in (kinematics.gradient, kinematics.initial)
-        )
+        self._gradient = self.quadrature.values(kinematics.gradient, (3, 3))
+        self._initial = self.quadrature.values(kinematics.initial, (3, 3))
         normal = state.cells.local_axes.axes[..., 2, :]
         self._across = np.einsum("...ij,...j,...k->...ik", self._initial, normal, normal)  # G_0 N (x) N
         reference = self.quadrature.function("reference_content", ())
@@ -62,10 +60,9 @@ class Growth:
         """J_g, by what the volume has grown, (elements, points)."""
         return np.asarray(np.linalg.det(self._initial) / np.linalg.det(self._gradient))
 
-    @property
-    def taken(self) -> Array:
-        """m_ref J_g, the content over which the volume is that of the start, (elements, points)."""
-        return self._reference * self.ratio
+    def share(self, content: Array) -> Array:
+        """phi m/(m_ref J_g), the share of the present volume that is collagen; (elements, points)."""
+        return np.asarray(self.settings.volume * content / (self._reference * self.ratio))
 
     def begin_with(self, content: Array, ratio: Array) -> None:
         """Content and J_g of an earlier run: m_ref is such that they belong together."""
@@ -79,7 +76,7 @@ class Growth:
 
     def follow(self, content: Array) -> None:
         """J_g = 1 + phi (m/m_ref - 1) of the content (elements, points), and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
-        if self.state.time < getattr(self.settings, "from"):
+        if self.state.time < self.settings.start:
             self._reference[:] = content
         ratio = self.of_content(content)
         if self.quadrature.shape[1] > 1:
@@ -217,10 +214,9 @@ class TurnoverPass:
         return float(self.quadrature.mean(self._values(name)))
 
     def collagen_share(self) -> float:
-        """Volume mean of phi m/(m_ref J_g), where tissue grows."""
-        growth = self.growth
-        assert growth is not None
-        return float(self.quadrature.mean(growth.settings.volume * self._values("content") / growth.taken))
+        """Volume mean of `Growth.share`, where tissue grows."""
+        assert self.growth is not None
+        return float(self.quadrature.mean(self.growth.share(self._values("content"))))
 
     def _values(self, name: str) -> Array:
         return self.quadrature.values(getattr(self.tissue, name), ())

@@ -511,19 +511,26 @@ class TurnoverRates(NamedTuple):
     natural_length: Array
 
 
+class Followed(NamedTuple):
+    """What amount and natural length follow: their rates, and the power of lambda beside g in it."""
+
+    rates: Callable[[TurnoverRule, Callable[[Any], Any], Any], TurnoverRates]
+    power: int
+
+
 class TurnoverRule(NamedTuple):
     """How collagen is turned over: T, lambda_h, k, and one of `TURNOVER_RATES`."""
 
     time: float
     deposition_stretch: float
     gain: float
-    of: Callable[[TurnoverRule, Callable[[Any], Any], Any], TurnoverRates]
+    followed: Followed
 
     def rates(self, tissue: Tissue, stretch: Any) -> TurnoverRates:
         """Where chains have a stretch lambda_e (n,); complex for a derivative by a complex step."""
         chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
-        return self.of(self, lambda some: chain.stiffness(some * r0, contour) * some, stretch)
+        return self.followed.rates(self, lambda some: chain.stiffness(some * r0, contour) * some, stretch)
 
     def at_length(self, tissue: Tissue, length: Array) -> TurnoverRates:
         """Where chains have a length."""
@@ -538,8 +545,8 @@ class TurnoverRule(NamedTuple):
         assert chain is not None
         secant = chain.stiffness(deposited * r0, contour)
         both = secant - chain.stiffness(r0, contour) / deposited**2
-        power = 2 if self.of is by_stress else 1
-        steep, stiff = (float(np.log(some).imag) / COMPLEX_STEP for some in (secant * deposited**power, both))
+        what = secant * deposited**self.followed.power
+        steep, stiff = (float(np.log(some).imag) / COMPLEX_STEP for some in (what, both))
         return self.gain * steep, stiff * self.time / (self.gain * steep - 2)
 
 
@@ -569,7 +576,7 @@ def by_tension(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) 
     return TurnoverRates(content, turned_over * (stretch / rule.deposition_stretch - 1.0))
 
 
-TURNOVER_RATES = {"cauchy": by_stress, "tension": by_tension}
+TURNOVER_RATES = {"cauchy": Followed(by_stress, 2), "tension": Followed(by_tension, 1)}
 """By the name that `remodeling.turnover.rates` has."""
 
 

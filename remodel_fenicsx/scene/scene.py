@@ -404,7 +404,7 @@ class Scene(Table):
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
         end = self.last_time
         times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < end}
-        growth = {getattr(self.remodeling.turnover, "from")} - {0.0}
+        growth = {self.remodeling.turnover.start} - {0.0}
         return sorted({*times, *growth, *self.output.times, end})
 
     @property

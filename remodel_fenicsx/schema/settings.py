@@ -708,6 +708,11 @@ class Turnover(_WithStart):  # type: ignore[misc]
         return self.is_on and self.volume > 0
 
     @property
+    def start(self) -> float:
+        """The time from which it does."""
+        return float(getattr(self, "from"))
+
+    @property
     def rule(self) -> TurnoverRule:
         """For arrays."""
         assert self.time is not None
@@ -871,7 +876,7 @@ class Remodeling(Table):
             raise fault(rule, f"{key}.volume", self.turnover.volume)
         if scene.formulation != "displacement":
             raise fault("must be 0 unless mesh.formulation is 'displacement'", f"{key}.volume", self.turnover.volume)
-        start = getattr(self.turnover, "from")
+        start = self.turnover.start
         if start and scene.time.is_equilibrium:
             raise fault("must be 0 with time.end = 'equilibrium', which has no times", f"{key}.from", start)
         if start and start > scene.time.end:

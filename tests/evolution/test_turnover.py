@@ -13,7 +13,7 @@ from remodel_fenicsx import Simulation
 from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.laws import TurnoverRule, by_tension
+from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.system import NOTICE
@@ -200,7 +200,7 @@ def test_rates_against_their_equation() -> None:
     chain, r0, contour, time = CHAINS["wormlike"], 1.0, 1.594, 40.0
     tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(4), natural_length=np.array([1.0, 1.3, 1.3, 1.0]))
     stretches = np.array([1.1, 1.15, 0.9, 1.4])
-    found = TurnoverRule(time, 1.1, 1.0, by_tension).at_length(tissue, stretches * tissue.natural_length)
+    found = TurnoverRule(time, 1.1, 1.0, TURNOVER_RATES["tension"]).at_length(tissue, stretches * tissue.natural_length)
     tension = stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
     assert found.content == pytest.approx(np.clip(tension - 1, -1, 1) / time, abs=1e-15)
     growth = (1 / time + np.maximum(found.content, 0)) * (stretches / 1.1 - 1)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.model.laws import TurnoverRule, by_tension
+from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from tests.evolution.test_turnover_bodies import TURNOVER, grown
 from tests.runs import made, simulated
 from tests.values import isotropic, ramped
@@ -33,7 +33,7 @@ class Powers(Watcher):
         tissue, F = simulation.stepper.remodeling.parameters.at_points(), state.elastic_gradient()
         cells = [simulation.cells.point_cells]
         length = np.sqrt(simulation.cells.kernels.squared_length(F, cells[0]))
-        content, natural = TurnoverRule(TURNOVER["time"], 1.1, 1.0, by_tension).at_length(tissue, length)
+        content, natural = TurnoverRule(TURNOVER["time"], 1.1, 1.0, TURNOVER_RATES["tension"]).at_length(tissue, length)
 
         def energy(time: float) -> np.ndarray:
             m, rho = tissue.content * np.exp(time * content), tissue.natural_length * np.exp(time * natural)
