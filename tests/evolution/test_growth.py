@@ -12,6 +12,8 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, cli
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
@@ -281,3 +283,10 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
             tissue = simulation.stepper.remodeling.parameters.largest()
         _, slowly = turnover.settings.rule.rest(tissue)
         assert 100.0 / np.log(rates[0] / rates[1]) == pytest.approx(slowly, rel=0.03), gain
+
+
+def test_nothing_is_made_by_chains_without_stress() -> None:
+    """Production is never negative, whatever the gain: all that is left is removal, and what is there keeps its length."""
+    rule = TurnoverRule(40.0, 1.1, 2.0, TURNOVER_RATES["cauchy"])
+    found = rule.rates(Tissue(1.0, 1.0, 1.0, 1.594, 1.0), np.array([0.5, 1.1]))
+    np.testing.assert_allclose(found, [[-1 / 40.0, 0.0], [0.0, 0.0]], atol=1e-15)
