@@ -286,7 +286,7 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
 
 
 def test_nothing_is_made_by_chains_without_stress() -> None:
-    """Production is never negative, whatever the gain: all that is left is removal, and what is there keeps its length."""
+    """Production is never negative, whatever the gain: removal is left, and what is there keeps its length."""
     rule = TurnoverRule(40.0, 1.1, 2.0, TURNOVER_RATES["cauchy"])
     found = rule.rates(Tissue(1.0, 1.0, 1.0, 1.594, 1.0), np.array([0.5, 1.1]))
     np.testing.assert_allclose(found, [[-1 / 40.0, 0.0], [0.0, 0.0]], atol=1e-15)
