@@ -54,6 +54,8 @@ def in_units(scene: Values, stress: float = 1.0, length: float = 1.0, time: floa
         table[key] *= by
     if t["end"] != "equilibrium":
         t["end"] *= time
+    if "turnover" in r:
+        r["turnover"] |= {key: r["turnover"][key] * time for key in ("time", "from") if key in r["turnover"]}
     if "times" in s["output"]:
         s["output"]["times"] = [at * time for at in s["output"]["times"]]
     if "absolute_tolerance" in s["solver"]:
