@@ -13,7 +13,7 @@ import dolfinx.fem
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.domain import Domain, dof_of_node
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.fem import assembly, jit
 from remodel_fenicsx.fem.assembly import Remembered
@@ -255,6 +255,14 @@ class State:
         """How many of this rank's unknowns are its own: they come first, ghosts follow."""
         space = self.unknown.function_space.dofmap
         return int(space.index_map.size_local * space.index_map_bs)
+
+    @cached_property
+    def _dof_of_node(self) -> Any:
+        return dof_of_node(self.loading.domain.mesh, self.kinematics.nodal_space(self.unknown))
+
+    def gathered_displacement(self) -> NDArray[np.float64] | None:
+        """Of the mesh nodes, (n, 3), in the mesh file's order, on rank 0; None on others. Collective."""
+        return self.loading.domain.gather_nodes(self.kinematics.nodal_displacement(self.unknown)[self._dof_of_node])
 
     def deformation_gradient(self) -> NDArray[np.float64]:
         """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3)."""

@@ -28,7 +28,6 @@ from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, factorised, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
-from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
@@ -226,7 +225,7 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
         simulation.watchers = [simulation.observer]
         row = [step.row for step in simulation.steps()][-1]
         domain = simulation.domain
-        places, moves = domain.gather_nodes(domain.mesh.geometry.x), NodalGather(domain, simulation.state)()
+        places, moves = domain.gather_nodes(domain.mesh.geometry.x), simulation.state.gathered_displacement()
     radii = None
     if places is not None and moves is not None:
         before, after = (np.hypot(x[:, 0], x[:, 1]) for x in (places, places + moves))

@@ -16,7 +16,6 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.columns import Measurement
-from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.parts import tube
@@ -35,7 +34,7 @@ def main(out: str, request: dict) -> None:
         )
     simulation = Simulation(scene, MPI.COMM_WORLD, domain)
     domain, cells, quadrature = simulation.domain, simulation.cells, simulation.quadrature
-    displacement = NodalGather(domain, simulation.state)
+    displacement = simulation.state.gathered_displacement
     saved: dict[str, object] = {}
     tension = np.zeros(quadrature.shape, dtype=bool)
 

@@ -21,7 +21,6 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
@@ -356,7 +355,7 @@ class _LumenVolume:
         self._rims, self._comm, self._size = domain.rims, domain.comm, domain.size  # type: ignore[attr-defined]
         middle = domain.middle("inner")  # type: ignore[attr-defined]
         self._nodes = domain.gather_nodes(domain.mesh.geometry.x - middle)
-        self._displacement = NodalGather(domain, state)
+        self._state = state
         place = ufl.SpatialCoordinate(domain.mesh) - dolfinx.fem.Constant(domain.mesh, middle)
         place += state.kinematics.displacement(state.unknown)
         normal = ufl.cofac(state.kinematics.deformation_gradient(state.unknown)) * ufl.FacetNormal(domain.mesh)
@@ -365,7 +364,7 @@ class _LumenVolume:
     def __call__(self) -> float:
         """Of the present displacement. Collective."""
         volume = float(np.real(dolfinx.fem.assemble_scalar(self._form)))
-        displacement = self._displacement()
+        displacement = self._state.gathered_displacement()
         if displacement is not None and self._nodes is not None:
             volume += sum(cap_volume(self._nodes + displacement, rim) for rim in self._rims)
         volume = float(over_ranks(self._comm, volume, MPI.SUM))

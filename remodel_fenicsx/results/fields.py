@@ -12,7 +12,6 @@ import numpy as np
 import ufl
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.domain import Domain, dof_of_node
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem import jit
@@ -25,7 +24,6 @@ from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, NO_PRESTRETCH, REGION, UNLOADED
 from remodel_fenicsx.schema import SAME_TIME, same_time
 from remodel_fenicsx.solver.equilibrium import PointStresses
-from remodel_fenicsx.state import State
 from remodel_fenicsx.system.files import ClosedAtEnd
 
 Array = NDArray[np.float64]
@@ -193,7 +191,6 @@ class Fields(Watcher, ClosedAtEnd):
         self.domain = domain = self.state.loading.domain
         needed = {*self.names, *(OF_CHAINS if "chains" in self.names else ())}
         self._element_fields = ElementFields(shape, stepper, [name for name in OF_ELEMENTS if name in needed])
-        self._displacement = NodalGather(domain, self.state)
         quadrature, local_axes = self.state.cells.quadrature, self.state.cells.local_axes
         constant = local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
         self._constant = {
@@ -239,7 +236,7 @@ class Fields(Watcher, ClosedAtEnd):
     def _gathered(self) -> dict[str, Array]:
         """The fields of the present state on rank 0, nothing on others. Collective."""
         local = {name: self.domain.gather_elements(values) for name, values in self._element_fields().items()}
-        found = local | {"displacement": self._displacement()}
+        found = local | {"displacement": self.state.gathered_displacement()}
         return {name: values for name, values in found.items() if values is not None}
 
     def _write(self, time: float, fields: dict[str, Array]) -> None:
@@ -277,15 +274,3 @@ def _continued(path: Path, after: float | None) -> TransientGrid | None:
         log.warning("%s is missing: a new one begins with the next step", path.name)
         return None
     return TransientGrid.continued(path, after * (1 + SAME_TIME))
-
-
-class NodalGather:
-    """Gathers the displacement of the mesh nodes to rank 0, in the mesh file's order."""
-
-    def __init__(self, domain: Domain, state: State):
-        self.domain, self.state = domain, state
-        self._dof_of_node = dof_of_node(domain.mesh, state.kinematics.nodal_space(state.unknown))
-
-    def __call__(self) -> Array | None:
-        values = self.state.kinematics.nodal_displacement(self.state.unknown)[self._dof_of_node]
-        return self.domain.gather_nodes(values)

@@ -14,7 +14,6 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, read_scene, run, unloaded
 from remodel_fenicsx.body.mesh_file import read_mesh
-from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.unloading import NoUnloadedShape
 from tests.conftest import Refused
 from tests.body.test_natural import scene
@@ -52,7 +51,7 @@ def test_a_tube_comes_back_to_its_loaded_radii_and_length(
     with made(found) as simulation:
         row = [step.row for step in simulation.steps()][-1]
         places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
-        moved = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
+        moved = places + simulation.state.gathered_displacement()  # type: ignore[operator]
     radii = np.hypot(moved[:, 0], moved[:, 1])
     assert radii.min() == pytest.approx(1.4, abs=1e-7)
     assert radii.max() == pytest.approx(3.05, abs=1e-7)
@@ -92,7 +91,7 @@ def nodes_of(of: Scene) -> np.ndarray:
     """At the end of a run."""
     with simulated(of) as (simulation, _):
         places = simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
-        moved: np.ndarray = places + NodalGather(simulation.domain, simulation.state)()  # type: ignore[operator]
+        moved: np.ndarray = places + simulation.state.gathered_displacement()  # type: ignore[operator]
     return moved
 
 

@@ -15,7 +15,6 @@ from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import free_motions
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.results.columns import Measurement
-from remodel_fenicsx.results.fields import NodalGather
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.simulation import Simulation
@@ -45,7 +44,7 @@ def scene_of(file: Path, **tables: Any) -> Any:
 def solved(scene: Any, domain: Any = None) -> tuple[dict[str, float], Any, Any]:
     """The last row, displacement of the nodes and their places, in the order of the file."""
     with simulated(scene, domain) as (simulation, rows):
-        displacement = NodalGather(simulation.domain, simulation.state)()
+        displacement = simulation.state.gathered_displacement()
         return rows[-1], displacement, simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
 
 
