@@ -485,14 +485,14 @@ class Cells(Table):
         default=None, min_length=1, json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"}
     )
     """File of measured fibres (.vtu, .xdmf or .csv, relative to the scene). It gives axes and dimensions of the cells
-    at t = 0 (docs/own_body.md, Fibres in and out). The run keeps a copy in its folder."""
+    at t = 0 (docs/my_own_vessel.md, Measured fibres in). The run keeps a copy in its folder."""
     fibres_sha256: str | None = Field(
         default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
     )
     """SHA-256 of that file. A scene as run has it, and refuses another file."""
     axes: Annotated[str, OneOf(AXES)] = "global"
     """Cell axes n_I before the first pass. 'global': x, y, z. 'cylindrical': circumferential, axial, radial, about the
-    z axis. 'local': the same, found on a mesh (docs/own_body.md). Where neither scene nor preset names them, a tube has
+    z axis. 'local': the same, found on a mesh (docs/my_own_vessel.md). Where nothing names them, a tube has
     'cylindrical'."""
     aligned_axis: Annotated[int, OneOf((1, 2, 3))] = 3
     """Number of the axis that 'aligned' cells lie along. With global axes 3 is z, the load axis of cube and tendon.
