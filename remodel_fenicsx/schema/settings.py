@@ -780,11 +780,12 @@ class Remodeling(Table):
     (docs/which_numbers.md)."""
     threshold: Annotated[float, STRESS] = Field(default=0.0, ge=0)
     """Lazy zone: the principal stress s0 up to which a point does not remodel. Above it kappa has the factor max(0, 1 -
-    s0/s), where s is the largest principal stress. For the law 'tensor' and drivers that are stresses (docs/laws.md).
+    s0/s), where s is the largest principal stress. For the law 'tensor' and drivers that are stresses
+    (docs/laws_and_couplings.md).
     """
     exponent: float = Field(default=2.0, gt=0, le=16)
     """Exponent n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law
-    'tensor' (docs/laws.md)."""
+    'tensor' (docs/laws_and_couplings.md)."""
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="What the cells follow where there are several load cases ([[cases]]). "
