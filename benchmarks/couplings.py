@@ -2,9 +2,9 @@
 """Which law and coupling gives most for its processor time: error against time, and cost on the paper's artery.
 
     ./with-fenicsx benchmarks/couplings.py [--steps N]  # 15 minutes on an idle core
-
-They stand in docs/laws_and_couplings.md, with their picture.
     ./with-fenicsx benchmarks/couplings.py --page       # only the page, from what has been measured
+
+Tables and picture of docs/laws_and_couplings.md.
 
 Error: one layer of the artery's elements along z to t = 40, with steps from 5 to 5/8; each law against its own limit.
 Cost: the whole artery, N steps (40) of all schemes in turn, so that a noisy machine is noisy for all of them.

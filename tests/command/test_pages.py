@@ -27,7 +27,7 @@ TUBE = "tutorial_tube"
 OF_PAGES = tomllib.loads((Path(__file__).parent / "pages.toml").read_text(encoding="utf-8"))
 SHORT, NOT_RUN, LEFT_BEHIND = (OF_PAGES[name] for name in ("short", "not_run", "left_behind"))
 REFUSAL = "loads.force"
-PAGES = ["start", "fit", *sorted(page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md"))]
+PAGES = ["start", "fit", "report", *sorted(page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md"))]
 
 
 def blocks(page: str) -> list[tuple[str, str]]:
