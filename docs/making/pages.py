@@ -42,7 +42,7 @@ def by_layer(columns: Sequence[tuple[str, Sequence[Any]]]) -> str:
 
 def between_marks(text: str, name: str, made: str) -> str:
     """A page with another text between the two comments of this name."""
-    start, end = f"<!-- {name}: ./with-fenicsx docs/make ", f"\n<!-- end of {name} -->"
+    start, end = f"<!-- {name}: ./with-fenicsx ", f"\n<!-- end of {name} -->"
     before, rest = text.split(start)
     command, rest = rest.split("\n", 1)
     return f"{before}{start}{command}\n\n{made.strip()}\n{end}{rest.split(end)[1]}"
