@@ -16,7 +16,6 @@ from remodel_fenicsx.report import write_report
 from tests.mesh_files import write_tube
 from tests.runs import SELF, goes_on, last_row, rows_of
 
-FACES = ("x0", "x1", "y0", "y1", "z0", "z1")
 GEL = Path(__file__).parents[2] / "demos" / "gel"
 RAMP = [[0.0, 0.0], [2.0, 1.0]]
 
