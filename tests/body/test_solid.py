@@ -123,7 +123,7 @@ def test_what_is_refused(block: Path, tmp_path: Path) -> None:
         "loads.more.face = 'z0': loads.way moves this face too"
     )
     assert refusal({}, supports={"x0": free["x0"]}, output={}).startswith(
-        "supports (x0 'sliding'): they leave the body free to turn"
+        "supports (x0 'sliding'): they leave the body free to move, in 3 of 6 rigid"
     )
     assert refusal({}, supports=free | {"lid": {}}, output={}).startswith(
         "supports.lid: the body has no such face; it has x0"
