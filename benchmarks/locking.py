@@ -3,9 +3,10 @@
 
     ./with-fenicsx benchmarks/locking.py [--largest N]
 
-Makes two tables of docs/what_may_go_wrong.md, and results/what_may_go_wrong.md with all of them, from runs: without chains, in
+Makes two tables of docs/what_may_go_wrong.md, and results/locking.md with all of them, from runs: without chains, in
 a bulk from soft to stiff, for every formulation; what a run says of itself beside its error. N (default: all) leaves
-out meshes with more elements. A quarter of an hour on an idle core."""
+out meshes with more elements. A quarter of an hour on an idle core.
+"""
 
 from __future__ import annotations
 
@@ -250,7 +251,7 @@ def main() -> None:
         words["bar"] = table(head, bar_rows(largest))
     if largest == 10**9:
         made = filled(Path(__file__).with_suffix(".template.md"), words)
-        (DOCS.parent / "results" / "what_may_go_wrong.md").write_text(made, encoding="utf-8")
+        (DOCS.parent / "results" / "locking.md").write_text(made, encoding="utf-8")
         page = DOCS / "what_may_go_wrong.md"
         text = page.read_text(encoding="utf-8")
         for name in ("turning", "tube"):
