@@ -502,7 +502,7 @@ class Cells(Table):
     antithetic: bool = False
     """Random cells only. Seeds 1 to 3, 4 to 6 and so on have the same draws, with l_1, l_2 and l_3 in turn (antithetic
     variates). Each seed alone is as random as without. Means over whole threes scatter less, mostly by far
-    (docs/speed.md)."""
+    (docs/speed_and_accuracy.md)."""
     end_to_end_length: float = Field(default=1.0, gt=0)
     """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It is a material constant:
     the repulsive energy keeps this value while the cells remodel."""
@@ -1296,7 +1296,8 @@ class Solver(Table):
         default=AUTO,
         description=f"How the equations of each step are solved. 'auto' takes 'direct' up to {SMALL_BODY} "
         f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} (on several "
-        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} (docs/speed.md).",
+        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} "
+        "(docs/speed_and_accuracy.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
     """Where Newton's method starts a step. 'none': at the displacement of the step before. 'autoregressive': at what
