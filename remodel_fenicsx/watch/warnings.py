@@ -513,7 +513,8 @@ class GrowthWithoutRest(WarnsOnce):
             "the tissue has not come to rest: content or natural length change by up to "
             f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at {largest_at(self.quadrature, rates)}, "
             f"and since time {self.held_from + self._numbers['early_time']:g} the rates have fallen no faster than "
-            "1/t. It goes on without bound (mechanobiological instability, docs/turnover.md), or rests much later; "
+            "1/t. It goes on without bound (mechanobiological instability, docs/tissue_that_lives.md), "
+            "or rests much later; "
             "with a larger remodeling.turnover.gain it rests sooner"
         )
 
