@@ -1,8 +1,10 @@
 #!/usr/bin/env python3
 """Which law and coupling gives most for its processor time: error against time, and cost on the paper's artery.
 
-    ./with-fenicsx benchmarks/couplings.py [--steps N]  # docs/couplings.md and its picture; 15 minutes on an idle core
+    ./with-fenicsx benchmarks/couplings.py [--steps N]  # 15 minutes on an idle core
     ./with-fenicsx benchmarks/couplings.py --page       # only the page, from what has been measured
+
+Tables and picture of docs/laws_and_couplings.md.
 
 Error: one layer of the artery's elements along z to t = 40, with steps from 5 to 5/8; each law against its own limit.
 Cost: the whole artery, N steps (40) of all schemes in turn, so that a noisy machine is noisy for all of them.
@@ -14,7 +16,6 @@ import argparse
 import time as clock
 from collections.abc import Iterator
 from pathlib import Path
-from textwrap import fill
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -22,12 +23,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from docs.making.pages import DOCS, FIGURES, by_column, filled, markdown
+from docs.making.pages import DOCS, FIGURES, between_marks, by_column, markdown
 from remodel_fenicsx import Simulation, read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table
 from tests.runs import made
 
+PAGE = DOCS / "laws_and_couplings.md"
 ARTERY = Path(__file__).parents[1] / "demos" / "artery.toml"
 END, STEPS = 40.0, (5.0, 2.5, 1.25, 0.625)
 TUBE = Tube(inner_radius=1.0, outer_radius=3.0, length=0.5)
@@ -178,13 +180,11 @@ def cost_table() -> str:
 
 
 def page() -> str:
-    """docs/couplings.md from the tables."""
+    """docs/laws_and_couplings.md with both tables made anew."""
     head = ["law, coupling", "cells", "error of A", "of u", "order in A", "in u", "seconds"]
-    words = {
-        "table": markdown(head, rows_of(read_table(FIGURES / "couplings.csv"))),
-        "caption": fill(f"*{CAPTION[1]}*", 100), "steps_of_error": f"{END / 1.25:.0f}", "cost": cost_table(),
-    }  # fmt: skip
-    return filled(Path(__file__).with_suffix(".template.md"), words)
+    errors_table = markdown(head, rows_of(read_table(FIGURES / "couplings.csv")))
+    text = between_marks(PAGE.read_text(encoding="utf-8"), "errors of couplings", errors_table)
+    return between_marks(text, "cost of couplings", cost_table())
 
 
 def main() -> None:
@@ -199,7 +199,7 @@ def main() -> None:
             Page(FIGURES, name, *CAPTION).save_table(by_column(measured), [source])
     with matplotlib.rc_context(STYLE):
         Page(FIGURES, "couplings", *CAPTION).save_figure(draw(read_table(FIGURES / "couplings.csv")), source)
-    (DOCS / "couplings.md").write_text(page(), encoding="utf-8")
+    PAGE.write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     ./with-fenicsx python3 demos/fork/mesh.py
 
-Copy it and change the numbers, or leave it out: any mesh by Gmsh with these names will do (docs/own_body.md).
+Copy it and change the numbers, or leave it out: any mesh by Gmsh with these names will do (docs/my_own_vessel.md).
 """
 
 from __future__ import annotations

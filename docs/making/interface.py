@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import inspect
+import itertools
 import re
 import subprocess
 import sys
@@ -209,5 +210,46 @@ def columns_table() -> str:
     rows = [(key, "all" if shapes == everywhere else ", ".join(shapes)) for key, shapes in always]
     rows += [(key, f"{', '.join(shapes)}, on request") for key, shapes in found[1].items()]
     rows += [((column.name, column.unit, column.meaning), "on request") for column in COLUMNS_ON_REQUEST.values()]
-    cells = ([f"`{name}`", of, unit, meaning] for (name, unit, meaning), of in rows)
+    cells = (
+        [", ".join(f"`{name}`" for name in names), of, unit, meaning] for names, of, unit, meaning in together(rows)
+    )
     return markdown(["column", "of", "unit", "meaning"], cells)
+
+
+def together(rows: Iterable[tuple[tuple[str, str, str], str]]) -> Iterator[tuple[list[str], str, str, str]]:
+    """Columns of one quantity at several places in one row: those with one stem whose meanings are nearly the same."""
+
+    def stem(row: tuple[tuple[str, str, str], str]) -> tuple[str, str, str]:
+        (name, unit, _), of = row
+        return name.rpartition("_")[0] or name, unit, of
+
+    for (_, unit, of), found in itertools.groupby(rows, stem):
+        group = [key for key, _ in found]
+        names, meanings = [name for name, _, _ in group], [meaning for _, _, meaning in group]
+        one = one_meaning(meanings)
+        if one is not None:
+            yield names, of, unit, one
+        else:
+            yield from (([name], of, unit, meaning) for name, meaning in zip(names, meanings, strict=True))
+
+
+def one_meaning(meanings: list[str]) -> str | None:
+    """Of meanings that differ in one place alone: what they share, and there what each of them says."""
+    words = [meaning.split() for meaning in meanings]
+    before = common(words)
+    rest = [line[before:] for line in words]
+    after = common([line[::-1] for line in rest])
+    differing = [" ".join(line[: len(line) - after]) for line in rest]
+    if 2 * (before + after) < max(map(len, words)):
+        return None
+    if len(words) == 1:
+        return meanings[0]
+    mark = differing[0][-1:] if differing[0][-1:] in (",", ":") else ""
+    parts = [part.removesuffix(mark) for part in differing]
+    said = "; ".join(parts) if len(parts) < 5 else f"{parts[0]} to {parts[-1]}"
+    return " ".join([*words[0][:before], said + mark, *words[0][len(words[0]) - after :]])
+
+
+def common(lines: list[list[str]]) -> int:
+    """How many words all lines begin with."""
+    return sum(1 for _ in itertools.takewhile(lambda words: len(set(words)) == 1, zip(*lines)))

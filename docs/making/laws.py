@@ -1,4 +1,4 @@
-"""The laws beside each other, for docs/laws.md: three bodies, seven laws, coarse meshes.
+"""The laws beside each other, for docs/laws_and_couplings.md: three bodies, seven laws, coarse meshes.
 
 The histories stay in docs/figures/laws.csv; table and picture are made from it alone, so that a test can do the same
 without a run.
@@ -25,7 +25,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
 from tests.runs import made
 
-PAGE = DOCS / "laws.md"
+PAGE = DOCS / "laws_and_couplings.md"
 LATE = 10  # steps at the end of a run in which the cells should have come to rest
 CAPTION = (
     "The laws beside each other",

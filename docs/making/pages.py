@@ -40,7 +40,7 @@ def by_layer(columns: Sequence[tuple[str, Sequence[Any]]]) -> str:
 
 
 def between_marks(text: str, name: str, made: str) -> str:
-    """A page with another text between the two comments of this name, of which the first one has the command."""
+    """A page with another text between the two comments of this name."""
     start, end = f"<!-- {name}: ./with-fenicsx ", f"\n<!-- end of {name} -->"
     before, rest = text.split(start)
     command, rest = rest.split("\n", 1)

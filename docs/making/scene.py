@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
 
-import tomlkit
-
-from docs.making.pages import DOCS, filled, lines
+from docs.making.pages import filled, lines, markdown
 from remodel_fenicsx.extend import SHAPES, Dimension, markdown_reference
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES, RANDOM_CELLS
-from remodel_fenicsx.schema.tables import paragraphs
-from remodel_fenicsx.schema.text import merged
+from remodel_fenicsx.schema.tables import paragraphs, shown
 from remodel_fenicsx.schema.units import keys_with_units
 
 
@@ -19,15 +18,18 @@ def page() -> str:
     """Of the keys as they are."""
     words = {"keys": markdown_reference(Scene).rstrip(), "presets": "\n".join(_presets()).rstrip()}
     rows = {"units": _units(), "loads": _loads(), "profiles": _profiles()}
-    return filled(DOCS / "scene.template.md", words | {name: lines(found) for name, found in rows.items()})
+    return filled(
+        Path(__file__).with_name("scene.template.md"), words | {name: lines(found) for name, found in rows.items()}
+    )
 
 
 def _units() -> Iterator[list[str]]:
-    """A row for each dimension that a key of a scene has."""
+    """A row for each dimension that a key of a scene has; regions have those of their tables."""
     loads = {name: kind.dimension for shape in SHAPES.values() for name, kind in shape.loads.items() if kind.dimension}
     keys: dict[Dimension, list[str]] = {}
     for key, dimension in (*keys_with_units(Scene), *((f"loads.{name}.value", unit) for name, unit in loads.items())):
-        keys.setdefault(dimension, []).append(f"`{key}`")
+        if not key.startswith("regions.NAME.material."):
+            keys.setdefault(dimension, []).append(f"`{key}`")
     for dimension, names in keys.items():
         unit = " ".join(f"{name}^{power}" if power != 1 else name for name, power in dimension.powers)
         yield [dimension.name, f"`{dimension.example}`", f"`{unit}`", ", ".join(names)]
@@ -41,17 +43,42 @@ def _profiles() -> Iterator[list[str]]:
 
 
 def _loads() -> Iterator[list[str]]:
-    """A row for each load of each shape."""
+    """A row for each load, with the shapes that have it."""
+    shapes: dict[tuple[str, str], list[str]] = {}
     for shape, table in SHAPES.items():
         for name, kind in table.loads.items():
             unit = f", in the unit of {kind.dimension.name}" if kind.dimension else ""
-            yield [f"`{name}`", f"`{shape}`", f"{kind.meaning}{unit}"]
+            shapes.setdefault((name, f"{kind.meaning}{unit}"), []).append(f"`{shape}`")
+    yield from ([f"`{name}`", ", ".join(having), meaning] for (name, meaning), having in shapes.items())
+
+
+def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted keys and values of nested tables, as a scene writes them."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", f"`{shown(value)}`"
 
 
 def _presets() -> Iterator[str]:
-    """A section for each preset: its note, and a scene of each shape."""
-    for name, shapes in PRESETS.items():
+    """A section for each preset: its note, and its keys by shape; after the first only what is other than there."""
+    first = _by_key(next(iter(PRESETS.values())))
+    for number, (name, shapes) in enumerate(PRESETS.items()):
         yield from (f"## Preset `{name}`", "", *paragraphs(PRESET_NOTES[name]), "")
-        for shape, values in shapes.items():
-            body = tomlkit.dumps(merged({"geometry": {"shape": shape}}, values)).strip()
-            yield from (f"Shape `{shape}`:", "", f"```toml\n{body}\n```", "")
+        rows = _by_key(shapes)
+        if number:
+            yield from (f"All else is as in the preset `{next(iter(PRESETS))}`.", "")
+            rows = {row: having for row, having in rows.items() if first.get(row) != having}
+        of = ("all" if having == list(shapes) else ", ".join(having) for having in rows.values())
+        cells = ([f"`{key}`", value, shape] for (key, value), shape in zip(rows, of, strict=True))
+        yield from (markdown(["key", "value", "of"], cells), "")
+
+
+def _by_key(shapes: Mapping[str, Any]) -> dict[tuple[str, str], list[str]]:
+    """Shapes of each key and value of a preset, keys beside each other."""
+    found: dict[str, dict[tuple[str, str], list[str]]] = {}
+    for shape, values in shapes.items():
+        for key, value in flat(values):
+            found.setdefault(key, {}).setdefault((key, value), []).append(shape)
+    return {row: having for rows in found.values() for row, having in rows.items()}

@@ -20,7 +20,7 @@ from pathlib import Path
 
 DOCS = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-NAMED = re.compile(r"# (\w+\.(?:toml|py))\n")
+NAMED = re.compile(r"# (\w+\.(?:toml|py|csv))\n")
 NUMBER = re.compile(r"(?<![\w.])-?\d[\d.,:]*(?:e[+-]?\d+)?(?!\w)")
 PICTURES = {  # of docs/figures: what a page's commands leave
     "tutorial-artery.png": "artery.png",
@@ -28,6 +28,7 @@ PICTURES = {  # of docs/figures: what a page's commands leave
     "tutorial-layers.png": "layers.png",
     "tutorial-bent.png": "bent.png",
     "tutorial-residual-stress.png": "angles.png",
+    "tutorial-hypertension.png": "high.png",
     "tutorial-fit.png": "fitted/fit.png",
     "tutorial-biaxial.png": "biaxial/fit.png",
     "tutorial-gel.png": "gel.png",
@@ -82,7 +83,7 @@ def brought_up_to_date(text: str) -> str:
         language, content = block.groups()
         if language == "sh":
             printed = "".join(map(obey, content.splitlines()))
-        elif language in ("toml", "python"):
+        elif language in ("toml", "python", "text"):
             keep(content)
         elif language == "output":
             content = "".join(f"{line}\n" for line in printed_as(content, printed))
@@ -93,7 +94,7 @@ def brought_up_to_date(text: str) -> str:
 
 def make(keep: bool) -> None:
     """All pages in one folder: they use each other's files. There is nothing to keep."""
-    order = re.findall(r"\((tutorial_\w+)\.md\)", (DOCS / "tutorials.md").read_text(encoding="utf-8"))
+    order = re.findall(r"\((tutorial_\w+|fit)\.md\)", (DOCS / "tutorials.md").read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         Path("demos").symlink_to(DOCS.parent / "demos")

@@ -321,7 +321,7 @@ class Scene(Table):
         """Whether the coupling "implicit" leaves no error in time: steps of any length lead to the same cells.
 
         So it is where the cells depend on the time and the tension that they have then alone. From random cells some
-        points have no such state (docs/couplings.md).
+        points have no such state (docs/laws_and_couplings.md).
         """
         depends_on_now = LAWS[self.remodeling.law].of_absolute_time and not self.jumps_by_rank
         return depends_on_now and self.missing_for_implicit() is None

@@ -141,8 +141,8 @@ class Support(Table):
     direction hold the face, like the tissue around a vessel. 'free': nothing holds the face."""
     stiffness: Annotated[float | None, FOUNDATION] = Field(default=None, gt=0)
     """Force per area and displacement, in stress_unit over the scene's unit of length. 'elastic' needs it. For 'guided'
-    and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over the wall's thickness. With it a plane moves by a
-    thousandth of what the wall's own compression does."""
+    and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over the wall's thickness: a plane moves by a thousandth
+    of the wall's own compression."""
     tangential: float = Field(default=1.0, ge=0, le=1)
     """For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown may twist. With 0 a
     tube may be solved on one radius, which cannot twist."""
@@ -246,9 +246,8 @@ class Material(Table):
     """Force law of a single chain."""
     repulsion: Annotated[str, OneOf(REPULSIONS)] = "axes"
     """Form of the repulsive energy that makes the reference state free of stress. 'axes' is the paper's, in the
-    stretches along the three cell axes. 'log' depends on the structure tensor alone (A : ln C); it equals 'axes' where
-    both have the same axes, and suits the law 'tensor'. 'length' depends on the length of the chains alone. Where
-    neither scene nor preset names one, the law 'tensor' has 'log'."""
+    stretches along the three cell axes. 'log' depends on the structure tensor alone (A : ln C), and suits the law
+    'tensor'. 'length' depends on the length of the chains alone. Default with the law 'tensor': 'log'."""
     stress_unit: Literal["Pa", "kPa", "MPa"] = "Pa"
     """Unit of every stress, pressure and Lame constant of the scene. Forces are in this unit times the unit of length
     squared."""
@@ -369,9 +368,9 @@ class Natural(Table):
     """The configuration in which the tissue is free of stress, if that is not the mesh (docs/tissue_that_lives.md)."""
 
     opening_angle: float = Field(default=0.0, ge=0, le=180)
-    """For a tube: how far a cut ring opens, as the angle of the missing sector in degrees (360 less the angle of the
-    sector). Fung's opening angle, between the lines from the middle of the inner arc to its ends, is half of it. 0
-    means that the tissue of the mesh is free of stress."""
+    """For a tube: how far a cut ring opens, the angle of the missing sector in degrees. Fung's opening angle, between
+    the lines from the middle of the inner arc to its ends, is half of it. 0: the tissue of the mesh is free of
+    stress."""
     layers: Annotated[tuple[NaturalLayer, ...], IN_A_LIST] = Field(
         default=(), json_schema_extra={"allowed": "a list of tables, each [[natural.layers]]"}
     )
@@ -380,13 +379,12 @@ class Natural(Table):
 
     cells: Literal["as-given", "equilibrium"] = AS_GIVEN
     """Cells of a tube whose geometry is the loaded one (geometry.is). 'as-given': those of [cells]. 'equilibrium':
-    those that remodeling comes to under these loads, as in a vessel that was scanned. The run then begins with [cells]
-    and comes to the given tube at its end; it needs time.end = 'equilibrium'."""
+    those that remodeling comes to under these loads, as in a vessel that was scanned; it needs time.end =
+    'equilibrium'."""
 
     fibres: bool | None = Field(default=None, json_schema_extra={"allowed": "true or false"})
-    """Whether the run begins with the prestretch that the file of cells.fibres has too, and with its content,
-    natural length and growth (these with remodeling.turnover), as `export` writes them. A file with any is refused
-    where this is not said."""
+    """Whether the run begins with what the file of cells.fibres has beside the cells, as `export` writes it:
+    prestretch, content, natural length and growth. A file with any is refused where this is not said."""
 
     @property
     def is_of_the_mesh(self) -> bool:
@@ -485,14 +483,14 @@ class Cells(Table):
         default=None, min_length=1, json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"}
     )
     """File of measured fibres (.vtu, .xdmf or .csv, relative to the scene). It gives axes and dimensions of the cells
-    at t = 0 (docs/own_body.md, Fibres in and out). The run keeps a copy in its folder."""
+    at t = 0 (docs/my_own_vessel.md, Measured fibres in). The run keeps a copy in its folder."""
     fibres_sha256: str | None = Field(
         default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
     )
     """SHA-256 of that file. A scene as run has it, and refuses another file."""
     axes: Annotated[str, OneOf(AXES)] = "global"
     """Cell axes n_I before the first pass. 'global': x, y, z. 'cylindrical': circumferential, axial, radial, about the
-    z axis. 'local': the same, found on a mesh (docs/own_body.md). Where neither scene nor preset names them, a tube has
+    z axis. 'local': the same, found on a mesh (docs/my_own_vessel.md). Where nothing names them, a tube has
     'cylindrical'."""
     aligned_axis: Annotated[int, OneOf((1, 2, 3))] = 3
     """Number of the axis that 'aligned' cells lie along. With global axes 3 is z, the load axis of cube and tendon.
@@ -501,8 +499,7 @@ class Cells(Table):
     """Seed of the random cells. The same seed and mesh give the same cells on any number of ranks."""
     antithetic: bool = False
     """Random cells only. Seeds 1 to 3, 4 to 6 and so on have the same draws, with l_1, l_2 and l_3 in turn (antithetic
-    variates). Each seed alone is as random as without. Means over whole threes scatter less, mostly by far
-    (docs/speed_and_accuracy.md)."""
+    variates). Means over whole threes scatter less."""
     end_to_end_length: float = Field(default=1.0, gt=0)
     """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It is a material constant:
     the repulsive energy keeps this value while the cells remodel."""
@@ -759,12 +756,11 @@ class Remodeling(Table):
     law: Annotated[str, OneOf(LAWS)] = "explicit"
     """How the cells change in time. 'explicit' is eq. (11), in absolute time. 'rate' integrates eq. (10). 'relaxation'
     is dl/dt = kappa (r0 e - l), right for changing loads. 'rotation' (Remark 5) turns the axis of the largest dimension
-    gradually and keeps the dimensions. 'tensor' is 'relaxation' for the structure tensor as a whole, without ranks and
-    axes. 'none' leaves the cells as they are. Where neither scene nor preset names one, it is 'tensor'."""
+    and keeps the dimensions. 'tensor' is 'relaxation' for the structure tensor as a whole, without ranks and axes.
+    'none': cells stay. Default without a preset: 'tensor'."""
     frame: Annotated[str, OneOf(FRAMES)] = "material"
     """Axes of the remodeled cells, for the drivers 'cauchy' and 'finger'. 'material': the fibres that the deformation
-    carries onto the principal directions (objective). 'spatial': the principal directions themselves, as printed. The
-    driver 'pk2' has material eigenvectors of its own."""
+    carries onto the principal directions (objective). 'spatial': the principal directions themselves, as printed."""
     pairing: Annotated[str, OneOf(PAIRINGS)] = "sorted"
     """Which cell dimension follows which principal value. 'sorted': by rank, as printed; where two values cross, the
     cell turns by 90 degrees at once. 'continuous': by axis; each principal direction continues the axis that it
@@ -784,11 +780,12 @@ class Remodeling(Table):
     (docs/which_numbers.md)."""
     threshold: Annotated[float, STRESS] = Field(default=0.0, ge=0)
     """Lazy zone: the principal stress s0 up to which a point does not remodel. Above it kappa has the factor max(0, 1 -
-    s0/s), where s is the largest principal stress. For the law 'tensor' and drivers that are stresses (docs/laws.md).
+    s0/s), where s is the largest principal stress. For the law 'tensor' and drivers that are stresses
+    (docs/laws_and_couplings.md).
     """
     exponent: float = Field(default=2.0, gt=0, le=16)
     """Exponent n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law
-    'tensor' (docs/laws.md)."""
+    'tensor' (docs/laws_and_couplings.md)."""
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="What the cells follow where there are several load cases ([[cases]]). "
@@ -1180,10 +1177,10 @@ class Time(Table):
     tolerance: float | None = Field(
         default=None, gt=0, json_schema_extra={"allowed": "a number greater than 0, in degrees"}
     )
-    """Lets the program choose the steps: as long as the estimated error in time stays below this angle, in degrees. The
-    error is that of chain directions (root mean square over the body) and that of lengths (relative; 1 degree stands
-    for 1.7 %). A step ends at each time of a ramp and of output.times. On the way to an equilibrium steps are always
-    chosen so; the default there is 3 degrees, or 0.5 where a load falls."""
+    """Lets the program choose the steps so that the estimated error in time stays below this angle, in degrees: that of
+    chain directions (root mean square over the body), and that of lengths (relative; 1 degree stands for 1.7 %). A step
+    ends at each time of a ramp and of output.times. With end = 'equilibrium' the default is 3 degrees, or 0.5 where a
+    load falls."""
 
     @model_validator(mode="after")
     def _whole_number_of_steps(self) -> Time:
@@ -1300,29 +1297,28 @@ class Solver(Table):
         "(docs/speed_and_accuracy.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
-    """Where Newton's method starts a step. 'none': at the displacement of the step before. 'autoregressive': at what
-    the increments of the last steps predict. 'with-tolerance': as predicted where steps are chosen (time.tolerance),
-    otherwise as 'none'. The solutions are the same to the tolerance."""
+    """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' at what the
+    last increments predict, 'with-tolerance' as predicted where steps are chosen (time.tolerance), else as 'none'. The
+    solutions are the same to the tolerance."""
     absolute_tolerance: Annotated[float, FORCE] = Field(default=0.0, ge=0)
     """A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, where R has the
-    out-of-balance nodal forces. It is a force, so it depends on the units of the scene."""
+    out-of-balance nodal forces. It is a force, in the units of the scene."""
     relative_tolerance: float = Field(default=1e-10, ge=0, lt=1)
-    """See absolute_tolerance. It is relative to the norm of the internal nodal forces, which stays when the load is
-    held."""
+    """Relative to the norm of the internal nodal forces; see absolute_tolerance."""
     maximum_iterations: int = Field(default=25, ge=1)
     """Newton iterations after which a step counts as failed."""
     maximum_halvings: int = Field(default=12, ge=0)
     """How often a failed step is halved before the run ends with an error."""
     unstable: Literal["warn", "stop"] = "warn"
-    """What to do at an equilibrium that the body would leave: one with more negative eigenvalues of the tangent than
-    before. 'warn': say where, and go on. 'stop': look for it in every step, and end the run after the last stable step
-    (exit code 3)."""
+    """What to do at an equilibrium that the body would leave: the tangent has more negative eigenvalues than before.
+    'warn': say where, and go on. 'stop': look in every step, and end the run after the last stable one (exit code
+    3)."""
     petsc_options: Annotated[dict[str, str | bool | int | float], AfterValidator(_are_options)] = Field(
         default_factory=dict,
         json_schema_extra={"allowed": "a table with a string, a finite number, true or false for each option"},
     )
     """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_... and mat_.... Options
-    that run code or write files are refused. Options of the variable PETSC_OPTIONS are not looked at."""
+    that run code or write files are refused."""
 
     def check_with(self, scene: Scene, key: str) -> None:
         """Multigrid has no place for one more unknown."""
@@ -1369,12 +1365,12 @@ class Output(Table):
         json_schema_extra={"allowed": "true, false or a list of: " + ", ".join(map(repr, ALL_FIELDS))},
     )
     """Fields to write for ParaView: true for all, false for none, or a list of names (docs/commands.md). 'chains'
-    stands for the chain lines. Fields that are not asked for are not computed."""
+    stands for the chain lines. Others are not computed."""
     columns: Annotated[tuple[str, ...], IN_A_LIST, AfterValidator(lambda names: tuple(dict.fromkeys(names)))] = Field(
         default=(), json_schema_extra={"allowed": "a list of names of columns"}
     )
-    """Columns of the history. Those that are there only on request ('pass_residual', 'negative_eigenvalues' and others,
-    docs/commands.md) are added. Where any others are named, only those are measured, with time and loads."""
+    """Columns of the history. Those that are there on request only (docs/commands.md) are added. Where any others are
+    named, only those are measured, with time and loads."""
     every: int = Field(default=1, ge=1)
     """Write the fields of every n-th step, and of the last one."""
     times: Annotated[tuple[Annotated[float, Field(gt=0)], ...], IN_A_LIST, AfterValidator(_increasing)] = Field(
@@ -1385,9 +1381,8 @@ class Output(Table):
     report: bool = True
     """Make a page of the run for a browser, report.html, at its end (docs/report.md)."""
     checkpoint: int | None = Field(default=None, ge=0)
-    """Number of steps between two checkpoints, from which a run can be resumed; 0 means only at the end. Without it
-    time decides: at most 10 minutes are lost, and checkpoints cost less than 5 % of the run. There is always one at the
-    end, however the run ends."""
+    """Number of steps between two checkpoints, from which a run can be resumed; 0 means only at the end. Without it at
+    most 10 minutes are lost, and checkpoints cost less than 5 % of the run. There is always one at the end."""
 
     def check_with(self, scene: Scene, key: str) -> None:
         """Times, fields and columns that the run will have."""

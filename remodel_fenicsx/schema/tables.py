@@ -524,19 +524,34 @@ def markdown_reference(table: type[BaseModel]) -> str:
     >>> print(markdown_reference(Scene).splitlines()[0])
     ## Top of the file
     """
-    return "\n".join(_section(key, variant, inner) for key, variant, inner in sections(table))
+    told: dict[str, dict[str, str]] = {}
+    return "\n".join(_section(key, variant, inner, told.setdefault(key, {})) for key, variant, inner in sections(table))
 
 
-def _section(key: str, variant: str, table: type[BaseModel]) -> str:
+def _section(key: str, variant: str, table: type[BaseModel], told: dict[str, str]) -> str:
+    """`told`: rows of other variants of the table, with the variant; they are named only."""
     name = f"[[{key[:-2]}]]" if key.endswith("[]") else f"[{key}]"
     title = f"## `{name}`" + (f" of shape `{variant!r}`" if variant else "") if key else "## Top of the file"
-    rows = [
-        " | ".join([f"| `{name}`", _default(field), _cell(allowed(field)), _cell(text) + " |"])
-        for name, field in table.model_fields.items()
-        if (text := description(table, name))
-    ]
-    head = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
-    return "\n".join([title, "", *paragraphs(meaning(table)), "", *head, *rows, ""])
+    texts = {name: text for name in table.model_fields if (text := description(table, name))}
+    rows = {
+        name: " | ".join(
+            [f"| `{name}`", _default(table.model_fields[name]), _cell(allowed(table.model_fields[name])), _cell(text)]
+        )
+        for name, text in texts.items()
+    }
+    elsewhere: dict[str, list[str]] = {}
+    for name, row in rows.items():
+        if (as_key := re.match(r"As `([\w.]+)\.\w+`, for this region", texts[name])) is not None:
+            elsewhere.setdefault(f"as in `[{as_key[1]}]`, else those of the whole body", []).append(f"`{name}`")
+        elif variant and row in told:
+            elsewhere.setdefault(f"as of shape `{told[row]!r}`", []).append(f"`{name}`")
+    told |= {row: variant for row in rows.values() if row not in told}
+    left_out = {name for names in elsewhere.values() for name in names}
+    shown_rows = [f"{row} |" for name, row in rows.items() if f"`{name}`" not in left_out]
+    also = [f"Keys {where}: {', '.join(names)}." for where, names in elsewhere.items()]
+    head = ["| key | default | allowed | meaning |", "|---|---|---|---|"] if shown_rows else []
+    said = "\n\n".join([meaning(table), *also])
+    return "\n".join([title, "", *paragraphs(said), "", *head, *shown_rows, *([""] if shown_rows else [])])
 
 
 def paragraphs(text: str) -> list[str]:

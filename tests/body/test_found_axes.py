@@ -1,6 +1,6 @@
 """Local axes that are found on a mesh, against closed forms: tube, torus, ellipse, bend with legs; forks; faults.
 
-Limits in degrees are 1.2 times what the method was measured to reach when it was chosen (docs/own_body.md).
+Limits in degrees are 1.2 times what the method was measured to reach when it was chosen (docs/my_own_vessel.md).
 """
 
 from __future__ import annotations

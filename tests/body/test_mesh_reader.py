@@ -139,7 +139,7 @@ def scene_of(file: Path, **geometry: Any) -> Any:
 
 @pytest.mark.parametrize("sign", [1, -1])  # SALOME counts families of elements below zero
 def test_a_med_file_is_converted_as_the_docs_say(tmp_path: Path, sign: int) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "own_body.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "my_own_vessel.md").read_text(encoding="utf-8")
     command = re.search(r"^\./with-fenicsx (.*meshio.*)$", page, flags=re.MULTILINE)
     source = write_tube(tmp_path / "tube.msh")
     mesh, kinds = meshio.read(source), ("quad", "hexahedron")

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, SceneError, Simulation, preset_scene, read_scene
-from remodel_fenicsx.extend import CHAINS, DRIVERS, LAWS
+from remodel_fenicsx.extend import CHAINS, DRIVERS, LAWS, MATRICES
 from remodel_fenicsx.model.implicit import CondensedPoints
+from remodel_fenicsx.studies.fit import model_of, read_measurements
 from tests.model.test_condensed import deformations, points, solved, tangent_errors
 
 FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
@@ -24,8 +25,8 @@ FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
 @pytest.fixture(autouse=True)
 def parts() -> Iterator[None]:
     """Those of the files, as the command line loads them."""
-    with patch.dict(CHAINS), patch.dict(DRIVERS), patch.dict(LAWS):
-        for name in ("freely_jointed_chain", "mandel_driver", "kappa_by_temperature"):
+    with patch.dict(CHAINS), patch.dict(DRIVERS), patch.dict(LAWS), patch.dict(MATRICES):
+        for name in ("freely_jointed_chain", "mandel_driver", "kappa_by_temperature", "second_network"):
             assert len((FOLDER / f"{name}.py").read_text().splitlines()) < 60
             runpy.run_path(str(FOLDER / f"{name}.py"))
         yield
@@ -126,3 +127,29 @@ def test_kappa_depends_on_the_temperature_of_each_region() -> None:
     tube = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"remodeling.law": "arrhenius", "regions": layers})
     cool, usual = (one.kappa for one in tube.properties().values())
     assert cool < usual == tube.remodeling.kappa
+
+
+SECOND = {"material__matrix": "with-second-network", "material__repulsion": "log", "remodeling__law": "none"}
+
+
+def test_a_second_network_like_the_first_is_as_good_as_twice_the_chains() -> None:
+    """Of isotropic cells, in the units of the first, whose length without load is 1."""
+    half = scene(**SECOND)
+    tissue = Simulation(half).tissue
+    second = {"second_modulus": tissue.network_modulus, "second_contour_length": tissue.contour_length}
+    two = scene(**SECOND, **{f"material__{name}": float(value) for name, value in second.items()})
+    one = {"repulsion": "log", "chain_density": 2 * half.material.chain_density}
+    one_of_twice = scene(remodeling__law="none", **{f"material__{name}": value for name, value in one.items()})
+    np.testing.assert_allclose(rows(two, "mean_stretch"), rows(one_of_twice, "mean_stretch"), rtol=1e-9)
+    assert abs(rows(two, "mean_stretch")[-1] / rows(half, "mean_stretch")[-1] - 1) > 1e-3
+
+
+def test_two_networks_follow_a_tissue_that_one_does_not() -> None:
+    """Seven measured protocols: at least 0.97 of the variance, where one network comes to 0.69 and 0.79."""
+    folder = FOLDER.parent / "biaxial"
+    file = read_scene(folder / "two_networks.toml")
+    _, (table,) = read_measurements(folder / "two_networks_tissue.toml", file)
+    modelled = model_of(file, table, {})
+    for column in ("nominal_stress_x", "nominal_stress_y"):
+        measured = table.columns[column]
+        assert 1 - np.var(modelled[column] - measured) / np.var(measured) > 0.97

@@ -304,7 +304,7 @@ def test_the_page_leads_from_a_curve_to_numbers(tmp_path: Path, monkeypatch: pyt
         words = shlex.split(line.removeprefix("./with-fenicsx remodel-fenicsx "))
         more = {"run": ["-q", "--set", "time.end=12"], "fit": ["-q", "--starts", "1"]}.get(words[0], [])
         assert cli.main(words + more) == 0, line
-    with Path("fitted/fit.csv").open() as file:
+    with Path("found/fit.csv").open() as file:
         table = {row["key"]: row for row in csv.DictReader(file)}
     said = re.findall(r"^\| `(\w+)` \| ([\d.]+).* \| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
     assert len(said) == 3
@@ -312,7 +312,7 @@ def test_the_page_leads_from_a_curve_to_numbers(tmp_path: Path, monkeypatch: pyt
         found = table[f"material.{key}"]
         for name, number in (("value", value), ("profile_lower", low), ("profile_upper", high)):
             assert float(found[name]) == pytest.approx(float(number), rel=1e-2), key
-    assert len(table) == 3 and Path("vessel/history.csv").exists()
+    assert len(table) == 3 and Path("mine/history.csv").exists()
 
 
 def stretched(network: dict[str, float]) -> Scene:
