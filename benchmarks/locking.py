@@ -3,8 +3,9 @@
 
     ./with-fenicsx benchmarks/locking.py [--largest N]
 
-Makes docs/locking.md from runs: without chains, in a bulk from soft to stiff, for every formulation; what a run says of
-itself beside its error. N (default: all) leaves out meshes with more elements. A quarter of an hour on an idle core.
+Makes two tables of docs/what_may_go_wrong.md, and results/locking.md with all of them, from runs: without chains, in
+a bulk from soft to stiff, for every formulation; what a run says of itself beside its error. N (default: all) leaves
+out meshes with more elements. A quarter of an hour on an idle core.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from docs.making.pages import DOCS, filled, made_with, markdown
+from docs.making.pages import DOCS, between_marks, filled, made_with, markdown
 from remodel_fenicsx import Scene
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.scene.presets import PROFILES
@@ -249,7 +250,13 @@ def main() -> None:
         head = ["elements", "number", "formulation", "tip (mm)", "error", "iterations"]
         words["bar"] = table(head, bar_rows(largest))
     if largest == 10**9:
-        (DOCS / "locking.md").write_text(filled(Path(__file__).with_suffix(".template.md"), words), encoding="utf-8")
+        made = filled(Path(__file__).with_suffix(".template.md"), words)
+        (DOCS.parent / "results" / "locking.md").write_text(made, encoding="utf-8")
+        page = DOCS / "what_may_go_wrong.md"
+        text = page.read_text(encoding="utf-8")
+        for name in ("turning", "tube"):
+            text = between_marks(text, name, words[name])
+        page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

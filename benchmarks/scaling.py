@@ -2,7 +2,7 @@
 """How time and memory grow with the body: the artery on finer meshes, on one rank and on two.
 
     ./with-fenicsx benchmarks/scaling.py [--unknowns N]... [--ranks N]... [--steps 3] [--method auto]    # measures
-    ./with-fenicsx benchmarks/scaling.py --report       # docs/speed.md's table and cost model from what was measured
+    ./with-fenicsx benchmarks/scaling.py --report       # table and cost model (docs/speed_and_accuracy.md)
 
 Each case is a run of its own (the paper's tube, random cells, no fields, predictor on) with the mesh whose number of
 unknowns is nearest to N; its first load steps are solved. Results are lines of results/scaling.jsonl: wall and

@@ -8,8 +8,9 @@ for the printed coupling, the implicit one and the consistent variant, against t
 tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `end`, chosen steps against
 equal ones there, in turns; `paper`, the paper's own mesh there, at its points too; `whole`, the whole tube in three
 dimensions, up to 20 minutes a run; `hold`, chosen steps against equal ones to t = 1000; `tendon`, the paper's with
-random cells. An hour or more of one core, most of it the whole tube. Then makes docs/speed_and_accuracy.md, its
-appendix and picture; --only makes no page, --report makes it from what is there. What is recorded is used again.
+random cells. An hour or more of one core, most of it the whole tube. Then makes tables and picture of
+docs/speed_and_accuracy.md, and tables.md beside what is recorded; --only makes no page, --report makes it from what is
+there. What is recorded is used again.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.precision import chosen, places, tendon, whole
 from benchmarks.precision.kept import EVERY_TANGENT, Array, Found, Kept
-from docs.making.pages import DOCS, FIGURES, filled, lines, made_with
+from docs.making.pages import DOCS, FIGURES, between_marks, filled, lines, made_with, markdown
 from remodel_fenicsx.body.shape import profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
@@ -36,7 +37,8 @@ from remodel_fenicsx.studies.trade import pareto
 from tests.reference.radial import solve_radial
 
 PICTURE = "speed_and_accuracy"
-PAGES = {"work_precision": "speed_and_accuracy", "work_precision_appendix": "appendix_speed_and_accuracy"}  # templates
+PAGE = DOCS / "speed_and_accuracy.md"
+HEAD = ["seconds", "degrees", "largest", "radii, %", "method", "setting"]
 PARTS = ("artery", "end", "paper", "whole", "hold", "tendon")
 COARSE = (8.0, 4.0)  # tolerances, degrees
 TIMES = chosen.TO_THE_END
@@ -170,19 +172,28 @@ def points(kept: Kept) -> Iterator[Point]:
 def report(kept: Kept) -> None:
     """Write the page, its appendix and its picture."""
     found = sorted(points(kept), key=lambda point: point.found.seconds)
-    parts = {"rows": rows_of(found), "whole": rows_of([p for p in found if p.is_whole]),
-             "hold": chosen.hold_rows(kept), "end": chosen.end_rows(kept), "tendon": tendon.rows(kept),
-             "made": fill(f"Made with {made_with()}.", 100), "paper": paper_rows(found),
-             "places": places.words(kept)}  # fmt: skip
-    for template, page in PAGES.items():
-        text = filled(Path(__file__).with_name(f"{template}.template.md"), parts)
-        (DOCS / f"{page}.md").write_text(text, encoding="utf-8")
+    whole_tube = [point for point in found if point.is_whole]
+    parts = {"rows": rows_of(found), "whole": rows_of(whole_tube), "hold": chosen.hold_rows(kept),
+             "end": chosen.end_rows(kept), "tendon": tendon.rows(kept), "places": places.words(kept),
+             "made": fill(f"Made with {made_with()}.", 100)}  # fmt: skip
+    text = filled(Path(__file__).with_suffix(".template.md"), parts)
+    (kept.folder / "tables.md").write_text(text, encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
+    for name, made in {"paper": paper_rows(found), "front": best(found), "whole": best(whole_tube)}.items():
+        text = between_marks(text, name, made)
+    PAGE.write_text(text, encoding="utf-8")
     _draw(found)
 
 
 def rows_of(found: Sequence[Point]) -> str:
     """Settings, the cheapest first; those on their front stand out."""
     return lines(_row(point, on) for point, on in zip(found, _front(found), strict=True))
+
+
+def best(found: Sequence[Point]) -> str:
+    """Those on the front."""
+    on = [point for point, is_best in zip(found, _front(found), strict=True) if is_best]
+    return markdown(HEAD, (_row(point, False) for point in on))
 
 
 def _row(p: Point, is_best: bool) -> list[str]:
@@ -196,7 +207,8 @@ def paper_rows(found: Sequence[Point]) -> str:
     printed = {point.name: point.found for point in found if point.method == "printed"}
     whole, wall = printed["full-1-degree-1-step-1"], printed["radial-1-degree-1-step-1"]
     own = ["the whole tube", f"{whole.seconds:.3g}", f"{whole.typical:.2g}", f"{whole.anywhere:.2g}"]
-    return lines([own, ["the wall alone on the same elements", f"{wall.seconds:.1g}", f"{wall.typical:.2g}", ""]])
+    alone = ["the wall alone on the same elements", f"{wall.seconds:.1g}", f"{wall.typical:.2g}", ""]
+    return markdown(["the printed method", "seconds", "degrees", "largest"], [own, alone])
 
 
 def _front(found: Sequence[Point]) -> list[bool]:

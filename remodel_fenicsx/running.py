@@ -259,7 +259,7 @@ def _record(
         log.info("%s", scene.summary())
         unknowns = simulation.unknown.x.petsc_vec.getSize()
         if comm.size > 1 and unknowns < WORTH_RANKS:
-            log.info("%d unknowns: one rank is faster than %d (docs/speed.md, Ranks)", unknowns, comm.size)
+            log.info("%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)", unknowns, comm.size)
         for warning in simulation.scene.warnings():  # the one whose files have places
             log.warning("%s", warning)
         followers, kept = list(watchers), [record.flush]

@@ -21,7 +21,9 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser.add_argument("--reduced", action="store_true", help="only the cases of the test")
     parser.add_argument("--judge", action="store_true", help="only what has been measured with any reference before")
     parser.add_argument("--list", action="store_true", help="print the cases, run nothing")
-    parser.add_argument("--report", action="store_true", help="write docs/stability.md and its picture, run nothing")
+    parser.add_argument(
+        "--report", action="store_true", help="write table and picture of docs/what_may_go_wrong.md, run nothing"
+    )
     options = parser.parse_args(arguments)
     if options.report:
         return report.write(options.results, all_cases(), running.source_of())

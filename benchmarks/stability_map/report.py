@@ -1,4 +1,4 @@
-"""Tables, the page docs/stability.md, its appendix and its picture, from what has been measured."""
+"""The table and the picture of docs/what_may_go_wrong.md, and what is said of cases, from what has been measured."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from textwrap import shorten
 from benchmarks.stability_map.cases import Case
 from benchmarks.stability_map.judging import OUTCOMES
 from benchmarks.stability_map.running import Record, digest, read_records
-from docs.making.pages import DOCS, FIGURES, filled, markdown
+from docs.making.pages import DOCS, FIGURES, between_marks, markdown
 
-PAGES = ("stability", "appendix_stability")  # docs/NAME.md from docs/NAME.template.md
+PAGE = DOCS / "what_may_go_wrong.md"
 EXTRA = ("false alarms", "refused, no cause")
 
 
@@ -91,7 +91,7 @@ def draw(file: Path, cases: Mapping[str, Case], records: Iterable[Record]) -> No
 
 # ---------------------------------------------------------------- the page
 def write(results: Path, cases: Mapping[str, Case], source: str) -> int:
-    """docs/stability.md, its appendix and its picture; 1 if nothing has been measured."""
+    """Table, picture, and cases.md beside the results; 1 if nothing has been measured."""
     of_package = [r for r in read_records(results / f"{source.partition('+')[0]}.jsonl") if r["source"] == source]
     last = {r["key"]: r for r in of_package if r["key"] in cases and r["digest"] == digest(cases[r["key"]])}
     records = [last[key] for key in cases if key in last]
@@ -99,17 +99,15 @@ def write(results: Path, cases: Mapping[str, Case], source: str) -> int:
         print(f"nothing has been measured with {source}: run benchmarks/stability.py first")
         return 1
     draw(FIGURES / "stability.png", cases, records)
-    words = {name: listed(records, cases, lambda r, name=name: r["outcome"] == name)  # type: ignore[misc]
-             for name in ("wrong", "warned", "unchecked")}  # fmt: skip
-    words |= {
-        "families": table(records),
-        "false_alarms": listed(records, cases, lambda record: record["false_alarm"]),
-        "references": references(cases),
-        "made": made(source, records, cases),
-    }
-    for page in PAGES:
-        text = filled(DOCS / f"{page}.template.md", words)
-        (DOCS / f"{page}.md").write_text(text, encoding="utf-8")
+    families = f"{table(records)}\n\n{made(source, records, cases)}"
+    PAGE.write_text(between_marks(PAGE.read_text(encoding="utf-8"), "families", families), encoding="utf-8")
+    parts = []
+    for outcome in ("wrong", "warned", "unchecked"):
+        said = listed(records, cases, lambda r, outcome=outcome: r["outcome"] == outcome)  # type: ignore[misc]
+        parts.append(f"# {outcome}\n\n{said}")
+    parts += ["# false alarms\n\n" + listed(records, cases, lambda record: record["false_alarm"])]
+    text = "\n\n".join([*parts, "# references\n\n" + references(cases)])
+    (results / "cases.md").write_text(text + "\n", encoding="utf-8")
     return 0
 
 

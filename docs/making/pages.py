@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from remodel_fenicsx import Simulation
 from remodel_fenicsx.studies.page import STYLE, Page, read_table
 from remodel_fenicsx.system.environment import versions
 
@@ -76,20 +75,6 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
     """Rows of a table, numbers where they are."""
     columns = read_table(path)
     return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
-
-
-# ---------------------------------------------------------------- runs
-def through_the_wall(simulation: Simulation) -> Columns:
-    """Radius without load, depth, hoop stress and fibre angle at the points of a tube as it is, by radius."""
-    cells, local = simulation.cells, simulation.cells.local_axes
-    found = {
-        "radius": local.coordinates[..., 0],
-        "depth": local.depth,
-        "stress": simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1],
-        "angle": simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, local.axes),
-    }
-    order = np.argsort(found["radius"].reshape(-1))
-    return {name: values.reshape(-1)[order] for name, values in found.items()}
 
 
 # ---------------------------------------------------------------- pictures

@@ -466,7 +466,7 @@ _is: Any = {  # a word of Python
             default="unloaded",
             description="What the geometry describes. 'unloaded': the body without loads. 'loaded', for a tube or a "
             "body of your own: the body under the loads at the end of their ramps; the unloaded body is found first "
-            "(docs/natural.md).",
+            "(docs/tissue_that_lives.md).",
         ),
     )
 }

@@ -140,7 +140,8 @@ class Homeostasis:
             return True
         if self._grows_on(waiting):
             text = (
-                "growth does not come to rest, its rates fall no faster than 1/t (docs/turnover.md): the state is that "
+                "growth does not come to rest, its rates fall no faster than 1/t "
+                "(docs/tissue_that_lives.md, When it comes to rest): the state is that "
                 "of time %g, on the path"
             )
             self._say(logging.WARNING, text, self.state.time)

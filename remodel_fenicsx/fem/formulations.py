@@ -191,12 +191,12 @@ class _PartsApart(Dilatation):
 
 NOT_LOCKING = "selective-integration"
 STIFF_BULK = {"hexahedron": 10.0, "tetrahedron": 300.0}
-"""Largest lambda/mu with which "auto" takes J at all points (docs/locking.md, Cells that turn). Of tubes that remodel
-linear hexahedra lost 0.1 degrees at 8.8, 2 degrees at 20, 21 degrees and 8 % of the radii at 100. Quadratic tetrahedra
-lost 0.6 degrees at 300; with U at one point they have 0.3 % of error of their own."""
+"""Largest lambda/mu with which "auto" takes J at all points (docs/what_may_go_wrong.md, Cells that turn). Of tubes that
+remodel linear hexahedra lost 0.1 degrees at 8.8, 2 degrees at 20, 21 degrees and 8 % of the radii at 100. Quadratic
+tetrahedra lost 0.6 degrees at 300; with U at one point they have 0.3 % of error of their own."""
 
 FORMULATIONS: dict[str, Formulation] = {
-    # docs/appendix_elements.md has the measurements behind these numbers
+    # docs/what_may_go_wrong.md, Elements that lock, has the measurements behind these numbers
     "displacement": AtAllPoints(
         "at all quadrature points; right where the bulk is soft or elements are small. A run whose elements lock warns"
     ),

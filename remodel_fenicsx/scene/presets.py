@@ -206,7 +206,7 @@ PROFILES: dict[str, Profile] = {
 """Points of the front of docs/speed_and_accuracy.md; `remodel-fenicsx trade SCENE` measures any scene."""
 
 # Another mesh has other random cells, and with a tolerance each seed has other steps: both stay the scene's own. A
-# looser solve adds nothing to their error (docs/speed.md, What random cells cost)
+# looser solve adds nothing to their error (docs/speed_and_accuracy.md, A quarter of a tube)
 _LOOSE = {"solver.relative_tolerance": 1e-6, "model.kinematics": AUTO, "mesh.formulation": AUTO}
 _QUICK = Profile(_LOOSE, 0.8, 0.4, 1.0, "random", is_for_means=True)
 RANDOM_CELLS: dict[str, Profile] = {

@@ -339,7 +339,7 @@ _Share: Any = create_model("_Share", __base__=Table, **_share)
 
 
 class NaturalLayer(_Share):  # type: ignore[misc]
-    """A part of the wall that was stretched before it was joined to the rest (docs/natural.md)."""
+    """A part of the wall that was stretched before it was joined to the rest (docs/tissue_that_lives.md)."""
 
     region: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a region"})
     """Name of a region, in place of `from` and `to`."""
@@ -365,7 +365,7 @@ AS_GIVEN: Literal["as-given"] = "as-given"
 
 
 class Natural(Table):
-    """The configuration in which the tissue is free of stress, if that is not the mesh (docs/natural.md)."""
+    """The configuration in which the tissue is free of stress, if that is not the mesh (docs/tissue_that_lives.md)."""
 
     opening_angle: float = Field(default=0.0, ge=0, le=180)
     """For a tube: how far a cut ring opens, the angle of the missing sector in degrees. Fung's opening angle, between
@@ -680,7 +680,7 @@ _WithStart: Any = create_model("_WithStart", __base__=Table, **_start)
 
 
 class Turnover(_WithStart):  # type: ignore[misc]
-    """How collagen is removed, and deposited again under a stretch (docs/turnover.md). Without `time` it is not.
+    """How collagen is removed, and deposited again under a stretch: not without `time` (docs/tissue_that_lives.md).
 
     For the law `tensor`.
     """
@@ -1293,7 +1293,8 @@ class Solver(Table):
         default=AUTO,
         description=f"How the equations of each step are solved. 'auto' takes 'direct' up to {SMALL_BODY} "
         f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} (on several "
-        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} (docs/speed.md).",
+        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} "
+        "(docs/speed_and_accuracy.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
     """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' at what the

@@ -138,7 +138,7 @@ def last_line(said: str) -> str:
 
 # ---------------------------------------------------------------- readers of files of others
 # With limits, by rule, and from no other file than this one. What holds for all formats stands here, so that a new
-# reader cannot miss it (docs/reliability.md).
+# reader cannot miss it (docs/what_may_go_wrong.md).
 
 LARGEST_FILE = 2 * 10**9  # bytes; ten million hexahedra take 1.1 GB
 SECONDS, SECONDS_PER_MB = 20.0, 1.0  # of processor time

@@ -135,8 +135,8 @@ class WarnsOnce(Watcher):
 
 Array = NDArray[np.float64]
 
-# The part of its way that a body lacks, from which it is said. docs/locking.md: estimate and error over lambda/mu and
-# radii; the paper's bodies come to 3.6 % (artery with random cells, t = 5)
+# The part of its way that a body lacks, from which it is said. docs/what_may_go_wrong.md: estimate and error; the
+# paper's bodies come to 3.6 % (artery with random cells, t = 5)
 WARNED_SHARE = 0.05
 # Of the matrix's energy: with less work it is not the loads that deform the body, but its cells. Elastic tubes have at
 # least 0.93 (up to 0.9 of the pressure that bursts them), the paper's bodies 1.4
@@ -323,7 +323,7 @@ class PressureNoise(WarnsOnce):
         return (
             f"the pressure inside elements is noise, which turns the tensions that drive the cells by {turned:.2g} "
             f"degrees on the mean: fibre angles and radii are off (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
-            "(docs/locking.md)"
+            "(docs/what_may_go_wrong.md, Cells that turn)"
         )
 
 
@@ -513,7 +513,8 @@ class GrowthWithoutRest(WarnsOnce):
             "the tissue has not come to rest: content or natural length change by up to "
             f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at {largest_at(self.quadrature, rates)}, "
             f"and since time {self.held_from + self._numbers['early_time']:g} the rates have fallen no faster than "
-            "1/t. It goes on without bound (mechanobiological instability, docs/turnover.md), or rests much later; "
+            "1/t. It goes on without bound (mechanobiological instability, docs/tissue_that_lives.md), "
+            "or rests much later; "
             "with a larger remodeling.turnover.gain it rests sooner"
         )
 

@@ -307,7 +307,7 @@ def test_cells_that_stay_are_said_to_take_staggered_turnover(caplog: pytest.LogC
 
 @pytest.mark.parametrize(("gain", "thickness", "stress"), [(1.0, 0.753, 2.75), (2.0, 0.908, 1.85)])
 def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: float, stress: float) -> None:
-    """As docs/turnover.md says under Limits: its thickness and p r_i/h after half as much again, over those before."""
+    """As before growth had a volume: its thickness and p r_i/h after half as much again, over those before."""
     found = []
     for factor in (1.0, 1.5):
         values = wall(2400.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}, COLUMNS)

@@ -46,7 +46,7 @@ def found(site: Path, words: str) -> set[str]:
 
 
 BEST = {  # where a reader wants to be
-    "residual stress": "natural",
+    "residual stress": "tissue_that_lives",
     "mmHg": "tutorial_tube",
     "resume": "howto_resume",
     "STL": "my_own_vessel",

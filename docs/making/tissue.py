@@ -1,7 +1,7 @@
-"""docs/figures/turnover.png and turnover_map.png.
+"""The two pictures of docs/tissue_that_lives.md and their tables, in ten minutes.
 
-What turnover makes of a thin and of a thick wall that start free of stress, on one radius (docs/turnover.md), and for
-which gain and deposition stretch they come to rest. Ten minutes.
+Four tubes on one radius, with opening angles of 0 to 160 degrees; and for which gain and deposition stretch a thin and
+a thick wall that start free of stress come to rest.
 """
 
 from __future__ import annotations
@@ -12,17 +12,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from docs.making.pages import FIGURES, Columns, by_column, drawn, through_the_wall
+from docs.making.pages import FIGURES, Columns, by_column, drawn
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body.shape import columns_on_request
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
-from tests.runs import made, simulated
+from tests.runs import made
 
+OPENING_ANGLES = (0, 60, 120, 160)  # degrees
+RESIDUAL = (
+    "Residual stress and the fibre angle of the paper's artery",
+    "a: hoop stress without load, before any remodeling; b: under the paper's loads at t = 150; c: fibre angle at "
+    "t = 150, 0 is circumferential. Isotropic cells at t = 0, one radius, for opening angles of 0 to 160 degrees.",
+)
 TIME, STEP, TOLERANCE, RAMP_END = 40.0, 4.0, 1.0, 24.0  # of turnover; the first step; degrees, of chosen steps
 END = 60 * TIME
 AT_REST = 2.5e-4 / TIME  # largest d ln m/dt, d ln rho/dt; steps of half a T leave 2e-4 of rounding and error
@@ -33,6 +38,52 @@ STRETCHES = (1.05, 1.1, 1.15, 1.2, 1.3)
 GAINS = (0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
 
 
+# ---------------------------------------------------------------- residual stress
+def through_the_wall(simulation: Simulation) -> Columns:
+    """Radius without load, depth, hoop stress and fibre angle at the points of a tube as it is, by radius."""
+    cells, local = simulation.cells, simulation.cells.local_axes
+    found = {
+        "radius": local.coordinates[..., 0],
+        "depth": local.depth,
+        "stress": simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1],
+        "angle": simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, local.axes),
+    }
+    order = np.argsort(found["radius"].reshape(-1))
+    return {name: values.reshape(-1)[order] for name, values in found.items()}
+
+
+def residual(opening_angle: float) -> Columns:
+    """Radius without load, hoop stress without load and at t = 150, and fibre angle at t = 150, at the points."""
+    scene = scene_from_dict({
+        "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tube"}, "mesh": {"refinement": 2, "degree": 2},
+        "model": {"kinematics": "radial"}, "cells": {"initial": "isotropic"},
+        "natural": {"opening_angle": opening_angle}, "output": {"fields": False},
+    })  # fmt: skip
+    with made(scene) as simulation:
+        before = through_the_wall(simulation)
+        list(simulation.steps())
+        after = through_the_wall(simulation)
+    found = {"unloaded": before["stress"], "loaded": after["stress"], "angle": after["angle"]}
+    return {"radius": before["radius"]} | {f"{name}_{opening_angle}": values for name, values in found.items()}
+
+
+def draw_walls(table: Columns) -> Figure:
+    """Three panels over the radius, a curve for each opening angle."""
+    figure = Figure(figsize=(7.2, 2.7), layout="constrained")
+    panels = figure.subplots(1, 3)
+    labels = {"unloaded": "hoop stress, t = 0", "loaded": "hoop stress, t = 150", "angle": "fibre angle, degrees"}
+    for letter, axes, (name, label) in zip("abc", panels, labels.items(), strict=True):
+        axes.set_title(letter, loc="left", fontweight="bold")
+        for colour, opening_angle in zip(COLOURS, OPENING_ANGLES, strict=False):
+            axes.plot(table["radius"], table[f"{name}_{opening_angle}"], color=colour, label=f"{opening_angle}°")
+        axes.set(xlabel="radius without load", ylabel=label)
+    panels[1].set_yscale("log")
+    panels[2].set_ylim(0, 90)
+    panels[0].legend(title="opening angle", fontsize=7)
+    return figure
+
+
+# ---------------------------------------------------------------- turnover
 class Wall(NamedTuple):
     """A tube with an inner radius of 1, and its pressure."""
 
@@ -41,12 +92,6 @@ class Wall(NamedTuple):
 
 
 WALLS = {"thin": Wall(1.3, 1.2), "thick": Wall(3.0, 4.8)}
-GROWN = (
-    "Turnover in walls that start free of stress",
-    "a: opening angle of a cut over time; b: hoop stress under load over the depth in the wall, after turnover and "
-    "without it; c: fibre angle, 0 is circumferential. Walls of 1 to 1.3 under a pressure of 1.2 and of 1 to 3 under "
-    "4.8, elongation 10 %, T = 40, deposition stretch 1.1, gain 1, law tensor, isotropic cells at t = 0, one radius.",
-)
 MAP = (
     "Where turnover comes to rest",
     "By gain and deposition stretch: opening angle at rest in degrees, below 0 where a cut ring would overlap; an "
@@ -141,62 +186,14 @@ def _map(axes: Axes, table: dict[str, Any]) -> Any:
     return image
 
 
-# ---------------------------------------------------------------- what comes of a wall
-UNIT_GAIN = {"deposition_stretch": 1.1, "gain": 1.0}
-TO_REST = 1440.0
-
-
-def opening() -> Iterator[dict[str, Any]]:
-    """Opening angle over time, of both walls, with cells that turn and without."""
-    for name, wall in WALLS.items():
-        for cells, kappa in (("turn", {}), ("fixed", {"kappa": 0.0})):
-            with made(scene_of(wall, UNIT_GAIN, TO_REST, **kappa)) as simulation:
-                for step in simulation.steps():
-                    angle = opening_angle(simulation, step)
-                    yield {"wall": name, "cells": cells, "time": step.time, "angle": angle}
-
-
-def walls_at_rest() -> Columns:
-    """Depth, hoop stress and fibre angle, of both walls at the end with turnover and without."""
-    table: Columns = {}
-    for name, wall in WALLS.items():
-        for how, turnover in (("with", UNIT_GAIN), ("without", None)):
-            with simulated(scene_of(wall, turnover, TO_REST)) as (simulation, _):
-                found = through_the_wall(simulation)
-            table["depth"] = found["depth"]
-            table |= {f"{what}_{name}_{how}": found[what] for what in ("stress", "angle")}
-    return table
-
-
-def draw(over_time: Columns, table: Columns) -> Figure:
-    """Three panels: opening angle over time, stress and angle over the depth."""
-    figure = Figure(figsize=(7.2, 3.1), layout="constrained")
-    panels = figure.subplots(1, 3)
-    for colour, (name, wall) in zip(COLOURS, WALLS.items(), strict=False):
-        label = f"wall of 1 to {wall.outer_radius:g}"
-        for cells, line in (("turn", "-"), ("fixed", "--")):
-            here = (over_time["wall"] == name) & (over_time["cells"] == cells)
-            panels[0].plot(over_time["time"][here], over_time["angle"][here], line, color=colour)
-        for axes, what in zip(panels[1:], ("stress", "angle"), strict=True):
-            axes.plot(table["depth"], table[f"{what}_{name}_with"], color=colour, label=label)
-            axes.plot(table["depth"], table[f"{what}_{name}_without"], ":", color=colour)
-    panels[0].set(xlabel="time", ylabel="opening angle, degrees", ylim=(0, None))
-    panels[1].set(xlabel="depth in the wall", ylabel="hoop stress under load", yscale="log")
-    panels[2].set(xlabel="depth in the wall", ylabel="fibre angle, degrees", ylim=(0, 90))
-    styles = {"turnover": "-", "cells that do not turn": "--", "no turnover": ":"}
-    handles = [*panels[2].get_lines()[::2], *(Line2D([], [], color="0.3", ls=style) for style in styles.values())]
-    labels = [*(str(line.get_label()) for line in handles[:2]), *styles]
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=7)
-    panel_letters(*panels)
-    return figure
-
-
 def make(keep: bool) -> None:
     """Tables and pictures."""
-    grown, of_map = Page(FIGURES, "turnover", *GROWN), Page(FIGURES, "turnover_map", *MAP)
+    walls, of_map = Page(FIGURES, "natural", *RESIDUAL), Page(FIGURES, "turnover_map", *MAP)
     if not keep:
-        grown.save_table(by_column(opening()), list(GROWN), "time")
-        grown.save_table(walls_at_rest(), list(GROWN))
+        table: Columns = {}
+        for angle in OPENING_ANGLES:
+            table |= residual(angle)
+        walls.save_table(table, list(RESIDUAL))
         of_map.save_table(by_column(map_of_walls()), list(MAP))
-    drawn(grown, draw, read_table(FIGURES / "turnover-time.csv"), read_table(FIGURES / "turnover.csv"))
+    drawn(walls, draw_walls, read_table(FIGURES / "natural.csv"))
     drawn(of_map, draw_map, read_table(FIGURES / "turnover_map.csv"), **{"axes.grid": False})
