@@ -19,6 +19,7 @@ from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
 from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Time
 from remodel_fenicsx.schema.tables import SceneError, allowed, locate, shown
+from remodel_fenicsx.schema.text import put
 from tests.tables import rows, values
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -43,11 +44,7 @@ def changed(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Nested dict with values at dotted keys."""
     result = copy.deepcopy(base)
     for key, value in changes.items():
-        table = result
-        *parents, name = key.split(".")
-        for parent in parents:
-            table = table.setdefault(parent, {})
-        table[name] = value
+        put(result, key, value)
     return result
 
 
