@@ -27,8 +27,17 @@ TUBE = "tutorial_tube"
 OF_PAGES = tomllib.loads((Path(__file__).parent / "pages.toml").read_text(encoding="utf-8"))
 SHORT, NOT_RUN, LEFT_BEHIND = (OF_PAGES[name] for name in ("short", "not_run", "left_behind"))
 REFUSAL = "loads.force"
+<<<<<<< HEAD
 PAGES = ["start", "fit", "report", *sorted(page.stem for page in (ROOT / "docs").glob("*_*.md"))]
 PAGES = [page for page in PAGES if page.partition("_")[0] in ("start", "fit", "report", "tutorial", "howto")]
+=======
+PAGES = [
+    "start",
+    "fit",
+    "report",
+    *sorted(page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md")),
+]
+>>>>>>> d128be6c (Special cases go where the general one is tested; a page's list in the width of a line)
 
 
 def blocks(page: str) -> list[tuple[str, str]]:

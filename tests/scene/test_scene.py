@@ -232,17 +232,6 @@ def test_collagen_as_measured():
     assert chain_stress(built) == pytest.approx(chain_stress(paper), rel=0.01)
 
 
-def test_the_presets_keys_lie_under_the_scenes():
-    values = {"preset": PAPER, "geometry": {"shape": "tube", "length": 4.0}, "loads": {"pressure": {"value": 2.4}}}
-    before = copy.deepcopy(values)
-    built = scene_from_dict(values)
-    assert built.geometry == Tube(inner_radius=1.0, outer_radius=3.0, length=4.0)
-    assert built.loads["pressure"] == Load(value=2.4, ramp=[[0.0, 0.0], [25.0, 1.0]])
-    assert built.loads["elongation"].value == 0.1
-    assert values == before
-    assert PRESETS[PAPER]["tube"]["geometry"]["length"] == 8.0
-
-
 def test_a_tube_starts_with_cylindrical_axes_unless_the_scene_says_otherwise():
     assert scene_from_dict(TUBE).cells.axes == "cylindrical"
     assert scene_from_dict(changed(TUBE, {"cells.axes": "global"})).cells.axes == "global"
