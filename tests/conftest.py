@@ -82,7 +82,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
         requests: dict[Path, str] = {}
         together = on_both if any(arguments in on_both for arguments in wanted) else []
         for arguments in (*wanted, *together):
-            text = json.dumps({"snapshots": [], "divisions": None} | arguments, sort_keys=True)
+            text = json.dumps({"divisions": None} | arguments, sort_keys=True)
             requests[folder / (hashlib.sha256(f"{ranks} {text}".encode()).hexdigest()[:16] + ".npz")] = text
         with ExitStack() as locked:
             for out in sorted(requests):
@@ -108,7 +108,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
 
 @pytest.fixture(scope="session")
 def case(cases: Cases) -> Case:
-    """case(scene, ranks=1, snapshots=(), divisions=None) -> what tests/run_case.py saved, by name."""
+    """case(scene, ranks=1, divisions=None) -> what tests/run_case.py saved, by name."""
 
     def run(scene: dict[str, Any], ranks: int = 1, **others: Any) -> dict[str, Any]:
         (found,) = cases([{"scene": scene, **others}], ranks)

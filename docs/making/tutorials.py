@@ -94,7 +94,7 @@ def brought_up_to_date(text: str) -> str:
 
 def make(keep: bool) -> None:
     """All pages in one folder: they use each other's files. There is nothing to keep."""
-    order = re.findall(r"\((tutorial_\w+|fit)\.md\)", (DOCS / "tutorials.md").read_text(encoding="utf-8"))
+    order = re.findall(r"\((tutorial_\w+|fit)\.md\)", (DOCS / "index.md").read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         Path("demos").symlink_to(DOCS.parent / "demos")

@@ -464,10 +464,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
     shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
-        """Whether faces of the wall and ends have each other's names."""
-        if pair := mesh_faces.likely_exchange(file.points, boundary):
-            words = f"inner and outer touch each other: are {pair[0]} and {pair[1]} swapped?"
-            raise SceneError(f"geometry.faces.{pair[0]} = {shown(self._asked(pair[0]))}: {words}")
+        """Whether inner and outer have each other's names."""
         inner, outer = boundary.area("inner"), boundary.area("outer")
         if inner > outer:
             words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"

@@ -147,29 +147,6 @@ def through_the_wall(boundary: Boundary) -> bool:
     return bool(np.isin(inner, outer).any())
 
 
-def likely_exchange(points: Array, boundary: Boundary) -> tuple[str, str] | None:
-    """Which wall (inner or outer) and which end (inlet or outlet) have each other's name; None where none seem to."""
-    # Inner and outer touch only then: ends lie between them. It is one after whose exchange they touch no more, and of
-    # these the pair in which the wall is the flatter.
-    walls = {"inner": "outer", "outer": "inner"}
-
-    def touch(one: str, other: str) -> bool:
-        nodes = [
-            {node for part in boundary.parts(name) for node in boundary.facets[part.facets].flat}
-            for name in (one, other)
-        ]
-        return len(nodes[0] & nodes[1]) > 1
-
-    def flatness(name: str) -> float:
-        vectors = [_area_vectors(points[boundary.facets[part.facets]]).sum(axis=0) for part in boundary.parts(name)]
-        return sum(float(np.linalg.norm(vector)) for vector in vectors) / boundary.area(name)
-
-    if not touch("inner", "outer"):
-        return None
-    pairs = [(wall, end) for wall in walls for end in ("inlet", "outlet") if not touch(end, walls[wall])]
-    return max(pairs, key=lambda names: flatness(names[0]) - flatness(names[1])) if pairs else None
-
-
 def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle)."""
     # They run so that the normal of a flat cap on one points out of what the face encloses.
@@ -366,10 +343,9 @@ def of_parts(loading: Loading, face: str, name: str) -> Any:
 
 def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
     """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that."""
-    free = free_motions(domain.parts, supports)
-    if free:
+    if free := free_motions(domain.parts, supports):
         kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
-        raise SceneError(f"supports ({kinds}): they leave the body free to {' and to '.join(free)}")
+        raise SceneError(f"supports ({kinds}): they leave the body free to move, in {free} of 6 rigid motions")
     sliding = [part for part in domain.parts if supports.get(part.name, Support(kind="free")).kind == "sliding"]
     if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
         raise SceneError(
@@ -390,8 +366,8 @@ def warn_of_twist(name: str, support: Support, comm: Any) -> None:
         )  # fmt: skip
 
 
-def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> list[str]:
-    """Rigid motions of the body that no support holds, in words: of the 6 x 6 matrix of the supports over them."""
+def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
+    """How many rigid motions of the body no support holds: of the 6 x 6 matrix of the supports over them."""
     everywhere = np.concatenate([part.places for part in parts])
     middle = everywhere.mean(axis=0)
     size = float(np.linalg.norm(everywhere - middle, axis=1).max())
@@ -403,9 +379,8 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> list
             turns = np.cross(np.eye(3)[None], (part.places - middle)[:, None] / size)
             motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
             matrix += np.einsum("fki,fij,flj->kl", motions, _held_directions(support, part), motions) / len(motions)
-    values, vectors = np.linalg.eigh(matrix)
-    still = vectors[:, values <= STILL * max(float(values[-1]), 1e-300)]
-    return [_in_words(motion, middle, size) for motion in _plain(still).T]
+    values = np.linalg.eigvalsh(matrix)
+    return int(np.sum(values <= STILL * max(float(values[-1]), 1e-300)))
 
 
 def _held_directions(support: Support, part: Face) -> Array:
@@ -421,31 +396,3 @@ def _held_directions(support: Support, part: Face) -> Array:
         "held": np.broadcast_to(np.eye(3), along.shape),
         "elastic": share * np.eye(3) + (1 - share) * springs,
     }[support.kind]
-
-
-def _plain(motions: Array) -> Array:
-    """Another basis of the same motions, (6, n), each with as many zeros as can be: Gauss-Jordan with pivots."""
-    rows = motions.T.copy()
-    for row in range(len(rows)):
-        column = int(np.argmax(np.abs(rows[row:]).max(axis=0)))
-        pivot = row + int(np.argmax(np.abs(rows[row:, column])))
-        rows[[row, pivot]] = rows[[pivot, row]]
-        rows[row] /= rows[row, column]
-        others = np.arange(len(rows)) != row
-        rows[others] -= np.outer(rows[others, column], rows[row])
-    return np.asarray(rows.T)
-
-
-def _in_words(motion: Array, middle: Array, size: float) -> str:
-    """A rigid motion: along a direction, or about an axis through a place."""
-    shift, turn = motion[:3], motion[3:] / size
-    if np.linalg.norm(motion[3:]) <= 1e-6 * np.linalg.norm(shift):
-        return f"move along {_vector(shift / np.linalg.norm(shift))}"
-    axis = turn / np.linalg.norm(turn)
-    through = middle + np.cross(turn, shift) / (turn @ turn)
-    return f"turn about {_vector(axis)} through {_vector(through)}"
-
-
-def _vector(values: Array) -> str:
-    tidy = np.where(np.abs(values) < 5e-4 * max(1.0, float(np.abs(values).max())), 0.0, values)
-    return "(" + ", ".join(f"{value:.3g}" for value in tidy) + ")"

@@ -8,14 +8,13 @@ a parallel run rank 0 writes arrays that were gathered in the mesh file's order.
 from __future__ import annotations
 
 import errno
-import fcntl
 import io
 import os
 import shutil
 import signal
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -120,7 +119,7 @@ class TransientGrid(ClosedAtEnd):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
         self.path, self._part = path, part_of(path)
         self._part.unlink(missing_ok=True)  # of a process that was killed
-        self.number_of_steps, self._has_published = 0, False
+        self.number_of_steps = 0
         self._open("x+")
         with self._written() as file:
             self._make(file.create_group("VTKHDF"), np.asarray(points, point_dtype), np.asarray(cells), cell_type)
@@ -135,14 +134,10 @@ class TransientGrid(ClosedAtEnd):
             points, cell_type = root["Points"][: int(root["NumberOfPoints"][0])], int(root["Types"][0])
             cells = root["Connectivity"][:].reshape(int(root["NumberOfCells"][0]), -1)
         grid = cls(path, points, cells, cell_type, point_dtype=points.dtype, replaces=True)
-        grid._take_over(time)
+        for step in recorded_steps(path):
+            if step.time <= time:
+                grid.append(*step)
         return grid
-
-    def _take_over(self, until: float = np.inf) -> None:
-        """Append the steps of the published file that this one lacks."""
-        for step in recorded_steps(self.path, self.number_of_steps):
-            if step.time <= until:
-                self.append(*step)
 
     def _open(self, mode: str) -> None:
         import h5py
@@ -168,7 +163,8 @@ class TransientGrid(ClosedAtEnd):
     ) -> None:
         """Add one step; points are given at every step or at none."""
         if self._disk.closed:
-            self._go_on()
+            shutil.copyfile(self.path, self._part)
+            self._open("r+")
         step = self.number_of_steps
         kinds = (("PointData", point_data, step), ("CellData", cell_data, step), ("CellData", constant, 0))
         # offsets that stay 0 say that the mesh is the one of the first step
@@ -200,31 +196,9 @@ class TransientGrid(ClosedAtEnd):
         self.close()
 
     def publish(self) -> None:
-        """Give the file its name; keep the one that had it, to go on there."""
-        if self._disk.closed:
-            return
-        older = self.path.with_name(f"{self.path.name}.older")
-        older.unlink(missing_ok=True)
-        if self._has_published:  # else it is of another run, or begins otherwise
-            with suppress(OSError):  # a file system without hard links
-                os.link(self.path, older)
-        self._give_name()
-        self._has_published = True
-        if older.exists():
-            older.rename(self._part)
-
-    def _go_on(self) -> None:
-        """Append to the file that had the name before, where nobody reads it any more, or else to a copy."""
-        with suppress(FileNotFoundError), open(self._part, "rb") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # HDF5's readers lock what they read
-            except BlockingIOError:
-                self._part.unlink()
-        if not self._part.exists():
-            shutil.copyfile(self.path, self._part)
-        self._open("r+")
-        self.number_of_steps = int(self._file["VTKHDF/Steps"].attrs["NSteps"])
-        self._take_over()
+        """Give the file its name; the next step goes on in a copy."""
+        if not self._disk.closed:
+            self._give_name()
 
     def _give_name(self) -> None:
         try:
@@ -312,8 +286,8 @@ def damage_named(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: is damaged or of another kind: {words}; {remedy}") from error
 
 
-def recorded_steps(path: Path, first: int = 0) -> Iterator[RecordedStep]:
-    """The steps of a file of `TransientGrid` from this one on; what does not belong there is an error."""
+def recorded_steps(path: Path) -> Iterator[RecordedStep]:
+    """The steps of a file of `TransientGrid`; what does not belong there is an error."""
     import h5py
 
     with damage_named(path), h5py.File(path, "r") as file:
@@ -321,7 +295,7 @@ def recorded_steps(path: Path, first: int = 0) -> Iterator[RecordedStep]:
         times = root["Steps/Values"][:number]
         if len(times) != number or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise ValueError("the times of its steps do not increase")
-        for step in range(first, number):
+        for step in range(number):
             points = {name: _recorded(root, "Point", name, step)[0] for name in root["PointData"]}
             cells = {name: _recorded(root, "Cell", name, step) for name in root["CellData"]}
             changing, constant = ({n: v for n, (v, stays) in cells.items() if stays is kind} for kind in (False, True))

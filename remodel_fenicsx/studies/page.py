@@ -11,7 +11,6 @@ import json
 import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,6 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import RemodelError
@@ -71,9 +68,11 @@ class Page:
 
     def save_figure(self, figure: Figure, made_with: str) -> None:
         """Write NAME.png; title, caption and what it was made with stand in the file."""
-        made_with = f"{made_with}; matplotlib {matplotlib.__version__}"
-        about = About(f"{MARK} {__version__}", self.title, self.caption, made_with, self.name)
-        self._write(f"{self.name}.png", as_file(figure, about))
+        about = {"Software": f"{MARK} {__version__}", "Title": self.title, "Description": self.caption,
+                 "Source": f"{made_with}; matplotlib {matplotlib.__version__}", "Comment": self.name}  # fmt: skip
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png", dpi=DOTS_PER_INCH, facecolor="white", metadata=about)
+        self._write(f"{self.name}.png", drawn.getvalue())
 
     def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
         """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
@@ -167,31 +166,6 @@ def label(scene: Scene, name: str) -> str:
     dimensions = loads | {column.name: column.unit for column in scene.columns()}
     unit = unit_of(scene, dimensions.get(name, ""))
     return words(name) + (f", {unit}" if unit else "")
-
-
-@dataclass(frozen=True)
-class About:
-    """What stands in a picture's file: the caption says how it is read, the comment what it is or who made it."""
-
-    made_by: str
-    title: str
-    caption: str
-    made_with: str
-    comment: str
-
-
-def as_file(figure: Figure, about: About) -> bytes:
-    """A figure as a PNG of 256 colours, which is a quarter as large."""
-    notes = {"Software": about.made_by, "Title": about.title, "Description": about.caption,
-             "Source": about.made_with, "Comment": about.comment}  # fmt: skip
-    drawn, small, texts, dpi = io.BytesIO(), io.BytesIO(), PngInfo(), DOTS_PER_INCH
-    figure.savefig(drawn, format="png", dpi=dpi, facecolor="white")
-    for key, value in notes.items():
-        texts.add_text(key, value)
-    with Image.open(drawn) as full:
-        how: dict[str, Any] = {"method": Image.Quantize.MAXCOVERAGE, "kmeans": 2, "dither": Image.Dither.NONE}
-        full.convert("RGB").quantize(256, **how).save(small, "png", pnginfo=texts, optimize=True, dpi=(dpi, dpi))
-    return small.getvalue()
 
 
 HEAD_LINE, VERDICT_LINE, VERDICT_LETTER = 0.24, 0.155, 0.0585  # inches: lines of title and verdict, mean letter

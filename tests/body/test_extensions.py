@@ -254,51 +254,6 @@ def test_a_load(monkeypatch: pytest.MonkeyPatch) -> None:
         Scene(geometry={"shape": "tendon"}, loads={"weight": {"value": 1.0, "ramp": ramp}}, time={"end": 1.0})
 
 
-STRETCHED = extend.LoadKind(
-    lambda shape, loading, name: loading.add_prescribed_elongation(name, "z1", 2, shape.side),
-    "strain of the height",
-    reductions=("point",),
-)
-
-
-class Held(Cube):
-    """A cube that is stretched, between walls: x can not change."""
-
-    loads: ClassVar[dict[str, extend.LoadKind]] = {"stretch": STRETCHED}
-
-    shape: Literal["held"] = Field(default="held", description="Which body it is.")
-
-    def hold(self, loading: Any) -> None:
-        super().hold(loading)
-        loading.hold_face("x1", 0)
-
-
-class Clamped(Held):
-    """The same, whose ends keep their width."""
-
-    shape: Literal["clamped"] = Field(default="clamped", description="Which body it is.")
-
-    def hold(self, loading: Any) -> None:
-        super().hold(loading)
-        loading.hold_face("z1", 1)
-
-
-def test_a_prescribed_displacement_of_a_body_as_a_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The rows are those of the whole cube; what the one strain cannot be is refused."""
-    for shape in (Held, Clamped):
-        monkeypatch.setitem(extend.SHAPES, shape.model_fields["shape"].default, shape)
-    values = scene().model_dump(exclude={"geometry", "preset", "format", "model", "loads"}, exclude_none=True)
-    values["loads"] = {"stretch": {"value": 0.3, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}
-    held = Scene(**values, geometry={"shape": "held", "side": 2.0}, model={"kinematics": "full"})
-    expected, found = (rows_of(held.with_values({"model.kinematics": name})) for name in ("full", "point"))
-    assert column(found, "mean_stretch") == pytest.approx([1.15, 1.3, 1.3, 1.3])
-    for name in ("mean_stretch", "min_jacobian", "stored_energy", "mean_fibre_angle"):
-        np.testing.assert_allclose(column(found, name), column(expected, name), rtol=1e-9, err_msg=name)
-    clamped = Scene(**values, geometry={"shape": "clamped"}, model={"kinematics": "point"})
-    with pytest.raises(SceneError, match="^model.kinematics = 'point': z1 is held across"):
-        rows_of(clamped)
-
-
 def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The body's volume, integrated on the mesh: the cube's lengths know it too."""
 

@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from remodel_fenicsx import cli
-from remodel_fenicsx.body.lumen import oriented, Surface
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Refused
 from tests.tables import rows
@@ -159,17 +158,3 @@ def test_files_that_are_none_are_refused_in_one_line(name: str, text: bytes, tmp
     words = ("--thickness", 1, "--size", 1, "-o", tmp_path / "vessel.msh")
     assert name in refused("wall", tmp_path / name, *words)
     assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_normals_look_out_of_a_bend() -> None:
-    points, triangles = tube(bend=np.pi / 2)
-    for given in (triangles, triangles[:, ::-1]):
-        found = oriented(Surface(points, given, {}), "it")
-        a, b, c = (points[found.triangles[:, k]] for k in range(3))
-        centre = -LENGTH / (np.pi / 2)
-        middle = (a + b + c) / 3
-        radius = np.hypot(middle[:, 0] - centre, middle[:, 2])
-        on_axis = np.stack(
-            [centre + -centre * (middle[:, 0] - centre) / radius, 0 * radius, -centre * middle[:, 2] / radius], 1
-        )
-        assert (np.einsum("ni,ni->n", np.cross(b - a, c - a), middle - on_axis) > 0).all()

@@ -127,26 +127,19 @@ def test_held_ends_move_as_they_are_told(tube: Path) -> None:
 
 SLIDING = {"kind": "sliding"}
 SPRINGS = {"kind": "elastic", "stiffness": 1.0}
-X, Y, Z = "(1, 0, 0)", "(0, 1, 0)", "(0, 0, 1)"
-
-
-MOVES, TURNS = (tuple(f"{way} {axis}" for axis in (X, Y, Z)) for way in ("move along", "turn about"))
 
 
 @pytest.mark.parametrize(("supports", "free"), [
-    ({}, ()), ({"inlet": FREE}, ()), ({"inlet": FREE, "outlet": FREE}, MOVES + TURNS),
-    ({"inlet": SLIDING, "outlet": SLIDING}, (*MOVES[:2], f"{TURNS[2]} through (0, 0,")),
-    ({"inlet": SLIDING, "outlet": FREE, "outer": SPRINGS}, ()),
-    ({"inlet": FREE, "outlet": FREE, "outer": SPRINGS | {"tangential": 0.0}}, (MOVES[2], TURNS[2])),
+    ({}, 0), ({"inlet": FREE}, 0), ({"inlet": FREE, "outlet": FREE}, 6),
+    ({"inlet": SLIDING, "outlet": SLIDING}, 3),
+    ({"inlet": SLIDING, "outlet": FREE, "outer": SPRINGS}, 0),
+    ({"inlet": FREE, "outlet": FREE, "outer": SPRINGS | {"tangential": 0.0}}, 2),
 ])  # fmt: skip
-def test_every_free_rigid_motion_is_named(tube: Path, supports: Any, free: list[str]) -> None:
+def test_every_free_rigid_motion_counts(tube: Path, supports: Any, free: int) -> None:
     scene = scene_of(tube)
     parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).parts
     chosen = {"inlet": Support(), "outlet": Support()} | {name: Support(**one) for name, one in supports.items()}
-    found = free_motions(parts, chosen)
-    assert len(found) == len(free)
-    for words in free:
-        assert any(one.startswith(words) for one in found), found
+    assert free_motions(parts, chosen) == free
 
 
 # ---------------------------------------------------------------- runs

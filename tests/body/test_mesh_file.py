@@ -84,25 +84,6 @@ def bent(x: Any) -> Any:
     return np.stack([radius * np.cos(angle), x[:, 1], radius * np.sin(angle)], axis=1)
 
 
-@pytest.mark.parametrize("end", ["inlet", "outlet"])
-@pytest.mark.parametrize("wall", ["inner", "outer"])
-@pytest.mark.parametrize(
-    "body",
-    [
-        {},
-        {"length": 0.1},  # the ends are larger than the inner face
-        {"moved": bent},
-        {"element": "tetrahedron", "degree": 2},
-    ],
-    ids=["tube", "ring", "bent", "curved tetrahedra"],
-)
-def test_an_end_and_a_wall_that_are_exchanged(tmp_path: Path, body: dict[str, Any], wall: str, end: str) -> None:
-    """Whichever two of the names; the line says which."""
-    file = write_tube(tmp_path / "tube.msh", **body)
-    said = refusal(file, faces={wall: end, end: wall})
-    assert f"geometry.faces.{wall} = '{end}': inner and outer touch each other: are {wall} and {end} swapped?" in said
-
-
 @pytest.mark.parametrize("file", ["lumen.stl", "vessel.inp", "vessel.pvtu", "vessel.msh.gz", "vessel", "", "a/b.txt"])
 @pytest.mark.parametrize("known", [{}, {"element": "hexahedron", "degree": 1}])
 def test_another_ending_is_refused_by_key_and_value(tmp_path: Path, file: str, known: dict[str, Any]) -> None:

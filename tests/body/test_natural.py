@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,9 @@ import pytest
 from remodel_fenicsx import Scene, preset_scene
 from remodel_fenicsx.model.residual_stress import Closing, Layer, closing
 from remodel_fenicsx.results.columns import Measurement
-from remodel_fenicsx.studies.page import read_table
 from tests.runs import last_row, made, rows_of, simulated
 
 RADII = (1.0, 1.3)
-FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 
 
 def scene(kinematics: str, **changes: Any) -> Scene:
@@ -160,19 +157,6 @@ def test_the_equilibrium_is_the_end_of_time() -> None:
     march = rows(**common, **{"time.end": 2000.0, "time.step": 5.0})[-1]
     for column, close in (("inner_radius", 1e-4), ("outer_radius", 1e-4), ("fibre_angle_outer", 0.05)):
         assert limit[column] == pytest.approx(march[column], abs=close), column
-
-
-def test_the_figure_shows_what_the_page_says() -> None:
-    """docs/figures/natural.csv: means over the outer eighth of the wall are the table's; equal stress at 120."""
-    found = read_table(FIGURES / "natural.csv")
-    radius = found["radius"]
-    outer = radius > 2.75
-    for opening_angle, angle in ((0, 72.9), (60, 44.9), (120, 21.1), (160, 14.7)):
-        mean = np.average(found[f"angle_{opening_angle}"][outer], weights=radius[outer])
-        assert mean == pytest.approx(angle, abs=1.5), opening_angle
-    spread = {angle: np.ptp(np.log(found[f"loaded_{angle}"])) for angle in (0, 60, 120, 160)}
-    assert spread[120] < 0.4 < min(spread[0], spread[60], spread[160])
-    assert not found["unloaded_0"].any() and found["unloaded_120"][0] < -3 < 1.5 < found["unloaded_120"][-1]
 
 
 def test_a_rotation_of_the_natural_state_changes_nothing() -> None:

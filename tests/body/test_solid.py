@@ -16,7 +16,6 @@ from remodel_fenicsx.report import write_report
 from tests.mesh_files import write_tube
 from tests.runs import SELF, goes_on, last_row, rows_of
 
-FACES = ("x0", "x1", "y0", "y1", "z0", "z1")
 GEL = Path(__file__).parents[2] / "demos" / "gel"
 RAMP = [[0.0, 0.0], [2.0, 1.0]]
 
@@ -124,7 +123,7 @@ def test_what_is_refused(block: Path, tmp_path: Path) -> None:
         "loads.more.face = 'z0': loads.way moves this face too"
     )
     assert refusal({}, supports={"x0": free["x0"]}, output={}).startswith(
-        "supports (x0 'sliding'): they leave the body free to turn"
+        "supports (x0 'sliding'): they leave the body free to move, in 3 of 6 rigid"
     )
     assert refusal({}, supports=free | {"lid": {}}, output={}).startswith(
         "supports.lid: the body has no such face; it has x0"

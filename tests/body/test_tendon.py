@@ -16,7 +16,6 @@ from tests.conftest import Case, slowly
 
 L, A_P, DENSITY, LAMBDA, MU, KAPPA = 1.594, 1.365, 2.0e21, 27.293, 3.103, 0.025
 C_NETWORK = 1.381e-23 * 310.0 * DENSITY / (4 * A_P)
-SNAPSHOTS = (12.0, 150.0)
 
 
 def tendon_scene(**cells: object) -> dict:
@@ -36,8 +35,8 @@ def slice_of(scene: dict, layers: int = LAYERS) -> dict[str, Any]:
 def random_tendon(request: pytest.FixtureRequest, case: Case) -> dict:
     """150 steps of a seed."""
     if request.param == "slice":
-        return case(**slice_of(tendon_scene()), snapshots=SNAPSHOTS)
-    return case(tendon_scene(seed=request.param), snapshots=SNAPSHOTS)
+        return case(**slice_of(tendon_scene()))
+    return case(tendon_scene(seed=request.param))
 
 
 def is_whole(tendon: dict) -> bool:
@@ -57,26 +56,12 @@ def test_stretch_rises_to_175_and_falls_to_140_percent(random_tendon: dict) -> N
         assert stretch[150.0] == pytest.approx(1.425, abs=1e-3)
 
 
-def test_aligned_elements_are_stiff_and_unaligned_ones_soft(random_tendon: dict) -> None:
-    order = np.argsort(random_tendon["angle_12"])
-    stretch = random_tendon["stretch_12"][order]
-    tenth = len(stretch) // 10
-    assert 1.49 <= stretch[:tenth].mean() <= 1.53
-    assert 1.80 <= stretch[-tenth:].mean() <= 1.89
-
-
 def test_first_dimension_follows_the_closed_form(random_tendon: dict) -> None:
     """Uniaxial tension to the end: l_1 -> r0 (1 - exp(-kappa t)) + l0_1 exp(-kappa t), up to small other tensions."""
     left = np.exp(-KAPPA * 150.0)
     expected = (1 - left) + left * random_tendon["l0"][..., 0]
     assert np.quantile(np.abs(random_tendon["l"][..., 0] - expected), 0.95) < 2e-3
     assert left == pytest.approx(0.0235, abs=5e-5)
-
-
-def test_no_accepted_state_passes_the_contour_length(random_tendon: dict) -> None:
-    assert np.all(random_tendon["max_chain_extension"] < 1.0)
-    assert random_tendon["max_chain_extension"].max() > 0.9  # it comes close: the guard is of use
-    assert np.all(random_tendon["min_jacobian"] > 0.0)
 
 
 def point_stretch(force_per_area: float, dimensions: np.ndarray) -> float:

@@ -18,7 +18,6 @@ import pytest
 from remodel_fenicsx import cli
 from remodel_fenicsx.body.shape import COLUMNS
 from remodel_fenicsx.results.recording import read_history
-from remodel_fenicsx.scene.scene import read_scene
 from tests.conftest import Refused, mpirun, slowly
 from tests.forks import COARSE, forked
 from tests.processes import wait_for_rows
@@ -157,43 +156,6 @@ def test_the_first_row_is_the_unloaded_body(tendon_run: Path) -> None:
     assert 45.0 < first["mean_fibre_angle"] < 65.0
 
 
-def test_scene_as_run_reads_back_as_the_same_scene(tendon_run: Path) -> None:
-    again = read_scene(tendon_run / "scene.toml")
-    assert again == read_scene(demo("tendon"), ["time.end=3"])
-    text = (tendon_run / "scene.toml").read_text()
-    assert "\nformat = 2\n" in text
-    assert "dolfinx" in text and "PETSc" in text
-
-
-def test_fields_are_those_of_the_history(tendon_run: Path) -> None:
-    """Top displacement, stress balance and r/L of the last step, read as ParaView reads the file."""
-    history = read_history(tendon_run)
-    with h5py.File(tendon_run / "fields.vtkhdf") as file:
-        root = file["VTKHDF"]
-        np.testing.assert_array_equal(root["Steps/Values"][:], [0.0, 1.0, 2.0, 3.0])
-        points = root["Points"][:]
-        last = root["Steps/PointDataOffsets/displacement"][-1]
-        displacement = root["PointData/displacement"][last : last + len(points)]
-        cells = int(root["NumberOfCells"][0])
-
-        def cell_data(name: str) -> np.ndarray:
-            start = root[f"Steps/CellDataOffsets/{name}"][-1]
-            return root[f"CellData/{name}"][start : start + cells]
-
-        top = points[:, 2] > 10.0 - 1e-9
-        assert top.sum() == 57  # 16 on each of three rings, 9 inside
-        assert displacement[top, 2].mean() == pytest.approx(10 * (history["mean_stretch"][-1] - 1), rel=0.02)
-        assert cell_data("chain_extension").max() == pytest.approx(history["max_chain_extension"][-1], rel=1e-6)
-        assert cell_data("deformation_gradient")[:, 8].max() == pytest.approx(history["max_stretch"][-1], rel=1e-6)
-        axes = np.stack([cell_data(f"axis_{i}") for i in (1, 2, 3)], axis=1)
-        np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), np.broadcast_to(np.eye(3), axes.shape), atol=1e-6)
-        lengths = np.linalg.norm(cell_data("cell_dimensions"), axis=1)
-        assert np.all((lengths > 0.7) & (lengths < 1.0 + 1e-6))
-        stress = cell_data("cauchy_stress").reshape(-1, 3, 3)
-        np.testing.assert_allclose(stress, stress.transpose(0, 2, 1), atol=1e-4)
-        assert stress[:, 2, 2].mean() > 5 * np.abs(stress[:, 0, 0]).mean()
-
-
 def test_one_and_two_ranks_write_the_same_files(on_ranks: Callable[[str, int], Done]) -> None:
     (alone, here), (done, folder) = on_ranks("files", 1), on_ranks("files", 2)
     assert alone.returncode == done.returncode == 0, done.stderr
@@ -310,27 +272,6 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
     assert read_history(folder)["time"].tolist() == list(range(int(last) + 3))
 
 
-def test_an_exception_on_one_rank_ends_all(tmp_path: Path) -> None:
-    program = tmp_path / "program.py"
-    program.write_text(
-        "import sys\n"
-        "from mpi4py import MPI\n"
-        "from remodel_fenicsx import cli\n"
-        "from remodel_fenicsx.evolution import remodeling as remodel\n"
-        "def broken(self, *arguments):\n"
-        "    if MPI.COMM_WORLD.rank == 1: raise RuntimeError('rank 1 has had enough')\n"
-        "    MPI.COMM_WORLD.Barrier()\n"
-        "remodel.RemodelingPass.apply = broken\n"
-        f"words = ['run', {str(demo('cube'))!r}, '--set=mesh.refinement=2', '-o', {str(tmp_path / 'out')!r}]\n"
-        "sys.exit(cli.main(words))\n"
-    )
-    command = mpirun(2, sys.executable, str(program))
-    environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
-    assert done.returncode == 1
-    assert "rank 1 has had enough" in done.stderr and "stopped by a defect" in done.stderr
-
-
 def test_an_exception_in_a_script_on_two_ranks_ends_both(tmp_path: Path) -> None:
     """A place that cannot be written is found by rank 0 alone; nobody may wait for it."""
     (tmp_path / "file").touch()
@@ -369,16 +310,6 @@ def test_a_misspelt_petsc_option_is_said_and_logged(tmp_path: Path) -> None:
     warning = "WARNING: solver.petsc_options: without effect (misspelt?): snes_linesearch_typ\n"
     assert done.stderr == warning  # once, and nothing about the options that were used
     assert warning.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
-
-
-def test_a_chain_density_of_another_stress_unit_is_said_and_logged(tmp_path: Path) -> None:
-    settings = ["--set", "material.stress_unit=kPa", "--set", "loads.force.value=1 N", "--set", "time.end=1"]
-    done = run("run", demo("cube"), *settings, "--set=geometry.length_unit=cm", "-q", "-o", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.startswith("WARNING: material.chain_density = 7e+21: the network (c g(r0) r0^2 = ")
-    assert done.stderr.count("\n") == 1
-    assert done.stderr.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
-    assert read_scene(tmp_path / "out" / "scene.toml").loads["force"].value == 10.0  # 1 N in kPa cm^2
 
 
 def test_the_limit_of_iterations_that_was_reached_is_named(tmp_path: Path) -> None:

@@ -90,25 +90,6 @@ runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_applications_signals_are_its_own_again_with_petsc() -> None:
-    """PETSc would abort the process, with pages of advice."""
-    program = """
-import os, signal
-signal.signal(signal.SIGHUP, signal.SIG_IGN)
-from remodel_fenicsx.system.interrupts import take_back_signals
-take_back_signals()
-os.kill(os.getpid(), signal.SIGHUP)
-reading, writing = os.pipe()
-os.close(reading)
-try:
-    os.write(writing, b"nobody reads this")
-except BrokenPipeError:
-    print("a closed pipe is an error")
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "a closed pipe is an error\n", "")
-
-
 def test_a_signal_before_the_first_step_ends_the_run_where_it_comes(tmp_path: Path) -> None:
     program = f"""
 import os, signal, sys

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from remodel_fenicsx import Recording, Scene, Simulation
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
@@ -19,8 +18,6 @@ from tests.conftest import Case, slowly
 from tests.parts import tube
 from tests.runs import SELF, simulated
 from tests.values import ANGLES, isotropic
-
-Array = NDArray[np.float64]
 
 
 def values(kinematics: str = "radial", **tables: Any) -> dict[str, Any]:

@@ -162,15 +162,6 @@ def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
         assert chosen[-1][name] == pytest.approx(short[-1][name], rel=5e-3, abs=0.5 if "angle" in name else 0.0), name
 
 
-def test_which_case_is_first_changes_no_step() -> None:
-    """The estimated error is that of the case that is worst."""
-    tables = {"time": {"end": 40.0, "step": 2.0, "tolerance": 0.5}, "remodeling": {"coupling": "staggered"}}
-    first, second = pulse(0.6)
-    one, two = rows_of(artery([first, second], **tables)), rows_of(artery([second, first], **tables))
-    for name in ("time", "time_error"):
-        assert [row[name] for row in two] == pytest.approx([row[name] for row in one], rel=1e-6, abs=1e-9), name
-
-
 def test_a_case_whose_loads_change_is_not_held() -> None:
     """The first case has no load at all."""
     cases = [{"weight": 0.5, "loads": {"pressure": 0.0, "elongation": 0.0}}, {"weight": 0.5}]
@@ -210,22 +201,6 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
     both, diastole, systole = np.array(changes)
     np.testing.assert_allclose(both, 2 / 3 * diastole + 1 / 3 * systole, atol=1e-12)
     assert np.abs(systole - diastole).max() > 1e-3
-
-
-def test_kinematics_agree() -> None:
-    """One radius, and a half-plane of closed ends: each case has a length of its own."""
-    base = {
-        "loads": ramped(8.0, pressure=4.8, elongation=0.0),
-        "supports": {"ends": "closed"},
-        "time": {"end": 16.0, "step": 4.0},
-    }
-    one, two = (
-        rows_of(artery(pulse(0.33), **base, mesh={"degree": 2}, model={"kinematics": name}))[-1]
-        for name in ("radial", "axisymmetric")
-    )
-    for name in ("inner_radius", "inner_radius@2", "axial_elongation", "axial_elongation@2"):
-        assert two[name] == pytest.approx(one[name], rel=1e-6), name
-    assert abs(one["axial_elongation@2"] - one["axial_elongation"]) > 0.01
 
 
 # ---------------------------------------------------------------- means of drives

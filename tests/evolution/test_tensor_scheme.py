@@ -125,26 +125,6 @@ def test_the_tangent_is_the_derivative_of_the_residual() -> None:
         np.testing.assert_allclose(taylor_orders(simulation, equilibrium, 1e-2), 2.0, atol=0.1)
 
 
-def test_the_ends_of_a_blend_are_the_plain_model() -> None:
-    """With the share 1 the new cells alone, with 0 those of the last equilibrium."""
-    simulation = short_tube(3.0)
-    run(simulation)
-    coupling: Any = simulation.stepper.coupling
-    blend, plain, cells = coupling.blend, coupling.equilibrium, simulation.cells
-    forces = [simulation.unknown.x.petsc_vec.duplicate() for _ in range(2)]
-
-    def difference(share: float) -> float:
-        blend.set(share)
-        for equilibrium, force in zip((blend.equilibrium, plain), forces, strict=True):
-            equilibrium.assemble_internal(force)
-        return float(np.abs(forces[0].array - forces[1].array).max())
-
-    assert difference(1.0) < 1e-12 < difference(0.0)
-    old = simulation.state.equilibrium_cells
-    cells.set(old.dimension_values, old.axis_values)
-    assert difference(0.0) < 1e-12
-
-
 def test_the_driving_stress_is_that_of_the_energy() -> None:
     """The pass sees the repulsion too: unloaded, with any A, no stress."""
     simulation = short_tube(1.0)
@@ -165,19 +145,6 @@ def test_the_extrapolated_scheme_is_of_second_order_and_the_staggered_one_of_fir
         orders[coupling] = np.log2(np.array(errors[0]) / errors[1])
     assert np.all(orders["extrapolated"] > 1.7)
     np.testing.assert_allclose(orders["staggered"], 1.0, atol=0.1)
-
-
-def test_isotropic_cells_keep_the_tube_symmetric() -> None:
-    """All elements of a layer do the same, for the drivers that over-correct with the printed law too."""
-    for driver in ("pk2", "finger"):
-        simulation = short_tube(12.0, cells="isotropic", driver=driver)
-        _, _, rows = run(simulation)
-        angle = simulation.scene.geometry.fibre_angle(
-            simulation.cells.dimension_values, simulation.cells.axis_values, simulation.cells.local_axes.axes
-        )
-        layers = np.round(np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1), 6)
-        scatter = max(np.ptp(angle[layers == radius]) for radius in np.unique(layers))
-        assert scatter < 1e-8
 
 
 def pulled_cube(ramp: list[list[float]], end: float, **changes: Any) -> Simulation:
@@ -206,14 +173,6 @@ def test_cells_that_tension_reaches_late_follow_from_then_on(kappa: float) -> No
         left = 2 / 3 * np.exp(-kappa * max(row["time"] - 4.0, 0.0))
         expected = np.degrees(np.arctan(np.sqrt(left / (1 - left))))
         assert row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-7)
-
-
-def test_late_tension_is_as_good_as_tension_at_once() -> None:
-    """The law knows no time: what a load does later is the same; from random cells, whose target changes."""
-    (u, A, _), (early_u, early_A, _) = (
-        run(pulled_cube([[start, 0.0], [start + 1.0, 1.0]], start + 3.0, cells="random")) for start in (2.0, 0.0)
-    )
-    assert np.abs(A - early_A).max() < 1e-8 and np.abs(u[2:] - early_u).max() < 1e-8
 
 
 def test_the_first_step_under_tension_is_as_accurate_as_the_others() -> None:

@@ -15,13 +15,11 @@ from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.scene import scene_from_dict
-from remodel_fenicsx.studies.page import read_table
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
 from tests.runs import goes_on, last_row, made, taylor_orders
 from tests.values import ANGLES, TENSION, ramped, isotropic
 
-FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLUMNS = ["content", "natural_length"]
 
 
@@ -208,36 +206,6 @@ def test_rates_against_their_equation() -> None:
     assert found.content[1] > 0 > found.content[2] and found.content[3] == 1 / time
 
 
-def test_energy_and_its_increment() -> None:
-    """W_net = m c (w(r/rho) - g(r0) M / 2), and its first-order change with the cells by differences."""
-    from remodel_fenicsx.model.cells import UnitCell
-
-    plain = Tissue(10.0, 3.0, 2.0, 1.594, 1.0)
-    turned = Tissue(10.0, 3.0, 2.0, 1.594, 1.0, content=2.5, natural_length=1.2)
-    F, axes = np.diag([1.15, 1.02, 0.9])[None], np.eye(3)[None]
-    cell = UnitCell(np.array([[0.7, 0.6, 0.4]]), axes)
-    r = np.sqrt(((np.diagonal(F[0]) * cell.dimensions[0]) ** 2).sum())
-    chain = CHAINS["wormlike"]
-    matrix = plain.matrix(F, 10.0, 3.0)
-    network = plain.strain_energy(F, [cell]) - matrix - 2.0 * chain.energy(r, 1.594)
-    expected = matrix + 2.5 * (2.0 * chain.energy(r / 1.2, 1.594) + network)
-    assert turned.strain_energy(F, [cell]) == pytest.approx(expected, rel=1e-12)
-    h, way = 1e-6, np.array([[0.3, -0.2, 0.1]])
-    ends = [UnitCell(cell.dimensions + sign * h * way, axes) for sign in (-1, 1)]
-    slope = (turned.strain_energy(F, [ends[1]]) - turned.strain_energy(F, [ends[0]])) / (2 * h)
-    assert turned.energy_increment(F, cell, ends[1]) / h == pytest.approx(slope, rel=1e-4)
-
-
-def test_a_growth_that_does_not_rest_is_said(caplog: pytest.LogCaptureFixture) -> None:
-    """With a small gain the wall dilates on and on."""
-    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 0.2}
-    with caplog.at_level(NOTICE):
-        rows, _ = simulated(wall(720.0, 4.0, turnover, COLUMNS))
-    assert rows[-1]["outer_radius"] > 5.0
-    (warned,) = (record.message for record in caplog.records if record.levelname == "WARNING")
-    assert "has not come to rest" in warned and "without bound" in warned
-
-
 @pytest.mark.parametrize("end", [2400.0, "equilibrium"])
 def test_a_growth_that_rests_is_no_instability_however_large(
     end: float | str, caplog: pytest.LogCaptureFixture
@@ -276,26 +244,6 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
     caplog.clear()
     simulated(wall(240.0, 4.0, turnover, COLUMNS))
     assert "come to rest" not in caplog.text
-
-
-def test_the_figures_show_what_the_page_says() -> None:
-    """docs/figures: both walls end at the independent solver's angles, with stress that varies less; and the map."""
-    time, wall_of, of_map = (
-        read_table(FIGURES / f"{name}.csv") for name in ("turnover-time", "turnover", "turnover_map")
-    )
-    for name, angle, fixed in (("thin", 115.4, 27.5), ("thick", 92.7, 21.7)):
-        for cells, expected in (("turn", angle), ("fixed", fixed)):
-            here = (time["wall"] == name) & (time["cells"] == cells)
-            assert time["angle"][here][-1] == pytest.approx(expected, abs=0.5)
-        spread = {how: np.ptp(np.log(wall_of[f"stress_{name}_{how}"])) for how in ("with", "without")}
-        assert spread["with"] < 0.6 * spread["without"]
-        assert wall_of[f"angle_{name}_with"][-1] < 0.6 * wall_of[f"angle_{name}_without"][-1]
-        for gain, outcome in ((0.2, "faster"), (0.5, "slower"), (1.0, "rests")):
-            (row,) = np.flatnonzero(
-                (of_map["wall"] == name) & (of_map["gain"] == gain) & (of_map["deposition_stretch"] == 1.1)
-            )
-            assert of_map["outcome"][row] == outcome
-        assert of_map["opening_angle"][row] == pytest.approx(angle, abs=1.0)
 
 
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])

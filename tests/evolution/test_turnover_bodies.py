@@ -10,7 +10,6 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Simulation
-from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import Tissue
@@ -18,7 +17,6 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases
 from tests.evolution.test_load_cases import CUBE
-from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import simulated
 from tests.values import TENSION, ramped, isotropic
 
@@ -69,42 +67,6 @@ def cauchy_of_the_energy(simulation: Simulation) -> np.ndarray:
 
 
 # ---------------------------------------------------------------- kinematics
-def test_kinematics_agree() -> None:
-    """One radius, a half-plane, a piece of the ring in three dimensions."""
-    rows = {}
-    for kinematics in ("radial", "axisymmetric", "sector"):
-        rows[kinematics], simulation = at_its_end(grown(kinematics))
-        simulation.close()
-    one = rows.pop("radial")
-    assert one["content"] > 1.2 and one["natural_length"] > 1.05
-    for kinematics, row in rows.items():
-        for name in one:
-            assert row[name] == pytest.approx(one[name], rel=1e-5), (kinematics, name)
-
-
-def test_whole_tubes_agree_with_one_radius(tmp_path: Path) -> None:
-    """Eight stiff linear elements around and two through the wall, as a shape and from a file, whose fields are
-    those of the column."""
-    shape = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
-    same: dict[str, Any] = {"mesh": {"degree": 1}, "solver": {"method": "direct"}, "pressure": 4.0}
-    one, simulation = at_its_end(grown(geometry=shape, pressure=4.0))
-    simulation.close()
-    of = grown("full", geometry=shape, **same)
-    whole, simulation = at_its_end(of, whole_tube(of.geometry, COUNTS, "hexahedron", 1, SELF))
-    simulation.close()
-    mesh = {"shape": "mesh", "file": str(write_tube(tmp_path / "tube.msh"))}
-    output = {"fields": ["displacement", *TURNED], "columns": [*TURNED, "fibre_angle_outer"], "report": False}
-    as_preset = {"preset": None, "material": {"repulsion": "log"}}  # of the consistent one, which has no own bodies
-    folder = run(grown("full", geometry=mesh, output=output, **as_preset, **same), tmp_path / "run", SELF)
-    recording = Recording(folder)
-    for name in (*TURNED, "fibre_angle_outer"):
-        assert whole[name] == pytest.approx(one[name], rel=0.05), name
-        assert recording.history[name][-1] == pytest.approx(whole[name], rel=1e-3), name
-    first, last = recording.fields(0.0), recording.fields(12.0)
-    assert set(last) == {"displacement", *TURNED}
-    for name in TURNED:
-        assert np.all(first[name] == 1.0) and np.ptp(last[name]) > 0.01
-        assert last[name].min() < recording.history[name][-1] < last[name].max()
 
 
 def test_fields_are_written_where_there_is_turnover(tmp_path: Path) -> None:

@@ -182,6 +182,7 @@ with StopRequest():
         ("group", signal.SIGINT),
         ("process and group", signal.SIGTERM),
         ("compiler", signal.SIGTERM),
+        ("process", signal.SIGTERM),
         *slowly(("group", signal.SIGTERM), ("group", signal.SIGHUP)),
     ],
 )
@@ -200,64 +201,6 @@ def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: sign
     if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
         assert all_end(process.pid)
     assert {path.parent.name for path in tmp_path.rglob("*") if path.is_file()} == {"locks"}
-
-
-def test_a_signal_for_one_process_ends_the_compilers_own_children(tmp_path: Path) -> None:
-    """As a supervisor sends it. A compiler stands in that would be at work for ever, in a program of its own."""
-    compiler = tmp_path / "compiler"
-    compiler.write_text("#!/bin/sh\nsleep 1000\nexit 1\n")
-    compiler.chmod(0o755)
-    command, environment = program(tmp_path, IN_A_RUN.replace("150", "3"))
-    environment["CC"] = str(compiler)
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment, text=True, start_new_session=True)
-    wait_for_compiler(process, "sleep")
-    process.terminate()
-    assert process.wait(timeout=200) == 143
-    ended = all_end(process.pid)
-    if not ended:
-        os.killpg(process.pid, signal.SIGKILL)
-    assert ended
-
-
-LIBRARY = """
-import logging
-from mpi4py import MPI
-from remodel_fenicsx.fem import jit
-logging.basicConfig(level=logging.INFO)
-source = "double twice(double x) { return 2.0 * x; }"
-module = jit.library(MPI.COMM_WORLD, "double twice(double);", source, "what doubles")
-assert module.lib.twice(4.0) == 8.0
-compiled = MPI.COMM_WORLD.gather(len(jit.compiled_kernels()))
-if compiled:  # one rank writes: lines of two may come mixed
-    print(*compiled)
-"""
-
-
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_functions_in_c_are_compiled_once_like_forms(ranks: int, tmp_path: Path) -> None:
-    def run(ranks: int) -> subprocess.CompletedProcess[str]:
-        command, environment = program(tmp_path, LIBRARY)
-        if ranks == 1:
-            return forked("python", LIBRARY, variables=environment)
-        command = mpirun(ranks, *command)
-        return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
-
-    first, again = run(ranks), run(1)
-    assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
-    assert first.stderr.count("compiling what doubles, once on this machine: about 2 s") == 1
-    assert "compil" not in again.stderr
-    assert again.stdout.split() == ["0"]
-    assert sorted(first.stdout.split()) == ["0"] * (ranks - 1) + ["1"]
-    one_file(tmp_path, "libremodel_*.so").unlink()
-    assert "removing a compilation that was cut off" in run(1).stderr
-
-
-def test_functions_in_c_that_do_not_compile_leave_nothing(tmp_path: Path) -> None:
-    command, environment = program(tmp_path, LIBRARY.replace("return", "retrun"))
-    done = subprocess.run(mpirun(2, *command), capture_output=True, text=True, timeout=120, env=environment)
-    assert done.returncode != 0
-    assert "the first rank could not compile what doubles" in done.stderr  # said by the second
-    assert not list(tmp_path.rglob("libremodel_*.*"))
 
 
 LOGARITHMS = """

@@ -76,15 +76,6 @@ def test_radial_is_the_independent_solution(driver: str) -> None:
     np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
-def test_radial_is_the_independent_solution_to_the_end(driver: str) -> None:
-    """64 elements of degree 2."""
-    exact, radii, angle, expected = ray_and_reference(driver, 150.0, degree=2, refinement=8)
-    np.testing.assert_allclose(radii, [exact.inner_radii, exact.outer_radii], rtol=1e-5)
-    np.testing.assert_allclose(angle, expected, rtol=0, atol=0.02)
-
-
 @pytest.mark.parametrize("driver", ["cauchy", *slowly("pk2", "finger")])
 def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     """Its law, typed by hand in the reference too; linear elements, which other tests of this law compile anyway."""
@@ -167,7 +158,6 @@ def test_it_is_named_never_chosen_and_says_what_it_means(caplog: pytest.LogCaptu
 
 
 # ---------------------------------------------------------------- rules
-TUBE = values("tube", AUTO, 2.0)
 
 
 @pytest.mark.parametrize(("shape", "name", "refused", "allowed", "words"), table(__file__, "kinematics_rules.txt"))
@@ -256,14 +246,6 @@ def test_what_the_symmetric_solution_cannot_show_is_said() -> None:
         lines = explained(scene("tube", AUTO, 2.0, remodeling=remodeling))
         assert any("leaves it after a while" in line for line in lines) == said
     assert not any("leaves it" in line for line in explained(scene("cube", AUTO, 2.0, remodeling={"driver": "pk2"})))
-
-
-def test_validate_says_what_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "tube.toml"
-    path.write_text(scene("tube", AUTO, 1.0, cells=ISOTROPIC | {"axes": "global"}).to_toml())
-    assert cli.main(["validate", str(path)]) == 0
-    said = capsys.readouterr().out
-    assert "kinematics 'sector'" in said and "'radial', not allowed: " in said and "along the diagonal" in said
 
 
 @pytest.mark.parametrize(

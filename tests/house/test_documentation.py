@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import subprocess
@@ -126,14 +125,6 @@ def test_a_name_that_the_package_does_not_have_is_refused() -> None:
 
 
 # ---------------------------------------------------------------- scripts beside the package
-def script(program: list[str], folder: Path) -> str:
-    """What it prints."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, *program], cwd=folder, env=environment, capture_output=True, text=True, timeout=500
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
 
 
 STUDIES = """
@@ -146,17 +137,6 @@ assert 0 < len(points) < 1536 * 8, len(points)
 for point in points:
     assert point["passes"] == 0 and point["largest_stress"] < 1e-7 and 1 < point["radius"] < 3, point
 print(sorted(points[0]))
-"""
-
-
-LAWS = """
-from docs.making import laws
-assert laws.page_text() == laws.PAGE.read_text(encoding="utf-8"), "./with-fenicsx docs/make laws --keep"
-case, law = laws.CASES["cube"], laws.LAWS["relaxation-continuous"]
-rows = list(laws.history(case, law, **{"time.end": 2.0}))
-last = rows[-1]
-assert [row["time"] for row in rows] == [1.0, 2.0] and 60 < last["angle"] < 70, rows
-assert last["size"] < 1 < last["newton_iterations"], rows
 """
 
 

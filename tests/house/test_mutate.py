@@ -14,11 +14,8 @@ SOURCE = "def double(x):\n    return 2 * x\n\n\ndef unused():\n    return 5\n"
 TEST = "from remodel_fenicsx.arithmetic import double\n\n\ndef test_double():\n    assert double(2) == 4\n"
 TABLE = """
 ["test_arithmetic.py"]
-half = 'double: 2 * x => x / 2'
 square = 'arithmetic.double: 2*x => x ** x'
 unused = 'unused: 5 => 6'
-crash = 'double: return 2 * x => import os; os.abort()'
-lines = ["double: return 2 * x => if x:\\n    return 3 * x\\nreturn 0", 'remodel_fenicsx/arithmetic.py: 5 => 7']
 """
 
 
@@ -45,31 +42,12 @@ def mutate(project: Path, *arguments: str) -> tuple[int, str]:
     return done.returncode, done.stdout
 
 
-def test_what_is_noticed_is_killed(project: Path) -> None:
-    status, said = mutate(project, "--only", "half", "--only", "crash", "--only", "lines")
-    assert status == 0 and "3 of 3 killed" in said
-    assert "FAILED tests/test_arithmetic.py::test_double" in said and "ended by signal 6" in said
-
-
 def test_a_survivor_is_named_and_the_project_stays(project: Path) -> None:
     before = {path: path.read_text() for path in project.rglob("*") if path.is_file()}
     status, said = mutate(project, "--only", "square", "--only", "unused")
     assert status == 1 and "0 of 2 killed" in said
     assert said.endswith("survived: square\nsurvived: unused\n")  # 2 ** 2 is 4 too
     assert before == {path: path.read_text() for path in project.rglob("*") if path.is_file()}
-
-
-@pytest.mark.parametrize(("old", "new", "words"), [
-    ("return 2 * x", "return x + x", "half: double has its text 0 times: '2 * x'"),
-    ("return 2 * x", "return 2 * x if x else 2 * x", "half: double has its text 2 times: '2 * x'"),
-    ("def double", "def twice", "half: double is 0 times there"),
-    ("def unused", "def double", "half: double is 2 times there: remodel_fenicsx/arithmetic.py:1, "),
-])  # fmt: skip
-def test_a_table_that_has_rotted_is_refused(old: str, new: str, words: str, project: Path) -> None:
-    (project / "remodel_fenicsx" / "arithmetic.py").write_text(SOURCE.replace(old, new))
-    for arguments in (["--list"], ["--only", "half"]):
-        status, said = mutate(project, *arguments)
-        assert status == 1 and words in said and "killed" not in said
 
 
 def test_the_table_fits_the_project() -> None:

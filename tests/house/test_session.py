@@ -77,11 +77,3 @@ def test_a_test_that_hangs_fails_and_the_others_go_on(name: str, workers: str, t
     pids = list(ranks.iterdir())
     assert len(pids) == (2 if name == "mpirun" else 0)
     assert all(has_ended(int(rank.name)) for rank in pids)
-
-
-def test_how_many_kernels_all_workers_have_compiled_is_said(tmp_path: Path) -> None:
-    compile_one = "import os\ndef test(): open(os.environ['REMODEL_FENICSX_COMPILED'], 'a').write('a form\\n')\n"
-    for name in ("one", "two"):
-        (tmp_path / f"test_{name}.py").write_text(compile_one)
-    done = session(tmp_path, "-n", "2", "--dist", "loadfile")
-    assert "2 passed" in done.stdout and "\nkernels compiled: 2\n" in done.stdout

@@ -10,7 +10,6 @@ import pytest
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.kernels.tensor import CompiledPoints, TensorKernels, condensed_points
 from remodel_fenicsx.model import energy, implicit as condensed
 from remodel_fenicsx.model.cells import UnitCell
@@ -169,24 +168,3 @@ def test_a_part_under_a_name_that_c_knows_is_numpys(
     np.testing.assert_array_equal(found.structure, expected.structure)
     of_c = compiled_twin(kernels, some).solve(F, start)
     assert np.abs(of_c.structure - expected.structure).max() > 1e-3
-
-
-def test_another_repulsion_under_a_known_name_is_not_replaced_by_c(monkeypatch: pytest.MonkeyPatch) -> None:
-    part = energy.Repulsion(energy.length_sum, energy.log_derivatives)
-    monkeypatch.setitem(energy.REPULSIONS, "log", part)
-    tissue = replace(points("tensor", "length", "cauchy", "material", 2).tissue, repulsion=part)
-    assert with_kernels(tissue, MPI.COMM_SELF).repulsion is part
-
-
-def test_c_solves_no_point_with_a_part_that_it_does_not_know(kernels: TensorKernels) -> None:
-    """Should a number that it does not know come to it all the same, no cell and no tangent are zero for it."""
-    some, F = points("tensor", "log", "cauchy", "material", 2), deformations(2, np.random.default_rng(3))
-    for unknown in ({"driver": replace(DRIVERS["cauchy"], compiled="LOG")}, {}):
-        step = some.step._replace(drive=some.step.drive._replace(**unknown))
-        tissue = some.tissue if unknown else replace(some.tissue, repulsion=replace(LOG, compiled="CAUCHY"))
-        empty, converged = [np.empty((2, 3, 3)) for _ in range(3)], np.empty(2, np.bool_)
-        CompiledPoints(tissue, step, kernels)._call("solve", F, np.ones((2, 3, 3)), *empty, np.empty(2), converged)
-        assert not converged.any()
-
-
-LOG = energy.REPULSIONS["log"]

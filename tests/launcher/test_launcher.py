@@ -19,8 +19,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import slowly
-from tests.processes import GROUP, members
 
 pytestmark = pytest.mark.launcher
 PROJECT = Path(__file__).resolve().parents[2]
@@ -403,33 +401,6 @@ def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
     assert (rooted.record / "held").read_text() == ""
 
 
-@pytest.mark.parametrize("as_user", [False, True])
-@pytest.mark.parametrize("victim", ["leader", "mmdebstrap"])
-@pytest.mark.parametrize("launcher", ["killed", *slowly("alive")])
-def test_a_builder_that_is_killed_leaves_nothing(rooted, tmp_path, launcher, victim, as_user):
-    """At once, or where nobody is left to remove it at the next start, which waits for nobody."""
-    environment = a_user_builds(rooted, tmp_path) if as_user else {}
-    process = rooted.building("hang", **environment)
-    builder = int((rooted.record / "pid").read_text())
-    group = os.getpgid(builder)
-    try:
-        if launcher == "killed":
-            process.kill()
-            process.wait()
-        os.kill(group if victim == "leader" else builder, signal.SIGKILL)
-        wait_for(lambda: not members(group, GROUP), "the end of the whole group")
-        if launcher == "alive":
-            assert process.wait(LONG) == 5
-        else:
-            assert rooted.run("true", environment=environment).returncode == 0
-    finally:
-        if members(group, GROUP):
-            os.killpg(group, signal.SIGKILL)
-    kept = {path.suffix for path in (rooted.cache / "remodel-fenicsx").iterdir()}
-    assert kept == ({".lock", ".log"} if launcher == "alive" else {".lock", ".log", ""})
-    assert not as_user or list((tmp_path / "temporary").iterdir()) == []
-
-
 @pytest.mark.parametrize("damage", ["empty", "without /etc", "file"])
 def test_an_environment_that_is_not_whole_is_made_anew(rooted, damage):
     assert rooted.run("true").returncode == 0
@@ -535,34 +506,10 @@ def test_a_file_system_without_inodes(rooted, inodes, missing):
     assert rooted.builds() == []
 
 
-def full(clone, *programs: str) -> None:
-    """Stand-ins for programs of a machine whose /tmp is full."""
-    for name in programs:
-        script(clone.stubs / name, f'#!/bin/sh\necho "{name}: cannot create: No space left on device" >&2; exit 1\n')
-
-
-def test_no_folder_for_sessions(ready, tmp_path):
-    clone = Clone(tmp_path, cache=ready.cache)
-    script(
-        clone.stubs / "mkdir", '#!/bin/sh\ncase "$*" in */tmp/*-m*|*-m*/tmp/*) exit 1 ;; esac; exec /bin/mkdir "$@"\n'
-    )
-    full(clone, "mktemp")
-    one_line(clone.run("true", environment={"TMPDIR": None}), "No space left on device: set TMPDIR to a folder")
-
-
 def test_a_file_system_without_locks(ready, tmp_path):
     clone = Clone(tmp_path, cache=ready.cache)
     script(clone.stubs / "flock", "#!/bin/sh\necho 'flock: 10: No locks available' >&2; exit 71\n")
     one_line(clone.run("true"), ".lock: No locks available")
-
-
-def test_what_cannot_be_laid_over_this_machine(ready, tmp_path):
-    clone = Clone(tmp_path, cache=ready.cache)
-    real = shutil.copy(shutil.which("mount", path=clone.environment["PATH"]), tmp_path / "real")
-    refusing = "echo mount: /usr: No space left on device >&2; exit 32"
-    stand_in = f'#!/bin/sh\ncase "$*" in "--rbind "*" /usr") {refusing} ;; esac; exec {real} "$@"\n'
-    script(clone.folder / "bin" / "mount", stand_in)
-    one_line(clone.run("true"), "on /usr: No space left on device")
 
 
 @pytest.mark.parametrize("way", ["root", None])
@@ -616,17 +563,6 @@ def test_container(clone, tmp_path):
     for folder in (tmp_path, clone.folder, clone.environment["HOME"]):
         assert ("--volume", f"{folder}:{folder}") in pairs
     assert ("--env", "KEPT") in pairs and ("--env", "LD_LIBRARY_PATH") not in pairs
-
-
-def test_container_names_no_mount_point_twice(clone):
-    """Of an image that is there already; the exit status is the command's."""
-    made = {"WITH_FENICSX": "container", "STUB_ENGINE": "built", "STUB_STATUS": "37"}
-    environment = made | {"HOME": str(clone.folder), "XDG_CACHE_HOME": "/nowhere"}
-    result = clone.run("true", cwd=clone.folder, environment=environment)
-    assert (result.returncode, result.stderr) == (37, "")
-    image, run = clone.engine_calls()
-    assert image[1] == "image"
-    assert [value for option, value in zip(run, run[1:]) if option == "--volume"] == [f"{clone.folder}:{clone.folder}"]
 
 
 def test_container_is_the_last_way(clone):

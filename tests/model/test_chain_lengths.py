@@ -24,7 +24,7 @@ from tests.model.test_condensed import deformations, points, solved
 from tests.tables import rows as table, values as values_of
 from tests.watch.test_over_correction import Tilt
 
-PAPER, CONSISTENT = "kuhl-holzapfel-2007", "consistent"
+PAPER = "kuhl-holzapfel-2007"
 METRES = 1e-9
 POWER = 2.0**-30  # about metres
 BASES: dict[str, dict[str, Any]] = {

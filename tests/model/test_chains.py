@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 
@@ -16,16 +15,6 @@ def lengths(contour_length: float) -> np.ndarray:
 
 def test_boltzmann_constant_as_printed() -> None:
     assert BOLTZMANN_CONSTANT == 1.381e-23
-
-
-@pytest.mark.parametrize("contour_length", CONTOUR_LENGTHS)
-def test_energy_is_the_work_of_the_force(contour_length: float) -> None:
-    """The energy is counted in k theta / A_p: a quarter of eq. (1), see erratum 1."""
-    persistence_length, k_theta = 1.365, 1.7
-    for r in lengths(contour_length):
-        work, _ = quad(lambda s: WORMLIKE.force(s, contour_length, persistence_length, k_theta), 0.0, r, epsabs=1e-13)
-        energy = WORMLIKE.energy(r, contour_length) - WORMLIKE.energy(0.0, contour_length)
-        assert k_theta / persistence_length * energy == pytest.approx(work, rel=1e-12)
 
 
 @pytest.mark.parametrize("contour_length", CONTOUR_LENGTHS)
@@ -47,17 +36,6 @@ def test_stiffness_is_the_bracket_of_eq_7_and_force_over_length(contour_length: 
 def test_stiffness_has_no_pole_at_zero_length() -> None:
     assert WORMLIKE.stiffness(0.0, 2.0) == pytest.approx(1.5 / 2.0, rel=1e-15)
     assert WORMLIKE.stiffness(1e-12, 2.0) == pytest.approx(1.5 / 2.0, rel=1e-11)
-
-
-@pytest.mark.parametrize(
-    "persistence_length, at_half, at_nine_tenths", [(0.1, 12.5, 256.5), (0.4, 3.125, 64.125), (0.8, 1.5625, 32.0625)]
-)
-def test_figure_1(persistence_length: float, at_half: float, at_nine_tenths: float) -> None:
-    """Force over r/L for k theta = 1: (4 x + 1/(1-x)^2 - 1)/(4 A_p) by hand, whatever L is."""
-    for contour_length in (1.0, 1.594):
-        assert WORMLIKE.force(0.0, contour_length, persistence_length) == 0.0
-        force = WORMLIKE.force(contour_length * np.array([0.5, 0.9]), contour_length, persistence_length)
-        np.testing.assert_allclose(force, [at_half, at_nine_tenths], rtol=1e-12)
 
 
 def test_values_of_the_paper() -> None:

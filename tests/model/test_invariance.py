@@ -24,7 +24,7 @@ from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import angle_to_axis, structure_tensor
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, material_frame, spatial_frame
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, material_frame
 from remodel_fenicsx.schema.settings import Cells, Remodeling
 from remodel_fenicsx.state import State, UnitCells
 from tests import parts
@@ -128,19 +128,6 @@ def test_turning_the_body_during_the_hold_changes_everything_in_the_spatial_fram
     axis = np.array([0.0, 0.0, 1.0])
     angles = [float(np.mean(angle_to_axis(bar.lengths, bar.body.cells.axis_values, axis))) for bar in (still, turned)]
     assert angles[0] == pytest.approx(50.1, abs=1.0) and angles[1] == pytest.approx(64.3, abs=1.0)
-
-
-def test_a_rigid_rotation_alone_changes_no_energy_and_no_material_axes() -> None:
-    """Before any further solve: the turned state is in equilibrium, the pass sees the same cells."""
-    bar = Bar("cauchy", "material")
-    bar.march(0, TURN)
-    energy = bar.problem.stored_energy()
-    before, _ = bar.remodeling.updated_cells(float(TURN), float(TURN + 1))
-    bar.rotate_observer(OBLIQUE)
-    assert bar.problem.stored_energy() == pytest.approx(energy, rel=1e-13)
-    after, _ = bar.remodeling.updated_cells(float(TURN), float(TURN + 1))
-    np.testing.assert_allclose(after[0], before[0], rtol=0, atol=1e-11)
-    np.testing.assert_allclose(structure_tensor(*after[:2]), structure_tensor(*before[:2]), rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("frame", ["material", "spatial"])
@@ -278,23 +265,6 @@ def test_material_frame(seed: int) -> None:
     np.testing.assert_allclose(material_frame(turn, spatial @ np.swapaxes(turn, 1, 2)), spatial, atol=1e-12)
 
 
-def test_material_frame_does_not_ask_for_the_sign_or_the_hand() -> None:
-    """Eigenvectors may be left-handed; the cells are lines, so only the projectors matter."""
-    rng = np.random.default_rng(3)
-    F, spatial = deformations(rng), parts.random_rotations(rng, 64)
-    axes = material_frame(F, spatial)
-    for signs in ((-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, -1)):
-        other = material_frame(F, spatial * np.array(signs)[:, None])
-        dyads = [np.einsum("nIi,nIj->nIij", n, n) for n in (axes, other)]
-        np.testing.assert_allclose(dyads[1], dyads[0], atol=1e-12)
-
-
-def test_spatial_frame_is_the_printed_equation() -> None:
-    rng = np.random.default_rng(4)
-    spatial = parts.random_rotations(rng, 64)
-    np.testing.assert_array_equal(spatial_frame(deformations(rng), spatial), spatial)
-
-
 # ---------------------------------------------------------------- no tension, equal eigenvalues
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("law", ["explicit", "rate", "relaxation"])
@@ -328,19 +298,6 @@ def test_the_finger_tensor_remodels_even_an_unloaded_body(points: Points, frame:
     np.testing.assert_allclose(axes, n0, atol=1e-12)
 
 
-def test_hydrostatic_tension_leads_to_the_isotropic_cell(points: Points) -> None:
-    isotropic = np.full(3, 1 / np.sqrt(3))
-    axes = parts.rotation((1.0, 2.0, 3.0), 50.0)
-    points.set_cells(isotropic, axes)
-    points.deform(1.05 * np.eye(3))
-    for driver in DRIVERS:
-        for frame in FRAMES:
-            dimensions, new_axes, active = points.updated(driver, frame)
-            assert active.all()
-            np.testing.assert_allclose(dimensions, np.broadcast_to(isotropic, dimensions.shape), atol=1e-12)
-            np.testing.assert_allclose(new_axes, np.broadcast_to(axes, new_axes.shape), atol=1e-12)
-
-
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_equibiaxial_tension_keeps_the_axes_in_the_plane(points: Points, driver: str, frame: str) -> None:
@@ -358,28 +315,6 @@ def test_equibiaxial_tension_keeps_the_axes_in_the_plane(points: Points, driver:
     assert active.all()
     np.testing.assert_allclose(new_axes, axes.reshape(-1, 3, 3), atol=1e-12)
     np.testing.assert_allclose(dimensions[:, 0], dimensions[:, 1], atol=1e-12)
-
-
-@pytest.mark.parametrize("driver", ["cauchy", "pk2"])
-def test_one_tension_leads_to_one_dimension(points: Points, driver: str) -> None:
-    """Uniaxial: e = (1, 0, 0), l_2 and l_3 fade, n_1 is the fibre along the load."""
-    isotropic = np.full(3, 1 / np.sqrt(3))
-    points.set_cells(isotropic, np.eye(3))
-    points.deform(np.diag([0.9, 0.9, 1.2]))
-    dimensions, axes, active = points.updated(driver, "material")
-    assert active.all()
-    left = np.exp(-0.025 * 10.0)
-    np.testing.assert_allclose(dimensions[0], left * isotropic + (1 - left) * np.array([1.0, 0.0, 0.0]), atol=1e-12)
-    np.testing.assert_allclose(np.abs(axes[:, 0]), np.broadcast_to([0.0, 0.0, 1.0], (512, 3)), atol=1e-12)
-
-
-def test_pk2_has_material_eigenvectors_whatever_the_frame(points: Points) -> None:
-    rng = np.random.default_rng(8)
-    points.set_random_cells(rng)
-    points.deform(deformations(rng))
-    first, second = (points.updated("pk2", frame) for frame in FRAMES)
-    for a, b in zip(first, second):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_a_driver_that_is_not_finite_is_refused(points: Points) -> None:

@@ -98,16 +98,6 @@ def test_curves_have_names_and_units_at_their_axes(browser: Browser, recorded: R
     assert re.search(r"inner radius [0-9.]+ mm", values) and re.search(r"fibre angle inner [0-9.]+°", values)
 
 
-def test_the_browser_unpacks_what_python_has_packed(browser: Browser, recorded: Recorded) -> None:
-    found = Decoded.of(recorded("artery"))
-    browser.open(recorded("artery") / REPORT)
-    for name in ("position", "edges", "angle"):
-        values = found.arrays[f"view.{name}"].reshape(-1)
-        weights = np.arange(len(values)) % 97
-        summed = browser.value(f"REPORT.arrays.view.{name}.reduce((sum, value, k) => sum + value * (k % 97), 0)")
-        assert summed == np.sum(values.astype(np.int64) * weights)
-
-
 # ---------------------------------------------------------------- controls
 def test_the_slider_leads_through_time_and_back(browser: Browser, recorded: Recorded) -> None:
     browser.open(recorded("artery") / REPORT)
@@ -176,14 +166,6 @@ def test_a_choice_changes_the_picture_and_back(browser: Browser, recorded: Recor
     assert (changed != before).any(axis=2).mean() > 0.005 and len(drawn(changed)) > 5000
     browser.choose(selector, "whole" if selector == "#cut" else "both")
     np.testing.assert_array_equal(body(browser), before)
-
-
-def test_chains_are_drawn(browser: Browser, recorded: Recorded) -> None:
-    """Black on the surface, by the rule of the figures."""
-    browser.open(recorded("artery") / REPORT)
-    black = (drawn(body(browser)) < 60).all(axis=1).mean()
-    browser.choose("#shown", "angle")
-    assert black > 0.01 and (drawn(body(browser)) < 60).all(axis=1).mean() < 0.001
 
 
 def test_downloads_are_the_files_of_the_run(browser: Browser, recorded: Recorded, tmp_path: Path) -> None:

@@ -147,13 +147,6 @@ def test_steps_after_the_checkpoint_are_done_again(half: Path, whole: Path) -> N
     assert_same(half, whole)
 
 
-def test_without_a_whole_checkpoint_it_is_refused(half: Path) -> None:
-    for path in half.glob("checkpoint*"):
-        path.write_bytes(b"")
-    with pytest.raises(CheckpointError, match="half: has no checkpoint that is whole .*; without its files checkpoint"):
-        resume(half, LONGER, SELF)
-
-
 def test_the_generation_before_counts_where_the_newest_is_damaged(half: Path, whole: Path) -> None:
     path = newest_first(half)[0]
     with np.load(path) as file:
@@ -461,9 +454,3 @@ def test_what_a_coupling_remembers_is_kept(tmp_path: Path, monkeypatch: pytest.M
     resume(tmp_path / "run", [], SELF)
     kept = read_checkpoint(tmp_path / "run")
     assert kept is not None and kept.numbers["part"] == 0.5**5
-
-
-def said(folder: Path) -> list[str]:
-    """What the log tells of equilibria and passes, without its clock."""
-    lines = [line.split(" ", 2)[2] for line in (folder / "run.log").read_text().splitlines()]
-    return [line for line in lines if re.match(r"\S+ time \d+:", line)]

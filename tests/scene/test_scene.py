@@ -18,7 +18,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
 from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Time
-from remodel_fenicsx.schema.tables import SceneError, allowed, description, is_table, locate, sections, shown
+from remodel_fenicsx.schema.tables import SceneError, allowed, locate, shown
 from tests.tables import rows, values
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -85,12 +85,6 @@ def test_a_preset_without_the_shape(monkeypatch):
         refusal({**CUBE, "preset": "bent"})
         == "geometry.shape = 'cube': the preset 'bent' has the shapes 'tendon', 'tube'"
     )
-
-
-def test_a_law_registered_later_is_allowed(monkeypatch):
-    monkeypatch.setitem(LAWS, "mine", LAWS["rate"])
-    assert scene_from_dict(changed(CUBE, {"remodeling.law": "mine"})).remodeling.law == "mine"
-    assert "'none', 'mine'" in refusal(changed(CUBE, {"remodeling.law": "yours"}))
 
 
 def test_a_key_of_an_earlier_format_is_refused_with_its_new_name(monkeypatch):
@@ -284,17 +278,6 @@ def test_the_network_modulus():
 # ---------------------------------------------------------------- Python and TOML
 
 
-@pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
-def test_a_scene_as_run_reads_back_as_the_same_scene(tmp_path, path):
-    read = read_scene(path, ["solver.petsc_options.ksp_type=preonly", "cells.initial=[0.6, 0.8, 0.0]"])
-    text = read.to_toml(f"remodel-fenicsx, from {path.name}\n\nsecond\x1bline")
-    again = tmp_path / "again.toml"
-    again.write_text(text, encoding="utf-8")
-    assert read_scene(again) == read
-    assert text.startswith(f"# remodel-fenicsx, from {path.name}\n\n# second line\n\n")
-    assert "# " + description(Remodeling, "kappa") in text
-
-
 def test_the_demos_are_the_preset():
     of_the_paper = {"artery": "tube", "cube": "cube", "tendon": "tendon"}
     assert [path.stem for path in DEMOS if path.stem not in of_the_paper] == [
@@ -454,19 +437,6 @@ def test_bodies_of_plausible_tissue_are_not_warned_of():
 
 
 # ---------------------------------------------------------------- documentation
-
-
-def test_every_key_is_described():
-    page = (Path(__file__).parents[2] / "docs" / "scene.md").read_text(encoding="utf-8")
-    tables = {"geometry", "mesh", "model", "material", "cells", "supports", "regions", "loads", "remodeling", "time",
-              "solver", "output"}  # fmt: skip
-    for key, _, table in sections(Scene):
-        for name, field in table.model_fields.items():
-            if (not key and name in tables) or is_table(field.annotation):
-                assert f"## `[{f'{key}.{name}' if key else name}" in page
-            else:
-                assert description(table, name).endswith("."), (key, name)
-                assert f"| `{name}` |" in page
 
 
 def test_a_law_that_shares_of_passes_make_slower_is_said() -> None:

@@ -28,13 +28,6 @@ def artery(**changes: Any) -> Any:
     return read_scene(ARTERY).with_values(keys)
 
 
-def refusal(path: Path, *overrides: str) -> str:
-    with pytest.raises(SceneError) as caught:
-        read_scene(path, overrides)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 # ---------------------------------------------------------------- what values become
 
 STRESSES = tomllib.loads(Path(__file__).with_name("stresses.toml").read_text())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, Simulation
-from remodel_fenicsx.evolution.coupling import PREDICTORS, Autoregressive, LoadStep, Predictor, Responsive
+from remodel_fenicsx.evolution.coupling import Autoregressive, LoadStep, Responsive
 from remodel_fenicsx.running import run
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
@@ -56,22 +56,6 @@ def test_a_trend_and_a_swing_are_both_continued(simulation: Simulation) -> None:
     assert np.all(found[~free] == 0.0)  # what supports prescribe
 
 
-def test_steps_of_other_lengths_go_on_at_the_same_speed(simulation: Simulation) -> None:
-    """What moves evenly is expected exactly, however long the steps were and the next one is."""
-    state = simulation.state
-    predictor, speed = Autoregressive(state), np.random.default_rng(1).standard_normal(len(state.unknown.x.array))
-    free, time = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values()), 0.0
-    for number, duration in enumerate([1.0, 2.0, 0.5, 4.0, 3.0, 1.5, 0.7], start=1):
-        time += duration
-        if number > 1:
-            found = predictor.expected(LoadStep(time, duration, RATES))
-            assert found is not None
-            np.testing.assert_allclose((found - state.unknown.x.array)[free], 1e-3 * duration * speed[free], rtol=1e-9)
-        before = state.unknown.x.array.copy()
-        state.unknown.x.array[:] += 1e-3 * duration * speed
-        predictor.solved(LoadStep(time, duration, RATES), before)
-
-
 def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation: Simulation) -> None:
     """Cells change by combinations of two fields, and the unknowns answer them linearly."""
     state, held = simulation.state, {"force": 0.0}
@@ -92,25 +76,6 @@ def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation
         predictor.solved(step, before)
         state.settle_cells()
     assert predictor.expected(LoadStep(time + 1.0, 1.0, {"force": 2.0})) is None
-
-
-def test_with_tolerance_predicts_where_steps_are_chosen() -> None:
-    equal = pulled_cube(9.0).with_values({"solver.predictor": "with-tolerance"})
-    for scene, kind in ((equal, Predictor), (equal.with_values({"time.tolerance": 1.0}), Responsive)):
-        with made(scene) as simulation:
-            assert type(simulation.stepper.coupling.predictor) is kind  # type: ignore[attr-defined]
-    assert PREDICTORS["with-tolerance"] is Predictor
-
-
-def test_another_rate_is_a_new_beginning(simulation: Simulation) -> None:
-    step, unknown = LoadStep(8.0, 1.0, {"force": 0.0}), simulation.state.unknown.x.array
-    predictor = follow(simulation, alternating(len(unknown))[:-1])
-    assert predictor.expected(step) is None
-    predictor.solved(step, unknown - 1e-3)
-    found = predictor.expected(LoadStep(step.time + step.duration, step.duration, step.rates))
-    free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
-    assert found is not None
-    np.testing.assert_allclose((found - unknown)[free], 1e-3, rtol=1e-12)
 
 
 def iterations(folder: Path) -> int:

@@ -14,7 +14,6 @@ from remodel_fenicsx.model.tensors import passes_through_zero
 from remodel_fenicsx.schema.settings import Cells, Material
 from remodel_fenicsx.solver.equilibrium import Extension, Look
 from remodel_fenicsx.solver.newton import SolveFailure
-from remodel_fenicsx.system.interrupts import Interrupted
 from tests import parts
 from tests.conftest import slowly
 from tests.parts import cube, tube
@@ -290,19 +289,6 @@ def test_a_start_beyond_the_contour_length_or_inside_out_fails_and_stays(stretch
     with pytest.raises(SolveFailure, match=said):
         made.problem().solve()
     np.testing.assert_array_equal(made.displacement.x.array, start)
-
-
-def test_a_request_to_stop_that_is_taken_back_is_forgotten() -> None:
-    """Looks at a state are remembered; the request that came with one is none of the state's."""
-    made = held_cube()
-    problem = made.problem()
-    made.loading.set({"force": 1.0})
-    problem.state.stop_signal = lambda: 15
-    with pytest.raises(Interrupted):
-        problem.solve()
-    problem.state.stop_signal = lambda: 0
-    assert problem.extension().stop_signal == 0
-    assert problem.solve().newton_iterations > 1
 
 
 @pytest.mark.parametrize("where", ["displacement", "dimensions", "axes"])

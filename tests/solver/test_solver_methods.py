@@ -64,13 +64,6 @@ def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
     assert methods.chosen("auto", methods.LARGE_ON_RANKS + 1, 2, reduced, multigrid=False) == "lagged"
 
 
-def test_the_paper_s_tendon_has_few_factors() -> None:
-    """Its 1,881 unknowns are many for a body in three dimensions; the preset leaves the method open."""
-    scene = preset_scene("kuhl-holzapfel-2007", "tendon").with_values({"time.end": 1.0})
-    with made(scene) as simulation:
-        assert (scene.solver.method, simulation.stepper.coupling.newton.method) == ("auto", "lagged")
-
-
 # ---------------------------------------------------------------- same states, other work
 @pytest.mark.parametrize("predictor", ["none", "autoregressive"])
 @pytest.mark.parametrize("method", ["lagged", "iterative"])
@@ -230,21 +223,6 @@ def test_one_refinement_makes_up_for_single_precision() -> None:
     assert before > 1e-3 and np.abs(1e-7 * answer.array - axes[:, 0]).max() < before / 10
     factors.destroy()
     factor.close()
-
-
-@needs_single
-def test_rows_are_those_of_factors_in_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken = []
-    answers = KeptFactor._answers_in_single
-    monkeypatch.setattr(KeptFactor, "_answers_in_single", lambda *a: taken.append(answers(*a)) or taken[-1])
-    simulation, rows = simulated("lagged")
-    simulation.close()
-    assert taken and all(taken)
-    monkeypatch.setattr(single, "is_available", lambda: False)
-    simulation, expected = simulated("lagged")
-    simulation.close()
-    assert_same(rows, expected)
-    assert sum(row["newton_iterations"] for row in rows) < 1.2 * sum(row["newton_iterations"] for row in expected)
 
 
 def test_a_kept_factor_stays_when_its_matrix_changes() -> None:

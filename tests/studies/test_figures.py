@@ -6,28 +6,18 @@ import importlib.util
 import math
 import os
 import re
-import shutil
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
-import pyvista
 from PIL import Image
 
 import remodel_fenicsx
-from remodel_fenicsx import Recording, run
-from remodel_fenicsx.body.shape import columns_of
-from remodel_fenicsx.pictures import bodies
-from remodel_fenicsx.results import vtkhdf
-from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.scene.scene import Scene, SceneError, scene_from_dict
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import page
-from remodel_fenicsx.studies.study import Run
 from tests.conftest import Refused
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
@@ -108,95 +98,12 @@ def tiny(**changes: float | str) -> Scene:
     return scene_from_dict(TINY).with_values({key.replace("__", "."): value for key, value in changes.items()})
 
 
-def record(runs_folder: Path, scene: Scene, last: float | None = None) -> Path:
-    """What a run leaves, as far as the command looks: one hexahedron that does not move. Returns its folder."""
-    folder = runs_folder / scene.name
-    folder.mkdir(parents=True)
-    (folder / "scene.toml").write_text(scene.to_toml("as run\ndolfinx 0.0"))
-    corners = np.array([(x, y, z) for z in (0.0, 1.0) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
-    with vtkhdf.TransientGrid(folder / "fields.vtkhdf", corners, np.arange(8).reshape(1, 8), 12) as grid:
-        for time in np.arange(scene.time.number_of_steps + 1.0):
-            grid.append(time, {"displacement": 0 * corners}, {"fibre_angle": np.array([1.0])})
-    names = [column.name for column in columns_of(scene.geometry, scene.output.columns, scene.loads)]
-    rows = [[time, *[1.0] * (len(names) - 1)] for time in np.arange(0.0, (last or scene.time.end) + 0.5)]
-    (folder / "history.csv").write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]) + "\n")
-    return folder
-
-
-def answers(runs_folder: Path, scene: Scene) -> bool | str:
-    """Whether the record of a scene counts as its run, or the one line that refuses it."""
-    try:
-        return Run(scene.name, scene, runs_folder / scene.name).is_complete()
-    except (SceneError, RecordingError) as error:
-        assert "\n" not in str(error)
-        return str(error)
-
-
-def test_a_recorded_run_is_complete_when_all_of_it_is_there(tmp_path: Path) -> None:
-    scene = tiny(time__end=5.0)
-    assert answers(tmp_path, scene) is False
-    record(tmp_path, scene, last=4.0)
-    assert answers(tmp_path, scene) is False
-    shutil.rmtree(tmp_path / "tiny")
-    record(tmp_path, scene)
-    assert answers(tmp_path, scene) is True
-    # a default that the scene does not name
-    assert "another scene" in str(answers(tmp_path, tiny(time__end=5.0, solver__maximum_halvings=11)))
-    shutil.rmtree(tmp_path / "tiny")
-    without = tiny(output__fields=False)
-    (record(tmp_path, without) / "fields.vtkhdf").unlink()
-    assert answers(tmp_path, without) is True
-
-
-def cut_text(name: str, change: Callable[[str], str]) -> Callable[[Path], object]:
-    """A file of the folder with another text."""
-    return lambda folder: (folder / name).write_text(change((folder / name).read_text()))
-
-
-def resized(dataset: str, length: int) -> Callable[[Path], None]:
-    """Fields with fewer of these values."""
-
-    def damage(folder: Path) -> None:
-        with h5py.File(folder / "fields.vtkhdf", "r+") as file:
-            file[f"VTKHDF/{dataset}"].resize(length, axis=0)
-
-    return damage
-
-
-DAMAGES: dict[str, Callable[[Path], object]] = {
-    "another scene": cut_text("scene.toml", lambda text: tiny(cells__seed=2).to_toml()),
-    "no scene": lambda folder: (folder / "scene.toml").unlink(),
-    "no fields": lambda folder: (folder / "fields.vtkhdf").unlink(),
-    "no second row": cut_text("history.csv", lambda text: re.sub("\n1.0,.*", "", text)),
-    "half a row": cut_text("history.csv", lambda text: text[:-4]),
-    "fields cut short": lambda folder: os.truncate(folder / "fields.vtkhdf", 5000),
-    "no last values": resized("CellData/fibre_angle", 2),
-    "no last time": resized("Steps/Values", 5),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_run_is_not_complete(damage: str, tmp_path: Path) -> None:
-    scene = tiny(time__end=5.0)
-    DAMAGES[damage](record(tmp_path, scene))
-    assert answers(tmp_path, scene) is not True
-
-
 def test_a_failing_run_ends_the_script_with_its_code(tmp_path: Path) -> None:
     # more than any chain can bear at once, and no part of the step is tried
     torn = tiny(name="torn", loads__force__value=1e9, solver__maximum_halvings=0)
     with pytest.raises(SystemExit) as end:
         figures.run_all([torn], tmp_path, 1)
     assert end.value.code == 3 and not figures.is_complete(torn, figures.run_folder(torn, tmp_path))
-
-
-def test_a_damaged_run_ends_the_script_with_the_line_of_the_run(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
-    path = figures.run_all([tiny()], tmp_path, 1)["tiny"].path
-    DAMAGES["half a row"](path)
-    capfd.readouterr()
-    with pytest.raises(SystemExit) as end:
-        figures.run_all([tiny()], tmp_path, 1)
-    assert end.value.code == 2 and f"{path / 'history.csv'}: " in capfd.readouterr().err.splitlines()[-1]
 
 
 def test_another_scene_is_another_run(tmp_path: Path) -> None:
@@ -251,83 +158,6 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monke
     assert [path.stat().st_mtime_ns for path in histories] == before
     with Image.open(drawn / "fig5.png") as picture:
         picture.load()
-
-
-# ---------------------------------------------------------------- pictures in space
-
-
-def two_hexahedra(F: np.ndarray, cell: list[float]) -> pyvista.UnstructuredGrid:
-    """Two unit cubes side by side in x, beginning at x = 1; l_1, l_2, l_3 along z, x and y."""
-    x, y, z = np.meshgrid([1.0, 2.0, 3.0], [-0.5, 0.5], [0.0, 1.0], indexing="ij")
-    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    first = np.array([0, 4, 6, 2, 1, 5, 7, 3])  # VTK's order, node number 4 i + 2 j + k
-    grid = pyvista.UnstructuredGrid({pyvista.CellType.HEXAHEDRON: np.array([first, first + 4])}, points)
-    grid.point_data["displacement"] = points @ (F - np.eye(3)).T
-    fields = {"cell_dimensions": cell, "axis_1": [0, 0, 1], "axis_2": [1, 0, 0], "axis_3": [0, 1, 0]}
-    for name, values in (fields | {"deformation_gradient": F.ravel()}).items():
-        grid.cell_data[name] = np.tile(np.asarray(values, dtype=float), (2, 1))
-    return grid
-
-
-def ribbons(F: np.ndarray, cell: list[float]) -> np.ndarray:
-    """Corners (4, 4, 3) of those on the face x = 3."""
-    corners = np.asarray(bodies.chains(two_hexahedra(F, cell), None).points).reshape(10, 4, 4, 3)
-    (found,) = corners[np.all(corners[..., 0] > 3.0, axis=(1, 2))]
-    return found
-
-
-def test_chains_lie_on_the_deformed_face_along_their_deformed_direction() -> None:
-    corners = ribbons(np.diag([1.0, 1.0, 2.0]), [1.0, 0.0, 0.0])
-    ends = np.stack([corners[:, [0, 3]].mean(axis=1), corners[:, [1, 2]].mean(axis=1)], axis=1)
-    np.testing.assert_allclose(ends.mean(axis=1)[:, 1:], [[0.0, 1.0]] * 4, atol=1e-6)
-    lengths = np.abs(ends[:, 1] - ends[:, 0])
-    np.testing.assert_allclose(lengths, [[0.0, 0.0, 2 * 2 * bodies.CHAIN_LOOK["reach"]]] * 4, atol=1e-6)
-    np.testing.assert_allclose(corners[..., 0], corners[0, 0, 0], atol=1e-6)
-
-
-def outline(F: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the same ribbons the places (n, 2) in the undeformed face, a square, and the lengths."""
-    corners = ribbons(F, list(cell))
-    flat = (corners.reshape(-1, 3) @ np.linalg.inv(F).T)[:, 1:] - [0.0, 0.5]
-    return flat, np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
-
-
-def test_colours_go_from_red_along_to_blue_across() -> None:
-    red, middle, blue = bodies.coloured(np.array([0.0, 45.0, 90.0]))
-    assert red[0] > 0.6 and red[1:].max() < 0.2
-    assert blue[2] > 0.5 and blue[:2].max() < 0.3
-    assert middle.min() > 0.7
-    assert np.all(np.isfinite(bodies.coloured(np.array([-1e-9, 90.0 + 1e-9]))))
-
-
-@pytest.fixture(scope="module")
-def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """Two steps of the tendon, as the command runs them."""
-    return Recording(run(tiny(), tmp_path_factory.mktemp("runs") / "tiny", report=False))
-
-
-def test_a_body_is_really_drawn(tiny_run: Recording) -> None:
-    """Of the tendon with and without chains; seen nearly from the side."""
-    grid = tiny_run.grid(2.0)
-    without = grid.copy()
-    without.cell_data.remove("cell_dimensions")
-    length = float((grid.points + grid.point_data["displacement"])[:, 2].max())
-    view = bodies.View((0.3, -1.0, 0.14), (0.0, 0.0, length / 2), 14.0, (120, 320))
-    both, bare = bodies.render([bodies.PictureSheet([each], ["t"], [""], 1, "", "") for each in (grid, without)], view)
-    head = 4 * bodies.LETTER
-    both, bare = (image[head : head + 320] for image in (both, bare))
-    assert np.all(both[0, 0] == 255)
-    body = np.any(bare < 245, axis=2)
-    # length along z of the body over the height of the picture, its width over the same
-    rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
-    assert np.ptp(rows) / 320 == pytest.approx(length / 14.0, abs=0.06)
-    assert np.ptp(columns) / 320 == pytest.approx(2 * math.sqrt(10 / math.pi) / 14.0, abs=0.03)
-    red, green, blue = np.moveaxis(bare[body].astype(int), -1, 0)
-    assert np.mean(red - blue > 60) > 0.1 and np.mean(blue - red > 40) > 0.1
-    # no chain shows beyond the outline, where those of the far side would
-    assert not np.any(np.any(both < 245, axis=2) & np.all(bare == 255, axis=2))
-    dark = np.all(both < 70, axis=2)
-    assert 0.02 < dark.sum() / body.sum() < 0.4 and not np.any(np.all(bare < 70, axis=2))
 
 
 # ---------------------------------------------------------------- all of it

@@ -14,7 +14,6 @@ import pytest
 
 from benchmarks.recovery import MOST, TRUTH as RECOVERED, fitted, noisy, tables, tube as tube_of_the_benchmark
 from remodel_fenicsx import Scene, SceneError, cli, preset_scene, read_scene
-from remodel_fenicsx.results.recording import FolderTaken, RunLock
 from remodel_fenicsx.schema.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
 from remodel_fenicsx.studies.fit import read_measurements
@@ -149,14 +148,6 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
 PAIR = (FITS / "pair.toml").read_text()
 
 
-def test_a_fit_is_alone_in_its_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second has found the folder empty before the first took it."""
-    monkeypatch.setattr("remodel_fenicsx.studies.fit.chosen_folder", lambda place, *_: place)
-    with RunLock(folder / "taken"), pytest.raises(FolderTaken, match="writes in it"):
-        fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "taken", starts=1, profiles=False)
-    assert not list((folder / "taken").iterdir())
-
-
 def test_what_changes_nothing_is_named(folder: Path) -> None:
     """A rate of remodeling in a test of virgin tissue."""
     text = PAIR.replace('"material.contour_length" = { start = 2.125 }', '"remodeling.kappa" = { start = 0.05 }')
@@ -232,15 +223,6 @@ def test_a_simulation_that_stays_says_what_a_new_one_does(folder: Path, changes:
     for found, fresh in zip(problem.models(x + 0.02, problem.kept), problem.models(x + 0.02), strict=True):
         for name in fresh:
             np.testing.assert_allclose(found[name], fresh[name], rtol=1e-9)
-
-
-def test_bands_have_the_width_of_the_noise(folder: Path) -> None:
-    """Twice the standard deviations, twice the logarithmic bands; they cover the truth of noisy data."""
-    path, scene = folder / "data.toml", read_scene(folder / "scene.toml")
-    one = fit(scene, path, folder / "one", starts=1, profiles=False)[1]
-    path.write_text(DATA.replace("= 0.01", "= 0.02").replace("= 2.0,", "= 4.0,"))
-    two = fit(scene, path, folder / "two", starts=1, profiles=False)[1]
-    np.testing.assert_allclose(np.log(two.upper / two.lower), 2 * np.log(one.upper / one.lower), rtol=1e-2)
 
 
 def test_a_passive_test_of_remodeled_tissue(folder: Path) -> None:
@@ -396,18 +378,6 @@ def test_numbers_of_another_kind_are_doubted(
     log = (folder / "o" / "fit.log").read_text()
     assert all(line.removeprefix("WARNING: ") in log for line in warned)
     assert f"{path.name}: {len(table) - 1} rows of " in log
-
-
-def test_loads_that_a_scene_has_not_are_zero(tmp_path: Path) -> None:
-    """Without [loads.elongation] the state still has one."""
-    demo = ROOT / "demos" / "fit"
-    text = (demo / "scene.toml").read_text()
-    (tmp_path / "scene.toml").write_text(text[: text.index("[loads.elong")] + text[text.index("[remodeling]") :])
-    scene = read_scene(tmp_path / "scene.toml")
-    assert list(scene.loads) == ["pressure"]
-    problem = Problem(scene, *read_measurements(demo / "inflation.toml", scene))
-    residuals = problem.residuals(np.log([unknown.start for unknown in problem.unknowns]))
-    assert np.abs(residuals).max() < 300, "it has an equilibrium"
 
 
 def test_virgin_tissue_whose_collagen_will_be_turned_over(tmp_path: Path) -> None:

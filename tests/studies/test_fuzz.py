@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import pytest
 
-from benchmarks.fuzzing import references
 from benchmarks.fuzzing.command import evaluated, said
 from benchmarks.fuzzing.scenes import made
 from benchmarks.stability_map.running import Runner
@@ -73,10 +72,3 @@ def test_scenes_are_valid_and_draw_every_key() -> None:
         keys = keys | {f"{name}.{key}" for key in getattr(type(table), "model_fields", ())}
     missing = keys - OF_FILES - OTHER_WORDS - drawn
     assert not missing, f"benchmarks/fuzzing/scenes.py draws no {sorted(missing)}"
-
-
-# ---------------------------------------------------------------- right and wrong
-CUBE = next(seed for seed in ALL if references.known(made(seed)[0]) and made(seed)[0]["model"]["kinematics"] == "point")
-TUBE = next(
-    seed for seed in ALL if references.known(made(seed)[0]) and made(seed)[0]["model"]["kinematics"] == "radial"
-)

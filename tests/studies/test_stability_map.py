@@ -5,14 +5,12 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.stability_map.cases import Case, Finding, Run, all_cases
+from benchmarks.stability_map.cases import all_cases
 from benchmarks.stability_map.homogeneous import CUBE
-from benchmarks.stability_map.judging import judged
 from benchmarks.stability_map.running import Runner, evaluated
 from tests.reference.march import Bar, march, material
 from tests.reference.point import prescribed_path
@@ -68,13 +66,6 @@ def test_reduced_map(key: str, runner: Runner) -> None:
 def test_the_table_of_known_faults_has_no_other_cases() -> None:
     assert set(EXPECTED) <= set(REDUCED)
     assert set(EXPECTED.values()) <= {"wrong", "warned", "unchecked"}
-
-
-# ---------------------------------------------------------------- verdicts
-def verdict(finding: Finding, **run: Any) -> Any:
-    """On a run that the reference says this of."""
-    case = Case("family", "key", {}, lambda case, run: finding, "reference")
-    return judged(case, Run(**{"code": 0, **run}))
 
 
 # ---------------------------------------------------------------- references

@@ -13,8 +13,6 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene
-from remodel_fenicsx.body.reductions import choice
-from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.stability import stability, unseen_by
 from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
@@ -143,22 +141,3 @@ def test_the_analysis_of_a_reduction_says_what_it_does_not_see(tmp_path: Path) -
     assert "kinematics 'radial' sees changes that keep its symmetry only" in unseen
     assert unseen in found.in_words()
     assert f"time 2: a pass multiplies the worst small change by {found.columns['factor'][0]:.3g}" in log
-
-
-# ---------------------------------------------------------------- near and beyond a limit load
-def inflated_wall(pressure: float) -> Scene:
-    """A thin wall without chains, which can bear 23.8 mmHg."""
-    return Scene(
-        geometry={"shape": "tube", "length_unit": "mm", "inner_radius": 3.0, "outer_radius": 3.3, "length": 12.0},
-        mesh={"degree": 2}, material={"stress_unit": "kPa", "lame_mu": 34.0, "lame_lambda": 3400.0, "chain_density": 0},
-        cells={"initial": "isotropic"}, remodeling={"law": "none"}, time={"end": 10.0},
-        loads={"pressure": {"value": f"{pressure} mmHg", "ramp": [[0, 0], [10, 1]]}},
-    )  # fmt: skip
-
-
-def test_beyond_a_limit_load_the_run_says_limit_point() -> None:
-    scene = inflated_wall(30.0)
-    assert choice(scene).name == "radial"
-    with pytest.raises(StepFailure) as caught, watched(scene):
-        pass
-    assert caught.value.refusal.kind == "limit point"

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene import Scene, scene_from_dict
@@ -17,8 +16,6 @@ from remodel_fenicsx.watch.warnings import VolumeLoss
 from tests.conftest import Case, slowly
 from tests.runs import rows_of, simulated
 from tests.values import PAPER, isotropic, ramped
-
-SELF = MPI.COMM_SELF
 
 
 def tube_scene(**tables: Any) -> Scene:
