@@ -87,7 +87,7 @@ def errors() -> Iterator[dict[str, Any]]:
         for name, scheme in SCHEMES.items():
             printed_random = cells == "random" and scheme.values is PRINTED
             if printed_random and name != "printed-staggered":
-                continue  # no limit (docs/appendix_coupling.md, Steps without a solution)
+                continue  # no limit (docs/theory.md, Steps without a solution)
             coupling, finest = ("staggered", FINEST) if printed_random else scheme.limit
             key = cells, str(scheme.values)
             if key not in limits:

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from docs.making.pages import EDGES, FIGURES, Columns, by_layer, drawn
+from docs.making.pages import EDGES, FIGURES, Columns, drawn
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
@@ -130,7 +130,7 @@ def _label(panels: Sequence[Axes]) -> None:
 def page_values(folder: Path) -> dict[str, str]:
     """What the page shows of the tables."""
     table, layers = (read_table(folder / f"{name}.csv") for name in ("consistent", "consistent-layers"))
-    found = {"consistent_table": layer_table(layers), "caption_consistent": CAPTION[1]}
+    found = {"caption_consistent": CAPTION[1]}
     for variant in ("once", "twice"):
         # at the same time of the cells: a row of the printed method has those of the step before
         names = [(f"cube_{k:g}_{variant}", f"cube_{k:g}_paper") for k in KAPPAS]
@@ -142,16 +142,9 @@ def page_values(folder: Path) -> dict[str, str]:
     return found
 
 
-def layer_table(layers: Columns) -> str:
-    """Angles of Figs. 8, 10 and 11, layer by layer."""
-    cases, short = {"σ": "10_4.8", "S": "pk2", "b": "finger"}, {"paper": "the paper's", "once": "κ", "twice": "2κ"}
-    of_all = [(symbol, case, variant) for symbol, case in cases.items() for variant in short]
-    return by_layer([(f"{symbol}, {short[variant]}", layers[f"{case}_{variant}"]) for symbol, case, variant in of_all])
-
-
 def make(keep: bool) -> None:
     """Run, draw, write the page."""
-    from docs.making.verification import write_pages
+    from docs.making.verification import write_page
 
     page, source = Page(FIGURES, "consistent", *CAPTION), "docs/making/consistent.py"
     if not keep:
@@ -161,4 +154,4 @@ def make(keep: bool) -> None:
         page.save_table(layers, [source], "layers")
     tables = (read_table(FIGURES / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
     drawn(page, draw, *tables, made=source)
-    write_pages()
+    write_page()

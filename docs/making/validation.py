@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from multiprocessing import get_context
 from tempfile import TemporaryDirectory
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -370,7 +371,7 @@ def tables() -> dict[str, str]:
 
 def page_text() -> str:
     """The template with its tables."""
-    return filled(DOCS / "validation.template.md", tables())
+    return filled(Path(__file__).with_suffix(".template.md"), tables())
 
 
 def draw(found: Columns) -> Figure:

@@ -1,9 +1,8 @@
-"""docs/verification.md, its appendix and docs/figures/.
+"""docs/verification.md and docs/figures/.
 
 Draws every figure, solves the independent radial reference of tests/, makes the studies of docs/making/studies.py, and
-keeps the pictures and the small tables in docs/figures/. The page is verification.template.md, the appendix
-appendix_verification.template.md. Each {name} in them is computed from the tables in docs/figures/, so that a test can
-do the same without a run.
+keeps the pictures and the small tables in docs/figures/. The page is verification.template.md. Each {name}
+in it is computed from the tables in docs/figures/, so that a test can do the same without a run.
 """
 
 from __future__ import annotations
@@ -284,12 +283,12 @@ def mesh_table(folder: Path) -> str:
     return markdown(header, found)
 
 
-def invariance_table(folder: Path, turned: str) -> str:
-    """What a turned body differs by."""
+def invariance_table(folder: Path) -> str:
+    """What the turned deformed body differs by."""
     header = ["driver", "frame", "l / r₀", "A / r₀²", "place", "energy", "mean reference angle"]
     found = []
     for row in rows_of(folder / "invariance.csv"):
-        if row["turned"] == turned:
+        if row["turned"] == "deformed body":
             angles = f"{row['angle_still']:.1f}° → {row['angle_turned']:.1f}°"
             found.append([row["driver"], f"`{row['frame']}`", *(
                 small(row[key]) for key in ("lengths", "tensor", "position", "energy")
@@ -310,8 +309,8 @@ def _made_with(folder: Path) -> str:
     return read_notes(folder, "fig7")["fig7.csv"][0].split(";")[0]
 
 
-def page(kept: Path = FIGURES, template: str = "verification") -> str:
-    """docs/verification.md, or the page of another template, from the tables in docs/figures."""
+def page(kept: Path = FIGURES) -> str:
+    """docs/verification.md, from the tables in docs/figures."""
     values = all_numbers(kept) | page_values(kept) | {
         "table_layers": layer_table(kept),
         "table_cases": case_table(kept),
@@ -319,20 +318,18 @@ def page(kept: Path = FIGURES, template: str = "verification") -> str:
                                           lambda row: f"{100 * row['stretch']:g} %, {row['pressure']:g}"),
         "table_errors_drivers": error_table(kept, "comparison-drivers", "driver | supports | elements", driver_of),
         "table_meshes": mesh_table(kept),
-        "table_turned": invariance_table(kept, "deformed body"),
-        "table_everything": invariance_table(kept, "everything"),
+        "table_turned": invariance_table(kept),
         "made_with": _made_with(kept),
         **{f"caption_{name}": figure.caption for name, figure in figures.FIGURES.items()},
         "caption_reference": REFERENCE_CAPTION[1],
     }  # fmt: skip
     values |= {name: fill(f"*{text}*", 100) for name, text in values.items() if name.startswith("caption_")}
-    return (DOCS / f"{template}.template.md").read_text(encoding="utf-8").format_map(Tables(kept, values))
+    return Path(__file__).with_suffix(".template.md").read_text(encoding="utf-8").format_map(Tables(kept, values))
 
 
-def write_pages() -> None:
-    """Both, from what is there."""
-    for name in ("verification", "appendix_verification"):
-        (DOCS / f"{name}.md").write_text(page(template=name), encoding="utf-8")
+def write_page() -> None:
+    """From what is there."""
+    (DOCS / "verification.md").write_text(page(), encoding="utf-8")
 
 
 def make(keep: bool) -> None:
@@ -347,4 +344,4 @@ def make(keep: bool) -> None:
     files = [f"{name}.{ending}" for name in pictures for ending in ("png", "json")]
     for file in (*files, *(f"{name}.csv" for name in (*pictures, *MORE_TABLES, *studies))):
         shutil.copyfile(folder / file, FIGURES / file)
-    write_pages()
+    write_page()
