@@ -6,11 +6,10 @@
 Parts: `artery`, the settings of `remodel-fenicsx trade` and the profiles on the paper's artery with isotropic cells,
 for the printed coupling, the implicit one and the consistent variant, against the one-dimensional solver of
 tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `end`, chosen steps against
-equal ones there, in turns; `paper`, the paper's own mesh there, at its points too; `whole`, the whole tube in three
-dimensions, up to 20 minutes a run; `hold`, chosen steps against equal ones to t = 1000; `tendon`, the paper's with
-random cells. An hour or more of one core, most of it the whole tube. Then makes tables and picture of
-docs/speed_and_accuracy.md, and tables.md beside what is recorded; --only makes no page, --report makes it from what is
-there. What is recorded is used again.
+equal ones there, in turns; `paper`, the paper's own mesh there; `whole`, the whole tube in three dimensions, up to 20
+minutes a run; `hold`, chosen steps against equal ones to t = 1000. An hour or more of one core, most of it the whole
+tube. Then makes tables and picture of docs/speed_and_accuracy.md, and tables.md beside what is recorded; --only makes
+no page, --report makes it from what is there. What is recorded is used again.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from benchmarks.precision import chosen, places, tendon, whole
+from benchmarks.precision import chosen, whole
 from benchmarks.precision.kept import EVERY_TANGENT, Array, Found, Kept
 from docs.making.pages import DOCS, FIGURES, between_marks, filled, lines, made_with, markdown
 from remodel_fenicsx.body.shape import profile_weights
@@ -39,7 +38,7 @@ from tests.reference.radial import solve_radial
 PICTURE = "speed_and_accuracy"
 PAGE = DOCS / "speed_and_accuracy.md"
 HEAD = ["seconds", "degrees", "largest", "radii, %", "method", "setting"]
-PARTS = ("artery", "end", "paper", "whole", "hold", "tendon")
+PARTS = ("artery", "end", "paper", "whole", "hold")
 COARSE = (8.0, 4.0)  # tolerances, degrees
 TIMES = chosen.TO_THE_END
 REFERENCE = {"explicit": (150, 1 / 8, 1 / 16), "tensor": (60, 1 / 2, 1 / 4)}  # elements and steps, by law
@@ -137,14 +136,11 @@ def run(kept: Kept, parts: Sequence[str], budget: float) -> None:
         if part in parts:
             chosen.run(kept, part)
     if "paper" in parts:
-        places.run(scene(METHODS["printed"]), kept)
         run_artery(kept, 0.0, paper=True)
     if "whole" in parts:
         for name, method in METHODS.items():
             for setting in whole.settings(name, scene(method)):
                 kept.measure(f"{name}-{setting.name}", setting.scene, TIMES)
-    if "tendon" in parts:
-        tendon.run(kept)
 
 
 def run_artery(kept: Kept, budget: float, paper: bool) -> None:
@@ -174,8 +170,7 @@ def report(kept: Kept) -> None:
     found = sorted(points(kept), key=lambda point: point.found.seconds)
     whole_tube = [point for point in found if point.is_whole]
     parts = {"rows": rows_of(found), "whole": rows_of(whole_tube), "hold": chosen.hold_rows(kept),
-             "end": chosen.end_rows(kept), "tendon": tendon.rows(kept), "places": places.words(kept),
-             "made": fill(f"Made with {made_with()}.", 100)}  # fmt: skip
+             "end": chosen.end_rows(kept), "made": fill(f"Made with {made_with()}.", 100)}  # fmt: skip
     text = filled(Path(__file__).with_suffix(".template.md"), parts)
     (kept.folder / "tables.md").write_text(text, encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")

@@ -1,1 +1,1 @@
-"""What benchmarks/work_precision.py measures beside the artery to t = 150: the long hold, the tendon, the seeds."""
+"""What benchmarks/work_precision.py measures beside the artery to t = 150: the whole tube, chosen steps."""

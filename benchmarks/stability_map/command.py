@@ -19,7 +19,6 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser.add_argument("--family", action="append", default=[], metavar="NAME", help="only cases of this family")
     parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="only cases whose key contains it")
     parser.add_argument("--reduced", action="store_true", help="only the cases of the test")
-    parser.add_argument("--judge", action="store_true", help="only what has been measured with any reference before")
     parser.add_argument("--list", action="store_true", help="print the cases, run nothing")
     parser.add_argument(
         "--report", action="store_true", help="write table and picture of docs/what_may_go_wrong.md, run nothing"
@@ -34,9 +33,6 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     source = running.source_of()
     file = running.file_of(options, source)
     done = {} if options.again else measured(file, source, cases, options.limit)
-    if options.judge:
-        known = {record["key"] for record in running.read_records(file) if record["source"] == source}
-        cases = {key: case for key, case in cases.items() if key in known}
     missing = spread([key for key in cases if key not in done], cases)
     print(f"{source}: {len(cases)} cases, {len(missing)} to run with {options.jobs} processes; {file}", file=sys.stderr)
     jobs = {key: partial(running.evaluated, cases[key], source=source) for key in missing}

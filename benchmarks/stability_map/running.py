@@ -12,7 +12,6 @@ import json
 import math
 import multiprocessing
 import os
-import pickle
 import re
 import subprocess
 import sys
@@ -39,7 +38,6 @@ from remodel_fenicsx._version import __version__
 PROJECT = Path(__file__).resolve().parents[2]
 WANTED_FIELDS = ("deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3")
 Record = dict[str, Any]
-ENDED = (0, 1, 2, 3)  # a run that was killed, or went on for too long, may end otherwise another time
 
 
 # ---------------------------------------------------------------- one scene, in the process that runs scenes
@@ -155,33 +153,15 @@ class Runner:
 
     Parameters
     ----------
-    store
-        Folder that keeps what came out of a scene, so that a new reference runs nothing again.
     limit
         Seconds of processor time that one scene may take; then the process is ended and another one started.
     """
 
-    def __init__(self, limit: float, store: Path | None = None):
-        self.limit, self.store = limit, store
+    def __init__(self, limit: float):
+        self.limit = limit
         self._process: Any = None
 
     def run(self, request: dict[str, Any]) -> Run:
-        """One scene, from the store if it is there."""
-        if self.store is None:
-            return self._run(request)
-        text = json.dumps(request, sort_keys=True, default=plain)
-        kept = self.store / f"{hashlib.sha256(text.encode()).hexdigest()[:20]}.pickle"
-        if kept.exists():
-            return pickle.loads(kept.read_bytes())
-        run = self._run(request)
-        if run.code in ENDED:
-            self.store.mkdir(parents=True, exist_ok=True)
-            part = kept.with_suffix(f".{id(self)}")
-            part.write_bytes(pickle.dumps(run))
-            part.rename(kept)
-        return run
-
-    def _run(self, request: dict[str, Any]) -> Run:
         """One scene; `CRASHED` or `NO_END` with words where there is no answer."""
         if self._process is None:
             os.environ["OMP_NUM_THREADS"] = "1"
@@ -296,8 +276,8 @@ def measure(
     """Do jobs, several at a time; each record is a line of the file of the version as soon as it is there."""
     found: dict[Any, Record] = {}
     options.results.mkdir(parents=True, exist_ok=True)
-    start, store = clock.monotonic(), None if options.again else options.results / "runs" / source.partition(" ")[0]
-    runners, free = [Runner(options.limit, store) for _ in range(options.jobs)], SimpleQueue[Runner]()
+    start = clock.monotonic()
+    runners, free = [Runner(options.limit) for _ in range(options.jobs)], SimpleQueue[Runner]()
     for runner in runners:
         free.put(runner)
 
