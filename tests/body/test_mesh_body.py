@@ -18,7 +18,6 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.studies.trade import ladder
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import simulated
 
@@ -216,13 +215,6 @@ def test_equal_pressures_inside_and_outside_compress_alike_everywhere(tube: Path
         s -= balance / (2 * mu * s + 2 * lame_lambda / s + 4.0 * s)
     assert s < 0.98 and row["tissue"] == 2.0
     assert np.abs(displacement[:, :2] - (s - 1) * places[:, :2]).max() < 1e-5
-
-
-def test_the_ladder_of_an_own_body_varies_steps_alone(tube: Path) -> None:
-    """Its mesh is given: no rung asks for another, and no two are the same."""
-    rungs = ladder(scene_of(tube, time={"end": 4.0, "step": 1.0}))
-    assert {rung.mesh for rung in rungs} == {("full", 1, 1)}
-    assert len({rung.steps_in_words + str(rung.way) for rung in rungs}) == len(rungs) > 3
 
 
 # ---------------------------------------------------------------- a bend that statics determine

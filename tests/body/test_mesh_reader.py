@@ -170,14 +170,6 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
         read_mesh(half)
 
 
-def test_numbers_in_a_column_of_their_own_are_numbers(tmp_path: Path) -> None:
-    """(n, 1), as Gmsh and VTK write them."""
-    source = write_tube(tmp_path / "tube.msh")
-    columns = [groups[:, None] for groups in meshio.read(source).cell_data["gmsh:physical"]]
-    one, other = read_mesh(converted(source, ".vtu")), read_mesh(converted(source, ".vtu", parts=columns), "parts")
-    np.testing.assert_array_equal(one.facet_groups, other.facet_groups)
-
-
 @pytest.mark.parametrize(
     ("cells", "tags", "words"),
     [

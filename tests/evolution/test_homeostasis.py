@@ -11,7 +11,6 @@ import pytest
 
 from remodel_fenicsx import Recording, Scene, Simulation
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
-from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Case, slowly
@@ -95,30 +94,6 @@ def test_one_and_two_ranks_agree(case: Case) -> None:
     for name in ("u", "l"):
         np.testing.assert_allclose(two[name], one[name], atol=1e-8)
     np.testing.assert_allclose(np.sort(one["l"], axis=-1)[..., :2], 0.0, atol=1e-6)  # all of it along the load
-
-
-TABLE = [
-    # driver, frame, r_i, r_o, angles of the eight layers
-    ("cauchy", "spatial", 1.4092, 3.0561, [0.38, 3.48, 14.06, 49.71, 64.03, 69.74, 72.92, 75.00]),
-    ("cauchy", "material", 1.4064, 3.0550, [0.41, 3.52, 14.27, 50.18, 64.29, 69.90, 73.04, 75.10]),
-    ("finger", "material", 1.5377, 3.1219, [30.3, 35.8, 39.6, 42.4, 44.4, 45.8, 47.0, 47.8]),
-    ("pk2", "material", 1.4068, 3.0549, [0.65, 4.75, 16.50, 51.07, 61.54, 66.59, 69.66, 71.74]),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("driver", "frame", "inner", "outer", "angles"), TABLE)
-def test_the_full_artery(driver: str, frame: str, inner: float, outer: float, angles: list[float]) -> None:
-    """Means over the points of each layer of elements."""
-    simulation = Simulation(artery("full", remodeling={"driver": driver, "frame": frame}), SELF)
-    (step,) = simulation.steps()
-    assert step.row["pass_residual"] < 1e-8
-    assert (step.row["inner_radius"], step.row["outer_radius"]) == pytest.approx((inner, outer), abs=1e-3)
-    angle = Measurement(simulation.observer, step).fibre_angle
-    radius = np.linalg.norm(simulation.quadrature.coordinates[..., :2], axis=-1).mean(axis=1)
-    layer = np.clip(((radius - 1.0) / 0.25).astype(int), 0, 7)
-    means = [angle[layer == number].mean() for number in range(8)]
-    np.testing.assert_allclose(means, angles, rtol=0, atol=0.1)
 
 
 # ---------------------------------------------------------------- the way decides

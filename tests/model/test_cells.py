@@ -124,27 +124,6 @@ def random_cells(count: int) -> UnitCell:
     return UnitCell(rng.uniform(0.05, 2.0, (count, 3)), np.linalg.qr(rng.normal(size=(count, 3, 3)))[0])
 
 
-def test_between_chains_of_one_direction_it_is_the_angle() -> None:
-    first = random_cells(50)
-    lengths = np.array([0.0, R0, 0.0]) + np.zeros((50, 3))
-    turned = first.axes @ rotations(np.linspace(0.1, 4.0, 50))
-    cosine = np.abs(np.einsum("na,na->n", first.axes[:, 1], turned[:, 1]))
-    found = angle_between(UnitCell(lengths, first.axes), UnitCell(2.0 * lengths, turned))
-    np.testing.assert_allclose(found, np.degrees(np.arccos(cosine)), rtol=5e-3)
-
-
-def test_between_cells_of_the_same_axes_it_is_the_angle_of_the_directions() -> None:
-    """Whatever the order in which the axes stand, and their senses."""
-    first = random_cells(50)
-    second = first.dimensions * np.random.default_rng(8).uniform(0.8, 1.2, (50, 3))
-    unit = [lengths / np.linalg.norm(lengths, axis=1)[:, None] for lengths in (first.dimensions, second)]
-    expected = np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(unit[0] - unit[1], axis=1)))
-    np.testing.assert_allclose(angle_between(first, UnitCell(second, first.axes)), expected, rtol=1e-12)
-    order = [2, 0, 1]
-    other = UnitCell(second[:, order], -first.axes[:, order])
-    np.testing.assert_allclose(angle_between(first, other), expected, rtol=1e-10)
-
-
 def test_it_is_that_of_bures() -> None:
     """cos = tr sqrt(sqrt(A) B sqrt(A)) for small changes of any kind; no change is no angle."""
     first = random_cells(50)

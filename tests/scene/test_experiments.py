@@ -10,6 +10,7 @@ import pytest
 
 from remodel_fenicsx import read_scene
 from remodel_fenicsx.scene.scene import scene_from_dict
+from remodel_fenicsx.schema.text import put
 from tests.runs import made
 
 
@@ -24,11 +25,7 @@ def cube(**changes: Any) -> dict[str, Any]:
         "output": {"fields": False},
     }
     for key, value in changes.items():
-        *path, last = key.split(".")
-        table = values
-        for name in path:
-            table = table.setdefault(name, {})
-        table[last] = value
+        put(values, key, value)
     return values
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 from hypothesis import example, given, settings, strategies
 
-from remodel_fenicsx import cli
 from remodel_fenicsx.scene.scene import read_scene, scene_from_dict
 from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.schema.units import is_quantity
@@ -96,16 +95,6 @@ def test_a_quantity():
     assert all(map(is_quantity, ("5 mm", "-5 mm", "2e21 / m^3", "37 degC", "1 N/mm^2", "1 kg m s^-2", "37 °C")))
     for text in ("5", "2e21", "mm", "two words", "5 mm = 3", "5 mm, 6 mm", "2 / 3", "5 m(", "", "1_000"):
         assert not is_quantity(text), text
-
-
-def test_validate_prints_stiffness_load_and_warnings(capsys):
-    settings = ["--set", "material.stress_unit=kPa", "--set", "loads.pressure.value=100 mmHg"]
-    assert cli.main(["validate", str(ARTERY), *settings]) == 0
-    out, err = capsys.readouterr()
-    line = "network modulus c = 0.001568 kPa, shear modulus mu = 3.103 kPa, largest pressure 13.33 kPa"
-    assert out.splitlines()[1] == line
-    assert err.startswith("remodel-fenicsx: warning: material.chain_density = 2e+21: the network (c g(r0) r0^2 = ")
-    assert err.count("\n") == 1
 
 
 @settings(max_examples=100, deadline=None)
