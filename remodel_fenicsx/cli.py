@@ -621,9 +621,8 @@ def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings: what each costs, and how far off it is."""
     from remodel_fenicsx.studies.trade import trade
 
-    say = None if options.quiet else _say
     with _stopping():
-        answer = trade(options.scene, options.output, options.budget, options.jobs, say)
+        answer = trade(options.scene, options.output, options.budget, options.jobs, options.quiet)
     return _answer(*answer)
 
 

@@ -420,7 +420,6 @@ def _in_words(sweep: _Sweep, found: SweepLimit) -> str:
 
 # ---------------------------------------------------------------- the runs
 BUDGET = 600.0  # seconds
-NOTHING = 1e-9  # degrees: the error of what others are compared with
 
 
 def trade(
@@ -428,10 +427,10 @@ def trade(
     folder: Path | str | None = None,
     budget: float = BUDGET,
     jobs: int | None = None,
-    say: Callable[[str], None] | None = None,
+    quiet: bool = True,
 ) -> tuple[Path, Trade]:
     """Run a scene with a ladder of settings, and estimate the error of each."""
-    study = _TradeStudy(scene, folder, ladder(scene), budget, jobs, say)
+    study = _TradeStudy(scene, folder, ladder(scene), budget, jobs, quiet)
     return study.answered(study.answer)
 
 
@@ -445,13 +444,13 @@ class _TradeStudy(Study):
         settings: Sequence[Setting],
         budget: float,
         jobs: int | None,
-        say: Callable[[str], None] | None,
+        quiet: bool,
     ):
-        self.settings, self.budget, self.say = settings, budget, say
+        self.settings, self.budget = settings, budget
         self.times = compared_times(scene, settings)
         of_run = {f"{setting.name}-{seed}": (setting, seed) for setting in settings for seed in setting.seeds}
         scenes = {name: as_run(setting, seed, self.times) for name, (setting, seed) in of_run.items()}
-        super().__init__("trade", scene, folder, scenes, jobs, quiet=say is None)
+        super().__init__("trade", scene, folder, scenes, jobs, quiet)
         self.deadline = clock.monotonic() + budget
         self._setting_of = {name: setting for name, (setting, _) in of_run.items()}
         self._results: dict[str, Result] = {}
@@ -492,7 +491,7 @@ class _TradeStudy(Study):
         return clock.monotonic() + self._expected(self._setting_of[run.name]) < self.deadline
 
     def learn(self) -> None:
-        """Read what is new, and say what it says."""
+        """Read what is new."""
         for setting in self.settings:
             with suppress(RecordingError):  # one that is damaged will be among those that have failed
                 if setting.name not in self._results and all(run.is_complete() for run in self.runs_of(setting)):
@@ -501,11 +500,6 @@ class _TradeStudy(Study):
     def _learn_from(self, setting: Setting) -> None:
         result = self._results[setting.name] = read(setting, self.runs_of(setting), self.times)
         self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
-        if self.say is not None:
-            rows = estimated(self.results)[0] if len(self._results) > 1 else []
-            error = next((row.angle_error for row in rows if row.result.setting == setting), np.nan)
-            so_far = f"so far {error:.2g} degrees off" if error > NOTHING else "the finest so far"
-            self.say(f"{setting.name}: {result.seconds:.2g} s, {so_far}")
 
 
 def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Result:

@@ -156,6 +156,7 @@ def test_what_changes_nothing_is_named(folder: Path) -> None:
         fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out")
 
 
+@pytest.mark.slow
 def test_six_numbers_are_recovered() -> None:
     """A part of benchmarks/recovery.py: one minimum from two starts, the truth within three standard deviations."""
     scene, random = tube_of_the_benchmark(), np.random.default_rng(1)
