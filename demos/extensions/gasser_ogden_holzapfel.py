@@ -35,19 +35,9 @@ def families(F: Any, lame_lambda: Any, mu: Any, fibre_stiffness: Any, fibre_expo
     return energy
 
 
-def volumetric(J: Any, lame_lambda: Any, mu: Any, **own: Any) -> Any:
-    """That of the Neo-Hookean matrix."""
-    return neo_hookean.volumetric(J, lame_lambda, mu)
-
-
-def distortional(F: Any, lame_lambda: Any, mu: Any, **own: Any) -> Any:
-    """That of the Neo-Hookean matrix."""
-    return neo_hookean.distortional(F, lame_lambda, mu)
-
-
 MATRICES["gasser-ogden-holzapfel"] = Matrix(
-    volumetric,
-    distortional,
+    neo_hookean.volumetric,
+    *neo_hookean.others,
     families,
     parameters={
         "fibre_stiffness": Parameter(5.0, "k1, in the unit of stress.", above=0),

@@ -33,19 +33,9 @@ def network(F: Any, lame_lambda: Any, mu: Any, second_modulus: Any, second_conto
     return second_modulus * (CHAIN.energy(length, second_contour_length) - repulsion)
 
 
-def volumetric(J: Any, lame_lambda: Any, mu: Any, **own: Any) -> Any:
-    """That of the Neo-Hookean matrix."""
-    return neo_hookean.volumetric(J, lame_lambda, mu)
-
-
-def distortional(F: Any, lame_lambda: Any, mu: Any, **own: Any) -> Any:
-    """That of the Neo-Hookean matrix."""
-    return neo_hookean.distortional(F, lame_lambda, mu)
-
-
 MATRICES["with-second-network"] = Matrix(
-    volumetric,
-    distortional,
+    neo_hookean.volumetric,
+    *neo_hookean.others,
     network,
     parameters={
         "second_modulus": Parameter(10.0, "c, in the unit of stress.", above=0),

@@ -106,7 +106,7 @@ class Matrix:
         return sum(rest, first)
 
 
-def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any, **own: Any) -> Any:
     """U = lambda/2 ln^2 J, the volumetric part of eq. (4a): its Kirchhoff pressure is lambda ln J."""
     return lame_lambda / 2 * ln(jacobian) ** 2
 
@@ -126,10 +126,11 @@ def neo_hookean_derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second
     return value, dyad
 
 
+# its terms pass over parameters of a matrix that adds others to them
 neo_hookean = Matrix(
     logarithmic_dilatation,
-    lambda F, lame_lambda, lame_mu: lame_mu / 2 * (squared_norm(F) - 3),
-    lambda F, lame_lambda, lame_mu: -(lame_mu * ln(det(F))),
+    lambda F, lame_lambda, lame_mu, **own: lame_mu / 2 * (squared_norm(F) - 3),
+    lambda F, lame_lambda, lame_mu, **own: -(lame_mu * ln(det(F))),
     derivatives=neo_hookean_derivatives,
     compiled="NEO_HOOKEAN",
 )
