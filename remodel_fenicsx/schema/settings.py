@@ -25,6 +25,7 @@ from remodel_fenicsx.fem.solver_methods import (
     AUTO,
     LARGE,
     LARGE_ON_RANKS,
+    NO_PREDICTOR,
     REMOVED,
     SMALL_BODY,
     SMALL_REDUCTION,
@@ -1296,10 +1297,9 @@ class Solver(Table):
         f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} "
         "(docs/speed_and_accuracy.md).",
     )
-    predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
-    """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' at what the
-    last increments predict, 'with-tolerance' as predicted where steps are chosen (time.tolerance), else as 'none'. The
-    solutions are the same to the tolerance."""
+    predictor: Annotated[str, OneOf(("none", "autoregressive"), (), NO_PREDICTOR)] = "autoregressive"
+    """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' one
+    increment further, as large as the last one at the same speed. The solutions are the same to the tolerance."""
     absolute_tolerance: Annotated[float, FORCE] = Field(default=0.0, ge=0)
     """A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, where R has the
     out-of-balance nodal forces. It is a force, in the units of the scene."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Recording, Simulation
-from remodel_fenicsx.evolution.coupling import Autoregressive, LoadStep, Responsive
+from remodel_fenicsx.evolution.coupling import LoadStep, Predictor
 from remodel_fenicsx.running import run
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
@@ -27,55 +27,20 @@ def simulation() -> Any:
         yield found
 
 
-def follow(simulation: Simulation, increments: list[np.ndarray], rates: dict[str, float] = RATES) -> Autoregressive:
-    """A predictor that has seen these, one a step."""
+def test_a_step_begins_as_fast_as_the_last_one_went_on(simulation: Simulation) -> None:
     state = simulation.state
-    predictor = Autoregressive(state)
-    for number, increment in enumerate(increments, start=1):
-        before = state.unknown.x.array.copy()
-        state.unknown.x.array[:] += increment
-        predictor.solved(LoadStep(float(number), 1.0, rates), before)
-    return predictor
-
-
-def alternating(size: int) -> list[np.ndarray]:
-    """A trend, and what alternates from step to step as a staggered pass does."""
-    rng = np.random.default_rng(1)
-    trend, swing = rng.standard_normal((2, size))
-    return [1e-3 * (0.9**k * trend + (-0.8) ** k * swing) for k in range(8)]
-
-
-def test_a_trend_and_a_swing_are_both_continued(simulation: Simulation) -> None:
-    unknown = simulation.state.unknown.x.array
-    increments = alternating(len(unknown))
-    predictor = follow(simulation, increments[:-1])
-    found = predictor.expected(LoadStep(8.0, 1.0, RATES))
+    predictor, unknown, increment = Predictor(state), state.unknown.x.array, np.empty(0)
+    assert predictor.expected(LoadStep(1.0, 1.0, RATES)) is None
+    for time, duration in ((1.0, 1.0), (1.5, 0.5)):
+        before, increment = unknown.copy(), np.random.default_rng(1).standard_normal(len(unknown))
+        unknown[:] += increment
+        predictor.solved(LoadStep(time, duration, RATES), before)
+    found = predictor.expected(LoadStep(3.0, 1.5, RATES))
     assert found is not None
     free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
-    np.testing.assert_allclose((found - unknown)[free], increments[-1][free], rtol=0, atol=1e-12)
+    np.testing.assert_allclose((found - unknown)[free], 3.0 * increment[free], rtol=1e-12)
     assert np.all(found[~free] == 0.0)  # what supports prescribe
-
-
-def test_a_body_that_answers_its_cells_is_expected_whatever_the_steps(simulation: Simulation) -> None:
-    """Cells change by combinations of two fields, and the unknowns answer them linearly."""
-    state, held = simulation.state, {"force": 0.0}
-    predictor, rng, cells = Responsive(state), np.random.default_rng(1), state.cells
-    fields = 1e-3 * rng.uniform(0.0, 1.0, (2, *cells.dimension_values.shape))
-    answers = rng.standard_normal((2, len(state.unknown.x.array)))
-    free, time = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values()), 0.0
-    for number, shares in enumerate(rng.uniform(0.2, 2.0, (6, 2)), start=1):
-        duration = float(rng.uniform(0.1, 3.0))
-        time += duration
-        cells.set(np.sqrt(cells.dimension_values**2 + np.tensordot(shares, fields, axes=1)), cells.axis_values)
-        found, step = predictor.expected(LoadStep(time, duration, held)), LoadStep(time, duration, held)
-        before = state.unknown.x.array.copy()
-        state.unknown.x.array[:] += shares @ answers
-        if number > 2:
-            assert found is not None
-            np.testing.assert_allclose(found[free], state.unknown.x.array[free], rtol=0, atol=1e-7)
-        predictor.solved(step, before)
-        state.settle_cells()
-    assert predictor.expected(LoadStep(time + 1.0, 1.0, {"force": 2.0})) is None
+    assert predictor.expected(LoadStep(3.0, 1.5, {"force": 2.1})) is None
 
 
 def iterations(folder: Path) -> int:
@@ -93,10 +58,10 @@ def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Pa
     found, expected = Recording(predicted).history, Recording(plain).history
     for name in ("mean_stretch", "stored_energy", "max_chain_extension", "remodeling_power"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-8, err_msg=name)
-    assert iterations(predicted) <= 0.9 * iterations(plain)
+    assert iterations(predicted) <= 0.95 * iterations(plain)
 
 
-def nearly_straight(predictor: Autoregressive, step: LoadStep) -> np.ndarray | None:
+def nearly_straight(predictor: Predictor, step: LoadStep) -> np.ndarray | None:
     """The last displacement, stretched until the longest chain has 0.999 of its contour length."""
     tissue = pulled_cube(4.0).material.tissue(pulled_cube(4.0).cells.end_to_end_length)
     unknown, extension = predictor.state.unknown.x.array, Equilibrium(predictor.state, tissue).extension
@@ -115,9 +80,9 @@ def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pyt
     """Not admissible, with chains nearly straight, or a start from which the solve fails: all is as without."""
     scene = pulled_cube(4.0, solver=PREDICTED, output={"fields": False})
     plain = run(pulled_cube(4.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
-    monkeypatch.setattr(Autoregressive, "expected", lambda self, step: -50.0 * self.state.unknown.x.array)
+    monkeypatch.setattr(Predictor, "expected", lambda self, step: -50.0 * self.state.unknown.x.array)
     assert rows(run(scene, tmp_path / "far", SELF)) == rows(plain)
-    monkeypatch.setattr(Autoregressive, "expected", nearly_straight)
+    monkeypatch.setattr(Predictor, "expected", nearly_straight)
     assert rows(run(scene, tmp_path / "straight", SELF)) == rows(plain)
     solve, failed = GuardedNewton.solve, []
 
@@ -127,7 +92,7 @@ def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pyt
             raise SolveFailure("made to fail", 3, 3, newton.equilibrium.extension())
         return solve(newton, origin)
 
-    monkeypatch.setattr(Autoregressive, "expected", lambda self, step: self.state.unknown.x.array + 0.0)
+    monkeypatch.setattr(Predictor, "expected", lambda self, step: self.state.unknown.x.array + 0.0)
     monkeypatch.setattr(GuardedNewton, "solve", failing)
     folder = run(scene, tmp_path / "failing", SELF)
     assert failed == [0, 1, 2, 3] and iterations(folder) == iterations(plain) + 12
