@@ -281,7 +281,7 @@ CHANGES = (
         choices=PROFILES,
     ),
 )
-SCENE = (option(SCENE_FILE), *CHANGES)
+SCENE_AND_CHANGES = (option(SCENE_FILE), *CHANGES)
 VIEWING = (
     option("--layers K  Show this many layers: of a tube from the inside, of others from the bottom (default: all)."),
     option(
@@ -473,7 +473,7 @@ def _wall(options: argparse.Namespace) -> None:
     _say("\n".join(lines))
 
 
-@command("validate", ["validate artery.toml", "validate artery.toml --profile fast"], *SCENE)
+@command("validate", ["validate artery.toml", "validate artery.toml --profile fast"], *SCENE_AND_CHANGES)
 def _validate(options: argparse.Namespace) -> None:
     """Check a scene without running it, and show what it means."""
     scene, unseen, warnings = options.scene, "", []
@@ -503,7 +503,7 @@ def _unseen_files(scene: Scene) -> str:
 @command(
     "axes",
     ["axes artery.toml -o artery-axes.vtu"],
-    *SCENE,
+    *SCENE_AND_CHANGES,
     option("-o --output FILE  Write to this new file (default: NAME-axes.vtu)."),
     needs=COMPUTES,
 )
@@ -520,7 +520,7 @@ def _axes(options: argparse.Namespace) -> None:
 @command(
     "unload",
     ["unload scanned.toml -o unloaded"],
-    *SCENE,
+    *SCENE_AND_CHANGES,
     option("-o --output FOLDER  Put its scene and mesh into this new folder (default: NAME-unloaded)."),
     needs=COMPUTES,
 )
@@ -567,7 +567,7 @@ def _answer(folder: Path, found: Any) -> int:
         "sweep mine.toml loads.pressure.value=2:6:5 remodeling.kappa=0.02,0.05",
         "sweep mine.toml loads.pressure.value=2:6 material.lame_mu=10:40 --latin 20",
     ],
-    *SCENE,
+    *SCENE_AND_CHANGES,
     option(
         "axes KEY=a:b:n  Vary a key: KEY=a:b:n takes n numbers from a to b, KEY=a,b,... these. Keys are combined.",
         nargs="+",
@@ -592,7 +592,7 @@ def _sweep(options: argparse.Namespace) -> int:
 @command(
     "ensemble",
     ["ensemble artery.toml --seeds 32 -o seeds"],
-    *SCENE,
+    *SCENE_AND_CHANGES,
     option("--seeds N  Use this many seeds (default: 32; at least 2).", default=32),
     *_study("ensemble"),
     needs=COMPUTES + DRAWS,
@@ -609,7 +609,7 @@ def _ensemble(options: argparse.Namespace) -> int:
 @command(
     "trade",
     ["trade artery.toml --budget 10min"],
-    *SCENE,
+    *SCENE_AND_CHANGES,
     option(
         "--budget TIME  Begin no run that would end after this wall time (default: 10min). Cheap runs come first.",
         default=600.0,
@@ -629,7 +629,7 @@ def _trade(options: argparse.Namespace) -> int:
 @command(
     "fit",
     ["fit tube.toml inflation.toml -o fitted"],
-    *SCENE,
+    *SCENE_AND_CHANGES,
     option("data DATA  A TOML file with the unknowns and the tables of measurements; docs/fit.md explains it."),
     option(
         "-o --output DIR  Put the results into this new or empty folder (default: results/NAME-fit), or go on there."
@@ -655,7 +655,7 @@ def _fit(options: argparse.Namespace) -> int:
 @command(
     "stability",
     ["stability artery.toml --times 5 -o stable"],
-    *SCENE,
+    *SCENE_AND_CHANGES,
     option("-o --output DIR  Put the results into this new or empty folder (default: results/NAME-stability)."),
     option("--times N  Look at N times of the run (default: 10).", default=10),
     QUIET,

@@ -295,9 +295,9 @@ def _way_to_rest(scene: Scene, stepper: Stepper) -> Any:
     stops, tolerance = scene.stops(), scene.time.tolerance
     if tolerance is None:
         falls = any(load.falls for load in scene.loads.values())
-        tolerance = homeostasis.UNLOADING if falls else homeostasis.TOLERANCE
+        tolerance = homeostasis.UNLOADING if falls else homeostasis.PATH_TOLERANCE
     if scene.has_random_cells and scene.jumps_by_rank:
-        tolerance = homeostasis.COARSE
+        tolerance = homeostasis.UNCHECKED
     control = StepControl(stepper, tolerance, scene.time.step, stops, homeostasis.LONGEST)
     limit = None
     if missing_for_steps_of_cells(scene) is None:

@@ -40,9 +40,9 @@ class CellField:
     dimensions, axes
         dolfinx quadrature functions of shape (3,) and (3, 3); row I of `axes` is n_I.
     dimension_values, axis_values
-        l_I (cells, points, 3), and n_I as rows (cells, points, 3, 3): the functions' own memory.
+        l_I (elements, points, 3), and n_I as rows (elements, points, 3, 3): the functions' own memory.
     point_cells
-        The cells of all points in one row, (cells * points, ...): the functions' own memory.
+        The cells of all points in one row, (elements * points, ...): the functions' own memory.
     """
 
     def __init__(self, quadrature: Quadrature, name: str):
@@ -59,7 +59,7 @@ class CellField:
         return UnitCell(self.dimensions, self.axes)
 
     def set(self, dimensions: Array, axes: Array) -> None:
-        """Replace all dimensions (cells, points, 3) and axes (cells, points, 3, 3)."""
+        """Replace all dimensions (elements, points, 3) and axes (elements, points, 3, 3)."""
         self.dimension_values[:] = dimensions
         self.axis_values[:] = axes
 
@@ -74,7 +74,7 @@ class CellField:
         return point_kernels(self.quadrature.mesh.comm)
 
     def structure_tensor(self) -> Array:
-        """A = sum_I l_I^2 n_I (x) n_I, shape (cells, points, 3, 3), in squared link lengths. Collective at first."""
+        """A = sum_I l_I^2 n_I (x) n_I, shape (elements, points, 3, 3), in squared link lengths. Collective at first."""
         return self.kernels.structure_tensor(self.dimension_values, self.axis_values)
 
 
@@ -95,7 +95,7 @@ class UnitCells(CellField):
     regions
         Initial dimensions and r0 of regions where they are others, by name.
     fibres
-        Measured fibres of all elements, (number_of_elements, columns) by name of `model.fibres.MEASURED`, by region;
+        Measured fibres of all elements, (number_of_elements, columns) by name of `model.axes.MEASURED`, by region;
         "" is the whole body.
 
     Attributes
@@ -103,7 +103,7 @@ class UnitCells(CellField):
     local_axes
         As given.
     initial_dimensions
-        l0_I by rank (not by direction), shape (cells, points, 3), in link lengths.
+        l0_I by rank (not by direction), shape (elements, points, 3), in link lengths.
 
     Examples
     --------
@@ -149,7 +149,7 @@ class UnitCells(CellField):
         self.dimension_values[chosen], self.axis_values[chosen] = cells_of(tensors, length, axes)
 
     def initial_axes(self) -> Array:
-        """n_I before the first pass, rows, (cells, points, 3, 3)."""
+        """n_I before the first pass, rows, (elements, points, 3, 3)."""
         return AXES[self.settings.axes](self.local_axes)
 
 

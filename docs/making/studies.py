@@ -106,7 +106,7 @@ class Passes(Watcher):
         drive = self.remodeling.drive()
         values = np.linalg.eigvalsh(drive.tensor)
         self.largest = values[:, 2].reshape(self.shape)
-        self.active = positive_direction(values, drive.threshold)[1].reshape(self.shape)
+        self.active = positive_direction(values, drive.noise)[1].reshape(self.shape)
         self.number += self.active
 
 

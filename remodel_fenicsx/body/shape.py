@@ -216,7 +216,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "pass_residual",
             "squared link length",
             "distance of the cells from those that their own stress asks for: largest norm of A_pass - A",
-            lambda m: m.observer.stepper.remodeling.residual(),
+            lambda m: m.observer.stepper.remodeling.distance(),
             after_pass=True,
         ),
         Column(

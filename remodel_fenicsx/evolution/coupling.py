@@ -213,13 +213,8 @@ class Staggered:
             self.turnover.lag(time)
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
         step = LoadStep.between(self.state.time, old_loads, time, loads)
-        if self._solved_as_expected(step, loads, work):
-            pass
-        elif self.equilibrium.extension().admissible:
-            self._solve_in_one(time, loads, work)
-        else:
-            log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
-            self._solve_in_parts(time, old_loads, loads, work, failure=None)
+        if not self._solved_as_expected(step, loads, work):
+            self._solve_from_the_last(time, old_loads, loads, work)
         self._whole(time, old_loads, loads).look_back(before, work)
         if self.predictor is not None:
             self.predictor.solved(step, before)
@@ -279,8 +274,12 @@ class Staggered:
         loading.set(old_loads)
         return False
 
-    def _solve_in_one(self, time: float, loads: LoadValues, work: Work) -> None:
-        old_loads = dict(self.state.loading.values)
+    def _solve_from_the_last(self, time: float, old_loads: LoadValues, loads: LoadValues, work: Work) -> None:
+        """From the unknowns of the last step, in one piece or in parts."""
+        if not self.equilibrium.extension().admissible:
+            log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
+            self._solve_in_parts(time, old_loads, loads, work, failure=None)
+            return
         self.state.loading.set(loads)
         try:
             work.add(self.newton.solve())

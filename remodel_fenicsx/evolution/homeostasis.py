@@ -29,14 +29,14 @@ from remodel_fenicsx.system import NOTICE
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-TOLERANCE, UNLOADING = 3.0, 0.5
+PATH_TOLERANCE, UNLOADING = 3.0, 0.5
 """Of the steps on the way, in degrees, where a scene has no time.tolerance: in all, and where loads fall or reverse.
 There points lose their tension, and their cells stay as exact as the way. The paper's artery takes 25 solves."""
-COARSE = 90.0  # degrees: more than any step's error, where it leaves nothing
+UNCHECKED = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
 LIMIT_ITERATIONS = 10
 """Of Newton's method in the step to the limit: from near it takes 3 to 7, and one that fails costs more than steps."""
-NEAR, AGAIN, TRIES = 0.05, 0.7, 6
+NEAR_REST, AGAIN, TRIES = 0.05, 0.7, 6
 """Change of A over r0^2 by a pass to the limit from which on the rest is tried in one step, how much nearer the cells
 are at the next try, and how often. Where there are points that gain and lose their tension, none is solved."""
 SAME_WAY, NO_CHANGE = 0.5, 0.03
@@ -88,7 +88,7 @@ class Homeostasis:
         """Equilibrium of forces and of cells."""
         state, work = self.state, Work()
         start, number, self.steps, self._held = state.time, state.number, 0, None
-        coarsens = not self.stepper.coupling.traits.accumulates and self.tolerance < COARSE and self.turnover is None
+        coarsens = not self.stepper.coupling.traits.accumulates and self.tolerance < UNCHECKED and self.turnover is None
         self._go(time, loads, max(start, self.held_from), coarsens, work)
         if coarsens and self._held is not None and self._largest_jump()[0] > FRONT:
             log.info(
@@ -106,7 +106,7 @@ class Homeostasis:
         """From where the state is until the cells rest."""
         # The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
         # collagen comes to rest depends on the way.
-        state, self.near, self.tries, self._slowing = self.state, NEAR, TRIES, Slowing(dict(Slowing.INITIAL))
+        state, self.near, self.tries, self._slowing = self.state, NEAR_REST, TRIES, Slowing(dict(Slowing.INITIAL))
         self.control.tolerance = self.tolerance
         for step in self.control.march():
             self.steps += 1
@@ -117,7 +117,7 @@ class Homeostasis:
             if state.time < self.held_from:
                 continue
             if coarsens:
-                self.control.tolerance = COARSE
+                self.control.tolerance = UNCHECKED
             ahead, solved = state.snapshot(), state.equilibrium_cells
             self._held = self._held or ahead
             state.cells.set(solved.dimension_values, solved.axis_values)  # those that the stress belongs to
@@ -247,7 +247,7 @@ class Homeostasis:
         quadrature, r0 = self.quadrature, float(
             assembly.largest(self.stepper.tissue.end_to_end_length, self.quadrature.mesh)
         )
-        left = self.remodeling.residual() / r0**2
+        left = self.remodeling.distance() / r0**2
         self._say(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)
         jump, place = self._largest_jump()
         if jump > FRONT:

@@ -125,28 +125,27 @@ class RemodelingPass:
     def _own_drive(self, residual: float) -> Drive:
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
+        # the driver's principal axes if the cells' axes are to stay
+        steady = self.state.cells.point_cells.axes
+        if not self.driver.material and self.frame.carries_axes:
+            steady = carried_axes(F, steady)
         return Drive(
             F,
-            self.kernels.without_noise(tensor, self._steady_axes(F), noise),
+            self.kernels.without_noise(tensor, steady, noise),
             self.driver,
             self.frame,
             noise,
             self.state.cells.initial_dimensions.reshape(-1, 3),
             self.parameters.at_points().end_to_end_length,
             self.kappa,
-            spectral.PAIRINGS[self.settings.pairing],
-            self.settings.rotation_time,
-            self.kernels,
-            rounding,
-            self.settings.exponent,
-            self.settings.threshold,
-            self.settings.own_parameters,
+            pairing=spectral.PAIRINGS[self.settings.pairing],
+            rotation_time=self.settings.rotation_time,
+            kernels=self.kernels,
+            rounding=rounding,
+            exponent=self.settings.exponent,
+            least_tension=self.settings.threshold,
+            parameters=self.settings.own_parameters,
         )
-
-    def _steady_axes(self, F: Array) -> Array:
-        """The driver's principal axes if the cells' axes are to stay, as rows (n, 3, 3)."""
-        axes = self.state.cells.point_cells.axes
-        return carried_axes(F, axes) if not self.driver.material and self.frame.carries_axes else axes
 
     def noise(self, F: Array, tensor: Array, residual: float) -> Noise:
         """Up to which size a principal value may be an error: of rounding, or of the equilibrium as it was accepted."""
@@ -234,7 +233,7 @@ class RemodelingPass:
         if self.law.target is not None:
             return np.asarray(self.target(residual).share < AWAKE)
         values = np.linalg.eigvalsh(drive.tensor)
-        return ~spectral.positive_direction(values, threshold=drive.threshold)[1]
+        return ~spectral.positive_direction(values, threshold=drive.noise)[1]
 
     def asleep_share(self) -> float:
         """Share of the body's volume in which no principal value is above `remodeling.threshold`."""
@@ -287,7 +286,7 @@ class RemodelingPass:
             increment = tissue.increment(before, after - before, sum_after - sum_before)
         return np.asarray(increment)
 
-    def residual(self) -> float:
+    def distance(self) -> float:
         """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths."""
         # How far the solved state is from one whose cells belong to its own stress; NaN before the first pass.
         if not self.law.remodels or self._change is None:

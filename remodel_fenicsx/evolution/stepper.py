@@ -50,9 +50,9 @@ class Step:
     is_last
         Whether it is the last one of the way.
     time_error
-        Estimated error in time of the solved state, degrees; NaN where nobody estimates it (`time_error.TimeError`).
+        Estimated error in time of the solved state, degrees; NaN where nobody estimates it (`time_steps.TimeError`).
     negative_eigenvalues
-        Of the tangent at the solved state; NaN where nobody counts them (`watch.equilibrium_stability`).
+        Of the tangent at the solved state; NaN where nobody counts them (`watch.stability`).
     row
         Its columns by name, where somebody measures (`results.columns.Observer`).
     case

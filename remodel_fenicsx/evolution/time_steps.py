@@ -234,14 +234,14 @@ log = logging.getLogger(__name__)
 
 AIM = 0.85  # share of the tolerance that another length aims at
 KEPT, WORTHWHILE = 0.9, 1.5  # best lengths over the present one between which steps stay as they are
-GROWTH, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two steps
+LENGTHENING, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two steps
 STRETCHED = 1.05  # so much longer steps are allowed to be where they are one fewer to a stop
 SMALLEST = 2.0**-12  # of the first step: shorter ones are not tried where steps cannot be solved
 FASTEST = 360.0  # degrees by which chains turn, at most, while cells remodel or loads go from one corner to the next
 FALLS, LONGER = 0.8, 2.0  # an error within this share of that of so much a longer step does not come from the step
 SHORT = 0.3  # of such a time: longer steps may have an error that has saturated
 IN_VAIN = 20  # steps above the tolerance in such a time that shorter ones would not help, until longer ones go on
-NEAR = 4.0  # tolerances: below such an error shorter steps are tried again
+NEAR_TOLERANCE = 4.0  # tolerances: below such an error shorter steps are tried again
 FAILED_STEPS = 3  # steps in a row that could not be solved, each a quarter of the one before
 TELLING_ERROR = 1e-4  # of the tolerance: smaller errors say nothing about the next step
 
@@ -292,7 +292,7 @@ class StepControl:
             except StepTooLongError as rejected:
                 log.debug("time %g: %s, taken back", time, rejected)
                 self._rejected.append(rejected)
-                duration = max(self._best(rejected.error, rejected.duration, GROWTH), self._shortest())
+                duration = max(self._best(rejected.error, rejected.duration, LENGTHENING), self._shortest())
             except StepFailure as failure:
                 failures += 1
                 duration = (time - self.state.time) / 4
@@ -336,7 +336,7 @@ class StepControl:
             return self._best(error, duration, 1.0)
         # an error that lags behind rises once more after a longer step, by as much
         present = self._numbers["wanted"]
-        best = self._best(error + max(0.0, error - self._numbers["before"]), duration, GROWTH * present / duration)
+        best = self._best(error + max(0.0, error - self._numbers["before"]), duration, LENGTHENING * present / duration)
         return present if KEPT * present <= best < WORTHWHILE * present else best
 
     # ------------------------------------------------------------ steps in vain
@@ -355,7 +355,7 @@ class StepControl:
             numbers["usual"] = max(duration, faded * numbers["usual"])
         elif numbers["in_vain"] <= IN_VAIN:
             numbers["in_vain"] += 1
-        if error <= NEAR:
+        if error <= NEAR_TOLERANCE:
             numbers["in_vain"] = min(numbers["in_vain"], IN_VAIN)
         return numbers["in_vain"] > IN_VAIN
 

@@ -41,7 +41,7 @@ class Kinematics(ABC):
     suits_multigrid
         Whether algebraic multigrid solves for these unknowns.
     closing
-        Of which sector a tube is made (`model.closing.Closing`), where it has residual stress.
+        Of which sector a tube is made (`model.residual_stress.Closing`), where it has residual stress.
     grows
         Whether the tissue's volume changes in time (`volume_ratio`).
     cost

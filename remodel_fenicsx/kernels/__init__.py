@@ -174,7 +174,7 @@ class PointKernels:
         return stretch, int(np.argmax(stretch)) if stretch.size else 0, float(smallest)
 
     def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
-        """Which points `operators.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends."""
+        """Which points `tensors.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends."""
         # |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular.
         F, J, change = before[:, 2:], before[:, 1], after[:, 2:] - before[:, 2:]
         reach = np.sqrt((change**2).sum(axis=1)) * (F**2).sum(axis=1)

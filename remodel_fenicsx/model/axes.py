@@ -154,7 +154,7 @@ GROWTH = "growth"  # J_g
 MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
 MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}  # beside one of SOURCES
 SOURCES = ("structure_tensor", "fibre", "angle")  # one of these is needed
-SYMMETRIC = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
+FULL_OF_VTK = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
 # eigenvalue below zero, over the trace, that may be rounding of files with 7 digits
 FILE_ROUNDING = 1e-6
 
@@ -226,7 +226,7 @@ def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple
 
 def _tensors(rows: Array) -> Array:
     """Symmetric (..., 3, 3) of rows of 9 or 6 numbers."""
-    full = rows if rows.shape[-1] == 9 else rows[..., SYMMETRIC]
+    full = rows if rows.shape[-1] == 9 else rows[..., FULL_OF_VTK]
     tensors = full.reshape(*rows.shape[:-1], 3, 3)
     return (tensors + np.swapaxes(tensors, -1, -2)) / 2
 

@@ -498,7 +498,7 @@ class Tissue:
             The unit cell: one whole cell, or shares whose weights add up to one.
 
         In UFL a repulsion that has derivatives of its own (`Repulsion.derivatives`) is left out: these enter forms as
-        values at the quadrature points (`solver.pointwise`).
+        values at the quadrature points (`solver.equilibrium.PointwiseRepulsion`).
         """
         energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)

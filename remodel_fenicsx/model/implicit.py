@@ -145,7 +145,7 @@ def _turns_by_tensor(step: StepOfCells, found: Ranked) -> Array:
     i, j = np.transpose(tensors.PAIRS)
     gap = found.values[:, i] - found.values[:, j]
     unknown = AGREE * np.abs(found.values).max(axis=1)
-    known = np.abs(gap) > np.maximum(unknown, step.drive.threshold)[:, None]
+    known = np.abs(gap) > np.maximum(unknown, step.drive.noise)[:, None]
     return np.where(known, np.sqrt(0.5) / np.where(known, gap, 1.0), 0.0)
 
 

@@ -36,7 +36,7 @@ class Drive(NamedTuple):
         The driving tensor, symmetric, (n, 3, 3).
     driver, frame
         Where the tensor's eigenvectors live, and what becomes of them.
-    threshold
+    noise
         Principal values up to this size are zero, in the unit of the tensor; (n,) or a number.
     initial_dimensions
         l0_I by rank, (n, 3), in link lengths.
@@ -51,7 +51,7 @@ class Drive(NamedTuple):
     kernels
         Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels`).
     rounding
-        The part of the threshold that is the rounding of a stress, in its unit; (n,) or a number.
+        The part of the noise that is the rounding of a stress, in its unit; (n,) or a number.
     exponent, least_tension
         Of `tensor_law.target` and `tensor_law.awake`.
     parameters
@@ -65,7 +65,7 @@ class Drive(NamedTuple):
     >>> from remodel_fenicsx.extend import DRIVERS, FRAMES, LAWS, Drive, UnitCell
     >>> cells = UnitCell(np.full((1, 3), 3**-0.5), np.eye(3)[None])
     >>> stress = np.diag([0.0, 0.0, 2.0])[None]
-    >>> drive = Drive(np.eye(3)[None], stress, DRIVERS["cauchy"], FRAMES["spatial"], threshold=1e-9,
+    >>> drive = Drive(np.eye(3)[None], stress, DRIVERS["cauchy"], FRAMES["spatial"], noise=1e-9,
     ...               initial_dimensions=cells.dimensions, end_to_end_length=1.0, kappa=0.1)
     >>> after = LAWS["explicit"].update(cells, drive, 0.0, 1.0)
     >>> after.dimensions.round(4)  # by rank of the principal values, in link lengths
@@ -76,7 +76,7 @@ class Drive(NamedTuple):
     tensor: Array
     driver: Driver
     frame: Frame
-    threshold: Array | float
+    noise: Array | float
     initial_dimensions: Array
     end_to_end_length: Array | float
     kappa: Array | float
@@ -96,7 +96,7 @@ class Drive(NamedTuple):
     @property
     def floor(self) -> Array | float:
         """Tension below which a principal value counts as none, (n,) or a number, in the unit of the tensor."""
-        return tensor_law.floor_above(self.threshold, self.rounding)
+        return tensor_law.floor_above(self.noise, self.rounding)
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
@@ -253,7 +253,7 @@ class Ranked(NamedTuple):
 def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> Ranked:
     """Axes at the principal directions (eqs. 8 and 9), dimensions towards r0 e (eqs. 10 and 11)."""
     values, axes = principal_directions(drive, cells.axes, drive.pairing)
-    direction, active = drive.kernels.positive_direction(values, threshold=drive.threshold)
+    direction, active = drive.kernels.positive_direction(values, threshold=drive.noise)
     target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
     if np.ndim(drive.kappa):
         active = active & (np.asarray(drive.kappa) > 0.0)
@@ -272,7 +272,7 @@ def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairin
     if not drive.driver.material and drive.frame.carries_axes:
         previous = carried_axes(drive.deformation_gradient, previous)
     function: spectral.Pairing = drive.kernels.principal if pairing is spectral.principal else pairing
-    return function(drive.tensor, previous, threshold=drive.threshold)
+    return function(drive.tensor, previous, threshold=drive.noise)
 
 
 def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
@@ -315,7 +315,7 @@ def rotation(cells: UnitCell, drive: Drive, time_old: float, time_new: float) ->
     order = (np.argmax(cells.dimensions, axis=1)[:, None] + np.arange(3)) % 3
     axes = np.take_along_axis(cells.axes, order[:, :, None], axis=1)
     values, towards = principal_directions(drive, axes, spectral.principal)
-    _, active = spectral.positive_direction(values, threshold=drive.threshold)
+    _, active = spectral.positive_direction(values, threshold=drive.noise)
     largest = spectral.with_signs_of(axes, framed(drive, towards))[:, 0]
     vectors = _turn_towards(axes[:, 0], largest, (time_new - time_old) / drive.rotation_time)
     return UnitCell(cells.dimensions, turned(cells.axes, np.where(active[:, None], vectors, 0.0)))
@@ -437,7 +437,7 @@ def mean_tensor(drives: Drives, weights: Weights) -> Drive:
     return _with(
         drives[0],
         tensor,
-        _weighted([drive.threshold for drive in drives], weights),
+        _weighted([drive.noise for drive in drives], weights),
         _weighted([drive.rounding for drive in drives], weights),
     )
 
@@ -447,11 +447,11 @@ def largest_tension(drives: Drives, weights: Weights) -> Drive:
     tensors = np.array([material_tensor(drive) for drive in drives])
     chosen = np.linalg.eigvalsh(tensors)[..., -1].argmax(axis=0)
     shape, points = tensors.shape[:2], np.arange(tensors.shape[1])
-    threshold, rounding = (
+    noise, rounding = (
         np.array([np.broadcast_to(getattr(drive, name), shape[1]) for drive in drives])[chosen, points]
-        for name in ("threshold", "rounding")
+        for name in ("noise", "rounding")
     )
-    return _with(drives[0], tensors[chosen, points], threshold, rounding)
+    return _with(drives[0], tensors[chosen, points], noise, rounding)
 
 
 def mean_target(targets: Sequence[Target], weights: Weights) -> Target:
@@ -461,9 +461,9 @@ def mean_target(targets: Sequence[Target], weights: Weights) -> Target:
     return Target(pulled / np.where(share > 0.0, share, 1.0)[:, None, None], share)
 
 
-def _with(drive: Drive, tensor: Array, threshold: Any, rounding: Any) -> Drive:
+def _with(drive: Drive, tensor: Array, noise: Any, rounding: Any) -> Drive:
     driver = replace(drive.driver, material=True)  # the tensor is in material space already
-    return drive._replace(tensor=tensor, driver=driver, threshold=threshold, rounding=rounding)
+    return drive._replace(tensor=tensor, driver=driver, noise=noise, rounding=rounding)
 
 
 def _weighted(values: Sequence[Any], weights: Weights) -> Any:

@@ -450,7 +450,7 @@ class Sight:
 
 PICTURES, ANIMATIONS = (".png", ".pdf"), (".gif", ".webp")
 MOST_PANELS, MOST_COLUMNS = 12, 4
-FRAMES, FEWEST_FRAMES, MOST_FRAMES = 60, 2, 500  # by default; an animation of one is a picture; all are in memory
+MOVIE_FRAMES, FEWEST_FRAMES, MOST_FRAMES = 60, 2, 500  # by default; an animation of one is a picture; all are in memory
 FRAME_TIME, LAST_TIME = 80, 1600  # ms that a frame stands; multiples of 10, as GIF counts
 ALONE, BESIDE, FRAME = (1000, 880), (500, 600), (600, 530)  # pixels of a body: alone, beside others, in an animation
 NOTE_LETTER = 6.3  # pixels, mean width
@@ -471,7 +471,7 @@ def draw_picture(
 
 
 def draw_animation(
-    folder: str | os.PathLike[str], frames: int = FRAMES, viewing: Viewing | None = None, path: Path | None = None
+    folder: str | os.PathLike[str], frames: int = MOVIE_FRAMES, viewing: Viewing | None = None, path: Path | None = None
 ) -> Path:
     """Draw the body of a run as it moves through time."""
     _check_new(path, ANIMATIONS)

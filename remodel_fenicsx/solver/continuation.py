@@ -27,7 +27,7 @@ FAR = 2.0
 """`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
 without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
 # Iterations, or tangents of a whole step: chains near their contour length make ends nearer too, but within 11
-NEAR, MANY = 0.5, 12
+CLOSE, MANY = 0.5, 12
 SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 SAME_SOLUTION = (
     1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
@@ -261,7 +261,7 @@ class Change:
             return True
         if solution is None:
             return False
-        return solution.reach > FAR or (0.0 < solution.reach < NEAR and solution.newton_iterations > MANY)
+        return solution.reach > FAR or (0.0 < solution.reach < CLOSE and solution.newton_iterations > MANY)
 
     def _size(self, change: NDArray[np.float64]) -> float:
         """Largest change of an unknown, over all ranks."""

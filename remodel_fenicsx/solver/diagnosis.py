@@ -188,15 +188,13 @@ class Inertia:
 def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
     """Negative eigenvalues, and the lowest one, without loads, displacement and remodeling; the state stays."""
     state = inertia.equilibrium.state
-    before, cells = state.snapshot(), state.cells
-    try:
+    cells = state.cells
+    with state.tentative():
         state.unknown.x.array[:] = 0.0
         state.loading.set(dict.fromkeys(state.loading.values, 0.0))
         cells.set(cells.initial_dimensions, cells.initial_axes())
         state.settle_cells()
         return inertia.negative_eigenvalues(), inertia.lowest().eigenvalue
-    finally:
-        state.restore(before)
 
 
 # ---------------------------------------------------------------- why there is no further step

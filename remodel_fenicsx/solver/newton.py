@@ -112,25 +112,22 @@ class Limits:
 
     def __init__(self, equilibrium: Equilibrium, bounded: bool):
         self.equilibrium, state = equilibrium, equilibrium.state
-        self._unknown: Array = state.unknown.x.array
         self.bounded = bounded and state.kinematics.three_dimensional and state.dilatation.jacobians().shape[1] == 0
         self._gain = equilibrium.quadrature.largest_gradient if self.bounded else np.inf
         self.forget()
 
     def forget(self) -> None:
         """Cells or loads may be others from now on."""
-        self._place: Array | None = None
+        self._found: Look | None = None
         self._chains: Array | None = None  # |l|/L at the points
         self._room, self._travelled = 0.0, np.inf
 
     def look(self) -> Look:
         """`Equilibrium.look` of the present unknowns."""
-        if not self._is_here():
-            self._place = self._unknown.copy()
-            self._found = self.equilibrium.look()
-            if self.bounded:
-                self._room, self._travelled = self._room_around(self._found), 0.0
-        return self._found
+        found = self.equilibrium.look()
+        if self.bounded and found is not self._found:
+            self._found, self._room, self._travelled = found, self._room_around(found), 0.0
+        return found
 
     def allow(self, before: Look, after: Look) -> bool:
         """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
@@ -149,10 +146,6 @@ class Limits:
         self._travelled = further
         return True
 
-    def _is_here(self) -> bool:
-        here = self._place is not None and bool((self._place == self._unknown).all())
-        return bool(over_ranks(self.equilibrium.comm, here, MPI.LAND))
-
     def _room_around(self, look: Look) -> float:
         """Largest |dF| at which J > 0 and r/L < NEAR_LIMIT at every point of all ranks."""
         if not look.extension.admissible:
@@ -163,11 +156,6 @@ class Limits:
             self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
         room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, NEAR_LIMIT)
         return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
-
-
-def reserved(before: float, after: float) -> bool:
-    """Whether of two largest r/L the later one is no nearer to 1 than a Newton step would come."""
-    return not after > NEAR_LIMIT or 1 - after >= RESERVE * (1 - before)
 
 
 log = logging.getLogger(__name__)
@@ -278,7 +266,6 @@ class GuardedNewton:
         self._matrix = equilibrium.create_matrix()
         self.convergence = Convergence(equilibrium, settings)
         self._present = _Solve(self._values.copy())
-        self._start_is_known = False  # whether the limits have been asked for the start of the next solve
         self._options_checked = False
         self._phase = LoadPhase(equilibrium.state)
         self._make_solver(self._chosen(held=False))
@@ -362,10 +349,9 @@ class GuardedNewton:
 
     def may_start(self, last_extension: float) -> bool:
         """Whether the present unknowns, from which `solve` is to start, are admissible and not too near to locking."""
-        self.limits.forget()
-        extension = self.limits.look().extension
-        self._start_is_known = extension.admissible and reserved(last_extension, extension.max_chain_extension)
-        return self._start_is_known
+        extension, least = self.equilibrium.extension(), RESERVE * (1 - last_extension)
+        near = extension.max_chain_extension > NEAR_LIMIT and 1 - extension.max_chain_extension < least
+        return extension.admissible and not near
 
     def _attempt(self, origin: Array | None, more_iterations: int = 1) -> Solution:
         start, tangents = self._values.copy(), self._linear.tangents
@@ -373,16 +359,14 @@ class GuardedNewton:
         self.convergence.begin()
         self._pull(self._x)
         self._present = _Solve(start if origin is None else origin)
-        if not self._start_is_known:
-            self.limits.forget()
-        self._start_is_known = False
+        self.limits.forget()
         self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         self._push(self._x)
-        extension = self.limits.look().extension if self.limits.bounded else self.equilibrium.extension()
+        extension = self.equilibrium.extension()
         if reason < 0 or self._present.inadmissible or not extension.admissible:
             self._values[:] = start
             if extension.stop_signal:
@@ -414,10 +398,8 @@ class GuardedNewton:
         self._pull(self._x)
         slope = self._x.duplicate()
         set_fraction(done + distance)
-        self.limits.forget()
         self._assemble_residual(self._snes, self._x, slope)
         set_fraction(done)
-        self.limits.forget()
         self._assemble_residual(self._snes, self._x, self._residual)
         slope.axpy(-1.0, self._residual)
         self._linear.renew()

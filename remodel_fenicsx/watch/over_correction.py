@@ -22,11 +22,11 @@ ORDER = 3  # of the difference over passes that takes a smooth course away and k
 GAIN = 2.0**ORDER  # by which it magnifies that
 # the beginning of an instability: measured, all bodies that left their solution did so; none that stayed on it
 # (factor of a pass, passes in a row, swing of A over r0^2 after the next)
-GROWTH, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 2e-2
+GROWING, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 2e-2
 # its end: random cells swing for ever at single points, each its own way, which the body hardly feels
 SUSTAINED, SUSTAINED_PASSES, BODY_TOLERANCE = -0.9, 3, 0.02  # the same of the displacement, over the displacement
 RESTED_SHARE = 0.5  # of the body: after a pass that has left so much of it as it was, a jump is no swing
-UNEVEN = 1.5  # ratio of two steps up to which they are about alike
+UNEVEN = 1.5  # ratio of two steps up to which they are about alike; of uneven ones a jump looks like a swing
 LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
 # root mean square over the body of what cells after a rest change in A in one pass, over r0^2
 RESUMED_CHANGE = 0.03
@@ -92,24 +92,18 @@ class OverCorrection(WarnsOnce):
         if self._cells.known > ORDER:
             body = np.array([self.state.unknown.x.array, *self._body.values])
             self.swing = swing = self._measured(cells, body, times)
-            tells = not (self._loads_jump(step, times) or _uneven(times) or self._rested(cells))
-            self._count("growing", tells and swing.cells_factor < GROWTH)
-            self._count("sustained", tells and swing.body_factor < SUSTAINED)
-            if self._may_swing and self._suffers(swing) and not self.said:
+            tells = self._tells(step, cells, times)
+            numbers = self._numbers  # of passes in a row
+            numbers["growing"] = numbers["growing"] + 1 if tells and swing.cells_factor < GROWING else 0
+            numbers["sustained"] = numbers["sustained"] + 1 if tells and swing.body_factor < SUSTAINED else 0
+            next_one = swing.cells * abs(swing.cells_factor)  # as large as it will be after one pass more
+            begins = numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE
+            lasts = numbers["sustained"] >= SUSTAINED_PASSES and swing.body >= BODY_TOLERANCE
+            if self._may_swing and (begins or lasts) and not self.said:
                 self.find(step, self._in_words(swing, cells, times))
         self._keep(step, structure, known)
         if self.rested is not None and not self.rested.said:
             self.rested.compare(step, self._at_points(cells), times)
-
-    def _suffers(self, swing: Swing) -> bool:
-        """Whether a swing has begun or lasts, and is large."""
-        next_one = swing.cells * abs(swing.cells_factor)  # as large as it will be after one pass more
-        begins = self._numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE
-        return begins or (self._numbers["sustained"] >= SUSTAINED_PASSES and swing.body >= BODY_TOLERANCE)
-
-    def _count(self, name: str, once_more: bool) -> None:
-        """Passes in a row."""
-        self._numbers[name] = self._numbers[name] + 1 if once_more else 0
 
     def _keep(self, step: Step, structure: Array, times: list[float]) -> None:
         self._cells.push(structure)
@@ -130,23 +124,28 @@ class OverCorrection(WarnsOnce):
         """What stands after each other by points, (..., elements, points, 6)."""
         return components.reshape(*components.shape[:-1], *self.quadrature.shape, len(tensors.MANDEL))
 
-    def _rested(self, cells: Array) -> bool:
-        """Whether one of the passes has left most cells as they were: what goes on after that jumps."""
-        same: Any = self._at_points(cells[:ORDER] == cells[1 : ORDER + 1]).all(axis=-1)
-        return max([self.quadrature.mean(passed.astype(np.float64)) for passed in same]) > RESTED_SHARE
-
-    def _loads_jump(self, step: Step, times: Array) -> bool:
-        earlier = [
-            self.stepper.load_values(time) if time else {} for time in times[1 : ORDER + 1]
-        ]  # it starts unloaded
+    def _tells(self, step: Step, cells: Array, times: Array) -> bool:
+        """Whether a swing is one of passes: not of loads, of uneven steps, nor of cells that had rested."""
+        # it starts unloaded
+        earlier = [self.stepper.load_values(time) if time else {} for time in times[1 : ORDER + 1]]
         loads = [[one.get(name, 0.0) for name in step.loads] for one in (step.loads, *earlier)]
-        return bool(np.any(np.abs(_weights(times) @ loads) > LOAD_JUMP * GAIN * np.abs(loads[0])))
+        if np.any(np.abs(_weights(times) @ loads) > LOAD_JUMP * GAIN * np.abs(loads[0])):
+            return False
+        lengths = -np.diff(times)
+        if lengths.max() > UNEVEN * lengths.min():
+            return False
+        same: Any = self._at_points(cells[:ORDER] == cells[1 : ORDER + 1]).all(axis=-1)
+        return max([self.quadrature.mean(passed.astype(np.float64)) for passed in same]) <= RESTED_SHARE
 
     def _measured(self, cells: Array, body: Array, times: Array) -> Swing:
         """Of the last passes, the newest first."""
         pair = np.array([np.append(_weights(times), 0.0), np.append(0.0, _weights(times[1:]))])
-        of_cells = self._products(self._at_points(pair @ cells))
-        of_body = self._products_of_unknowns(np.concatenate([pair @ body, body[:1]]))
+        volumes = self.quadrature.owned(self.quadrature.volumes)
+        changes = self._at_points(pair @ cells)[:, : len(volumes)]
+        owned = np.concatenate([pair @ body, body[:1]])[:, : self.state.number_of_owned_unknowns]
+        # integrals of the products of fields, each with each
+        of_cells = over_ranks(self.state.comm, np.einsum("aepi,bepi,ep->ab", changes, changes, volumes), MPI.SUM)
+        of_body = over_ranks(self.state.comm, owned @ owned.T, MPI.SUM)
         r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
         return Swing(
             np.sqrt(of_cells[0, 0] / self.quadrature.volume) / GAIN / r0**2,
@@ -154,21 +153,6 @@ class OverCorrection(WarnsOnce):
             np.sqrt(_ratio(of_body[0, 0], of_body[2, 2])) / GAIN,
             _ratio(of_body[0, 1], of_body[1, 1]),
         )
-
-    def _products(self, changes: Array) -> Array:
-        """Integrals of the products of fields at the points, each with each."""
-        volumes, owned = (
-            self.quadrature.owned(self.quadrature.volumes),
-            changes[:, : self.quadrature.number_of_owned_elements],
-        )
-        return self._summed(np.einsum("aepi,bepi,ep->ab", owned, owned, volumes))
-
-    def _products_of_unknowns(self, fields: Array) -> Array:
-        owned = fields[:, : self.state.number_of_owned_unknowns]
-        return self._summed(owned @ owned.T)
-
-    def _summed(self, values: Array) -> Array:
-        return np.asarray(over_ranks(self.state.comm, values, MPI.SUM))
 
     # ------------------------------------------------------------ words
     def _in_words(self, swing: Swing, cells: Array, times: Array) -> str:
@@ -194,12 +178,6 @@ class OverCorrection(WarnsOnce):
 def _ratio(value: float, size: float) -> float:
     """value / size; 0 where there is nothing to compare with."""
     return value / size if size > 0.0 else 0.0
-
-
-def _uneven(times: Array) -> bool:
-    """Whether the passes are not about as far from each other: of such a single jump looks like a swing."""
-    lengths = -np.diff(times)
-    return bool(lengths.max() > UNEVEN * lengths.min())
 
 
 class RestedCells(WarnsOnce):

@@ -112,7 +112,7 @@ class EquilibriumStability(Watcher):
         )
 
     def _of_the_unloaded_body(self) -> tuple[int, float]:
-        """`inertia.of_the_unloaded_body`, once."""
+        """`of_the_unloaded_body`, once."""
         if self._unloaded is None:
             self._unloaded = of_the_unloaded_body(self.inertia)
         return self._unloaded

@@ -423,7 +423,7 @@ class VolumeResponse:
 # paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
 NOTED = 0.05  # mean loss that the log mentions at the end
 MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # from where on it is hardly meant
-LONG = 10.0  # times of turnover, before which rates say little: walls that rest have risen and fall by then
+EARLY = 10.0  # times of turnover, before which rates say little: walls that rest have risen and fall by then
 FAR_FROM_REST = 0.01  # change of ln m or ln rho in a time of turnover
 WEAK = 0.05  # the paper's tube by the law "tensor": angles were 0.02 degrees off at 0.014, 1.2 at 0.14, 12 at 1.4
 RADIAL_SHARE = 0.5  # of the chains: more of them out of the wall are said
@@ -507,7 +507,7 @@ class GrowthWithoutRest(WarnsOnce):
         rates, period = turnover.fastest_changes(), turnover.settings.time
         rate = self.quadrature.maximum(rates)
         goes_on = self._slowing.goes_on(elapsed, rate)
-        if not (goes_on and step.is_last and elapsed >= LONG * period and rate * period >= FAR_FROM_REST):
+        if not (goes_on and step.is_last and elapsed >= EARLY * period and rate * period >= FAR_FROM_REST):
             return ""
         return (
             "the tissue has not come to rest: content or natural length change by up to "

@@ -162,7 +162,7 @@ def test_a_law_of_another_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     """Collagen that is lost where it is pulled: no target, no ranks, the axes stay."""
 
     def lost(cells: extend.UnitCell, drive: extend.Drive, time_old: float, time_new: float) -> extend.UnitCell:
-        pulled = np.linalg.eigvalsh(drive.tensor)[:, -1:] > drive.threshold
+        pulled = np.linalg.eigvalsh(drive.tensor)[:, -1:] > drive.noise
         share = np.where(pulled, np.exp(-drive.kappa * (time_new - time_old)), 1.0)
         return extend.UnitCell(share * cells.dimensions, cells.axes)
 

@@ -46,13 +46,13 @@ def test_cells_follow_the_time_not_the_number_of_steps(law: str) -> None:
 def test_the_relaxed_pass_makes_its_share_of_the_change() -> None:
     """Of A = diag(l^2); `residual` is the whole change."""
     made, stepper = pulled_cube(coupling="relaxed", relaxation_factor=0.25)
-    assert np.isnan(stepper.remodeling.residual())
+    assert np.isnan(stepper.remodeling.distance())
     stepper.advance(2.0)
     left, start = np.exp(-KAPPA * 2.0), 1 / np.sqrt(3)
     asked = np.array([1 + (start - 1) * left, start * left, start * left]) ** 2
     found = made.cells.dimension_values**2
     np.testing.assert_allclose(found, np.broadcast_to(0.75 / 3 + 0.25 * asked, found.shape), rtol=1e-12)
-    assert stepper.remodeling.residual() == pytest.approx(np.linalg.norm(asked - 1 / 3), rel=1e-12)
+    assert stepper.remodeling.distance() == pytest.approx(np.linalg.norm(asked - 1 / 3), rel=1e-12)
 
 
 def test_power_is_energy_per_time() -> None:

@@ -257,8 +257,8 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
     newton = coupled.blend.newton
     solve = newton.solve
 
-    def in_parts(time: float, loads: Any, work: Any) -> None:
-        coupled._solve_in_parts(time, dict(simulation.loading.values), loads, work, None)
+    def in_parts(time: float, old_loads: Any, loads: Any, work: Any) -> None:
+        coupled._solve_in_parts(time, old_loads, loads, work, None)
 
     def solved(origin: Any = None) -> Any:
         if simulation.state.number not in refused:
@@ -271,7 +271,7 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
         parts.append((fraction, turnover.logarithms()[0].mean()))
 
     monkeypatch.setattr(newton, "solve", solved)
-    monkeypatch.setattr(coupled, "_solve_in_one", in_parts)
+    monkeypatch.setattr(coupled, "_solve_from_the_last", in_parts)
     monkeypatch.setattr(turnover, "set_part", noted)
     rows = [dict(step.row) for step in simulation.steps()]
     simulation.close()

@@ -241,10 +241,27 @@ def test_no_name_has_two_meanings() -> None:
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.ClassDef):
                 classes.setdefault(node.name, set()).add(module)
-            targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
-            for target in targets:
-                if isinstance(target, ast.Name) and target.id.isupper() and getattr(node, "value", None) is not None:
-                    constants.setdefault(target.id, set()).add(ast.unparse(node.value))
+            if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+                target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+                pairs = [(target, node.value)]
+                if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    pairs = list(zip(target.elts, node.value.elts, strict=True))
+                for name, value in pairs:
+                    if isinstance(name, ast.Name) and name.id.isupper():
+                        constants.setdefault(name.id, set()).add(ast.unparse(value))
     assert len(classes) > 100 and len(constants) > 100
     assert not {name: places for name, places in classes.items() if len(places) > 1}
     assert not {name: values for name, values in constants.items() if len(values) > 1}
+
+
+def test_names_in_docstrings_are_there() -> None:
+    """`module.name` in a docstring or a comment is a name of this module."""
+    files = {path.stem: path for path in modules().values() if path.stem != "__init__"}
+    lost = [
+        f"{path.name}: {owner}.{name}"
+        for path in modules().values()
+        for owner, name in re.findall(r"`+(?:\w+\.)*(\w+)\.(\w+)(?:\.\w+)*`+", path.read_text(encoding="utf-8"))
+        if owner in files.keys() - {"parts", "extend"}
+        and not re.search(rf"\b{name}\b", files[owner].read_text(encoding="utf-8"))
+    ]
+    assert not lost

@@ -58,7 +58,7 @@ def test_the_target(kernels: TensorKernels, driver: str, frame: str) -> None:
     F = deformations(40, rng)
     drive = Drive(F, tensors, DRIVERS[driver], FRAMES[frame], 1e-14, np.zeros((40, 3)), np.ones(40), 0.025)
     for threshold, rounding in ((1e-14, 1e-14), (rng.uniform(0, 0.3, 40), 1e-14), (0.0, rng.uniform(0, 1e-4, 40))):
-        asked = drive._replace(threshold=threshold, rounding=rounding)
+        asked = drive._replace(noise=threshold, rounding=rounding)
         expected, found = tensor_target(asked), kernels.target(asked)
         np.testing.assert_allclose(found.direction, expected.direction, atol=1e-12)
         np.testing.assert_allclose(found.share, expected.share, atol=1e-12)

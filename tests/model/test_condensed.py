@@ -102,7 +102,7 @@ def test_cells_that_turn_by_less_than_the_noise_still_belong_to_their_stress(dri
     before = solved(some, F)
     noise = 1e-8 * float(np.median(np.linalg.norm(before.driving_tensor, axis=(1, 2))))
     assert before.cells is not None
-    step = some.step._replace(cells=before.cells, drive=some.step.drive._replace(threshold=noise))
+    step = some.step._replace(cells=before.cells, drive=some.step.drive._replace(noise=noise))
     some = replace(some, step=step)
     moved = F + noise * rng.uniform(0.0, 2.0, (200, 1, 1)) * rng.standard_normal((200, 3, 3))
     assert before.converged.all()
@@ -127,7 +127,7 @@ def test_tension_hardly_above_noise_answers_by_the_switch_too() -> None:
     rng = np.random.default_rng(9)
     quiet, F = points("tensor", "log", "cauchy", "material", 20), deformations(20, rng)
     size = float(np.median(np.linalg.norm(solved(quiet, F).driving_tensor, axis=(1, 2))))
-    some = points("tensor", "log", "cauchy", "material", 20, threshold=size)
+    some = points("tensor", "log", "cauchy", "material", 20, noise=size)
     found = solved(some, F)
     assert found.converged.all()
     assert tangent_errors(some, F, found, rng).max() < 1e-6

@@ -201,7 +201,7 @@ class Points:
         updated, _ = remodeling.updated_cells(3.0, 10.0)
         drive = remodeling.drive()
         values = np.linalg.eigvalsh(drive.tensor)[:, ::-1]
-        return updated.dimensions, updated.axes, spectral.positive_direction(values, drive.threshold)[1]
+        return updated.dimensions, updated.axes, spectral.positive_direction(values, drive.noise)[1]
 
 
 @functools.cache
