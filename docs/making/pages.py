@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from remodel_fenicsx.studies.page import STYLE, Page, read_table
+from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.environment import versions
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -30,13 +34,6 @@ def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
     first = lines([list(head)])
     found = lines(rows)
     return "\n".join([first, "|" + " --- |" * (first.count("|") - 1), *([found] if found else [])])
-
-
-def by_layer(columns: Sequence[tuple[str, Sequence[Any]]]) -> str:
-    """A table with a row for each layer of elements, of columns with their heads: degrees, or what is text already."""
-    heads, values = zip(*columns, strict=True)
-    rows = ([one if isinstance(one, str) else f"{one:.1f}" for one in row] for row in zip(*values, strict=True))
-    return markdown(["layer", *heads], [[str(number), *row] for number, row in enumerate(rows, 1)])
 
 
 def between_marks(text: str, name: str, made: str) -> str:
@@ -69,6 +66,13 @@ def by_column(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
         for name, value in row.items():
             found.setdefault(name, []).append(value)
     return found
+
+
+def side_by_side(function: Callable[[Any], Any], cases: Iterable[Any]) -> list[Any]:
+    """What a function makes of each case, in processes of their own, one for each core."""
+    os.environ["OMP_NUM_THREADS"] = "1"  # of these processes
+    with ProcessPoolExecutor(cores(), get_context("spawn")) as pool:
+        return list(pool.map(function, cases))
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
