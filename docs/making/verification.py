@@ -133,7 +133,6 @@ def _runs(folder: Path) -> dict[str, str]:
     return {
         "cube_within": f"within {error:.1g} degrees" if error > 0 else "in all 7 digits of the table",
         "tendon_spread_end": f"{tendon['max_stretch'][-1] - tendon['min_stretch'][-1]:.3f}",
-        "left_of_start": f"{100 * np.exp(-0.025 * 149):.1f}",
         "artery_peak_time": f"{time[outer.argmax()]:g}",
         "artery_shrinks": f"{outer[at_24] - outer[-1]:.3f}",
         "artery_stretch_outside": f"{outer[-1] / 3.0:.2f}",  # R_i = 1, R_o = 3
@@ -149,19 +148,14 @@ def _cases(folder: Path) -> dict[str, str]:
         chosen = np.isclose(table["stretch"], stretch) & np.isclose(table["pressure"], pressure)
         return table[name][chosen]
 
-    stretched, pressed = angles(0.1, 0.0), angles(0.0, 4.8)
-    most, least = (angles(*case, f"fibre_angle_{name}") for case, name in (((0.0, 4.8), "most"), ((0.1, 0.0), "least")))
+    stretched, pressed, least = angles(0.1, 0.0), angles(0.0, 4.8), angles(0.1, 0.0, "fibre_angle_least")
     return {
         "stretch_least": f"{stretched.min():.1f}",
         "stretch_most": f"{stretched.max():.1f}",
         "stretch_single": f"{least.min():.1f}",
-        "pressure_1": f"{pressed[0]:.1f}",
         "pressure_3": f"{pressed[:3].max():.1f}",
         "pressure_4": f"{pressed[3]:.1f}",
-        "pressure_single_1": f"{most[0]:.1f}",
-        "pressure_single_4": f"{most[1:4].max():.1f}",
         "pressure_outside": f"{pressed[-1]:.1f}",
-        "pressure_most": f"{most[-1]:.1f}",
     }
 
 
@@ -181,7 +175,6 @@ def _drivers(folder: Path) -> dict[str, str]:
         "finger_inner_error": f"{100 * (inner / exact['inner'] - 1):+.1f}",
         "finger_exact_outer_radius": f"{exact['outer']:.3f}",
         "finger_outer_error": f"{100 * (outer / exact['outer'] - 1):+.1f}",
-        "finger_parts": f"{(parts := int(drifted['substeps_finger'].max()))} part{'s' * (parts > 1)}",
         "rate_difference": f"{angles['cauchy'][-1] - angles['rate'][-1]:.1f}",
     }
 
