@@ -26,14 +26,12 @@ def comparison(setting: Any) -> Row:
     from tests import radial_comparison
 
     found = radial_comparison.errors(setting)
-    angles = {f"angle_{name}": getattr(found, name) for name in ("mean", "largest", "mean_outside", "outside")}
     return {
         "stretch": setting.stretch, "pressure": setting.pressure, "driver": setting.driver, "law": setting.law,
         "supports": "symmetry planes" if setting.planes else "the scene's", "degree": setting.degree,
         "around": setting.divisions[0], "through": setting.divisions[1], "end": setting.end,
         "front_from": setting.front[0], "front_to": setting.front[1],
-        "radii_percent": 100 * max(found.inner_radius, found.outer_radius), **angles,
-        "inner_radius_error": found.inner_radius, "outer_radius_error": found.outer_radius,
+        "radii_percent": 100 * max(found["inner_radius_error"], found["outer_radius_error"]), **found,
     }  # fmt: skip
 
 
