@@ -1,4 +1,4 @@
-"""What docs/verification.md shows beside the figures: comparisons with the radial reference, invariance.
+"""What docs/verification.md shows beside the figures: comparisons with the radial reference.
 
 Each study is a table, NAME.csv. They take minutes.
 """
@@ -46,30 +46,6 @@ def layer_mean(setting: Any) -> Row:
             "fibre_angle_4": mean, "reference_4": exact.mean_fibre_angle(1.75, 2.0)}  # fmt: skip
 
 
-# ---------------------------------------------------------------- invariance
-
-
-def invariance(case: tuple[str, str]) -> Row:
-    """The bar of tests/model/test_invariance.py twice, its deformed body turned once by 90 degrees: what differs."""
-    from remodel_fenicsx.model.cells import angle_to_axis
-    from tests.model import test_invariance as bars
-
-    driver, frame = case
-    still, other = pair = bars.pair(driver, frame, bars.QUARTER)
-    axis = np.array([0.0, 0.0, 1.0])
-    angles = [np.mean(angle_to_axis(bar.lengths, bar.body.cells.axis_values, axis)) for bar in pair]
-    return {
-        "driver": driver,
-        "frame": frame,
-        "lengths": np.abs(other.lengths - still.lengths).max(),
-        "tensor": np.abs(other.tensor - still.tensor).max(),
-        "position": np.abs(other.position - still.position).max(),
-        "energy": abs(other.problem.stored_energy() / still.problem.stored_energy() - 1),
-        "angle_still": angles[0],
-        "angle_turned": angles[1],
-    }
-
-
 # ---------------------------------------------------------------- a single run
 
 
@@ -87,14 +63,12 @@ def jobs() -> dict[str, tuple[Callable[[Any], Row], list[Any]]]:
     meshes = [setting for settings in compared.CONVERGENCE.values() for setting in settings]
     # Fig. 9's pure pressure on the paper's mesh, in one layer along z, and on one twice as fine
     pressed = [compared.Setting(0.0, 4.8, divisions=(12 * n, 8 * n, 1), degree=1) for n in (1, 2)]
-    turned = [(driver, frame) for frame in ("material", "spatial") for driver in ("cauchy", "pk2", "finger")]
     return {
         "stiff-tendon": (stiff_tendon, ["tendon"]),
         "comparison-cases": (comparison, compared.LOAD_CASES),
         "comparison-drivers": (comparison, compared.DRIVERS),
         "pressure-meshes": (layer_mean, pressed),
         "comparison-meshes": (comparison, meshes),
-        "invariance": (invariance, turned),
     }
 
 

@@ -256,25 +256,6 @@ def mesh_table(folder: Path) -> str:
     return markdown(header, found)
 
 
-def invariance_table(folder: Path) -> str:
-    """What the turned deformed body differs by."""
-    header = ["driver", "frame", "l / r₀", "A / r₀²", "place", "energy", "mean reference angle"]
-    found = []
-    for row in rows_of(folder / "invariance.csv"):
-        angles = f"{row['angle_still']:.1f}° → {row['angle_turned']:.1f}°"
-        differences = [small(row[key]) for key in ("lengths", "tensor", "position", "energy")]
-        found.append([row["driver"], f"`{row['frame']}`", *differences, angles])
-    return markdown(header, found)
-
-
-def small(value: float) -> str:
-    """A difference: two digits, or its order of magnitude."""
-    return f"{value:.2g}" if value > 1e-6 else f"10{str(int(np.ceil(np.log10(max(value, 1e-16))))).translate(RAISED)}"
-
-
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
 def _made_with(folder: Path) -> str:
     """The line of Fig. 7 that says what it was made with."""
     return read_notes(folder, "fig7")["fig7.csv"][0].split(";")[0]
@@ -288,7 +269,6 @@ def page(kept: Path = FIGURES) -> str:
                                           lambda row: f"{100 * row['stretch']:g} %, {row['pressure']:g}"),
         "table_errors_drivers": error_table(kept, "comparison-drivers", "driver | supports | elements", driver_of),
         "table_meshes": mesh_table(kept),
-        "table_turned": invariance_table(kept),
         "made_with": _made_with(kept),
         **{f"caption_{name}": figure.caption for name, figure in figures.FIGURES.items()},
         "caption_reference": REFERENCE_CAPTION[1],

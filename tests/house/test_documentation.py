@@ -26,7 +26,7 @@ def page(name: str) -> str:
 
 
 def test_pages_that_need_no_run_are_those_that_the_code_makes() -> None:
-    """Keys, schema, public interface, columns, sizes; what is added, renamed or dropped shows in their own history."""
+    """Keys, schema, public interface, columns; what is added, renamed or dropped shows in their own history."""
     made = subprocess.run([sys.executable, str(ROOT / "docs" / "make"), "--check"], capture_output=True, text=True)
     assert (
         made.returncode == 0
