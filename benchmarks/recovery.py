@@ -37,7 +37,6 @@ VIRGIN_PRESSURES = np.array([0.1, *PRESSURES])
 TIMES = np.array([5.0, 10.0, 20.0, 30.0, 45.0, 60.0])
 RADIUS, FORCE, ANGLE = 0.01, 0.05, 5.0  # standard deviations: shares of the radius and of the largest force, degrees
 FACTOR = 2.0  # of the starts, to both sides
-MOST = {"runs": 100}
 
 
 def tube() -> Scene:

@@ -5,11 +5,10 @@
 
 Parts: `artery`, the settings of `remodel-fenicsx trade` and the profiles on the paper's artery with isotropic cells,
 for the printed coupling, the implicit one and the consistent variant, against the one-dimensional solver of
-tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `end`, chosen steps against
-equal ones there, in turns; `paper`, the paper's own mesh there; `whole`, the whole tube in three dimensions, up to 20
-minutes a run; `hold`, chosen steps against equal ones to t = 1000. An hour or more of one core, most of it the whole
-tube. Then makes tables and picture of docs/speed_and_accuracy.md, and tables.md beside what is recorded; --only makes
-no page, --report makes it from what is there. What is recorded is used again.
+tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `paper`, the paper's own mesh
+there; `whole`, the whole tube in three dimensions, up to 20 minutes a run. An hour or more of one core, most of it the
+whole tube. Then makes tables and picture of docs/speed_and_accuracy.md, and tables.md beside what is recorded; --only
+makes no page, --report makes it from what is there. What is recorded is used again.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from benchmarks.precision import chosen, whole
+from benchmarks.precision import whole
 from benchmarks.precision.kept import EVERY_TANGENT, Array, Found, Kept
 from docs.making.pages import DOCS, FIGURES, between_marks, filled, lines, made_with, markdown
 from remodel_fenicsx.body.shape import profile_weights
@@ -38,9 +37,10 @@ from tests.reference.radial import solve_radial
 PICTURE = "speed_and_accuracy"
 PAGE = DOCS / "speed_and_accuracy.md"
 HEAD = ["seconds", "degrees", "largest", "radii, %", "method", "setting"]
-PARTS = ("artery", "end", "paper", "whole", "hold")
+PARTS = ("artery", "paper", "whole")
 COARSE = (8.0, 4.0)  # tolerances, degrees
-TIMES = chosen.TO_THE_END
+RADIAL = {"model.kinematics": "radial"}
+TIMES = [5.0, 25.0, 45.0, 65.0, 85.0, 105.0, 125.0, 145.0, 150.0]
 REFERENCE = {"explicit": (150, 1 / 8, 1 / 16), "tensor": (60, 1 / 2, 1 / 4)}  # elements and steps, by law
 
 
@@ -86,27 +86,19 @@ def settings(method: Method) -> list[rungs.Setting]:
     """Those of the ladder, and the profiles."""
     base = scene(method)
     profiles = [
-        whole.Named(profile.values, base.with_values(profile.values), (1,), title=f"profile-{name}")
+        rungs.Setting(profile.values, base.with_values({**profile.values, **RADIAL}), (1,), name)
         for name, profile in PROFILES.items()
     ]
-    resolved = [
-        whole.Named(one.changes, one.scene.with_values({"model.kinematics": "radial"}), (1,), title=one.name)
-        for one in profiles
-    ]
     same = [one for one in rungs.ladder(base) if not one.profile and rungs.COUPLING not in one.changes]
-    every = [*coarse(base), *same, *resolved]
+    every = [*coarse(base), *same, *profiles]
     exact = method.coupling == "implicit" and method.law == "explicit"  # no error in time: short steps buy nothing
     return [one for one in every if one.step is None or one.step >= base.time.step or not exact]
 
 
-def coarse(base: Scene) -> list[whole.Named]:
+def coarse(base: Scene) -> list[rungs.Setting]:
     """Below what a study asks for: steps as long as the compared times allow, on the coarsest elements."""
-    found = []
-    for tolerance in COARSE:
-        values = {"model.kinematics": "radial", "time.tolerance": tolerance}
-        name = f"radial-1-degree-1-tolerance-{tolerance:g}"
-        found.append(whole.Named(values, base.with_values(values), (1,), title=name))
-    return found
+    every = [{**RADIAL, "time.tolerance": tolerance} for tolerance in COARSE]
+    return [rungs.Setting(values, base.with_values(values), (1,)) for values in every]
 
 
 def reference(law: str, kept: Kept) -> tuple[Array, Array]:
@@ -132,9 +124,6 @@ def run(kept: Kept, parts: Sequence[str], budget: float) -> None:
     """What is asked for and not kept yet."""
     if "artery" in parts:
         run_artery(kept, budget, paper=False)
-    for part in ("end", "hold"):
-        if part in parts:
-            chosen.run(kept, part)
     if "paper" in parts:
         run_artery(kept, 0.0, paper=True)
     if "whole" in parts:
@@ -159,18 +148,24 @@ def points(kept: Kept) -> Iterator[Point]:
         exact = reference(method.law, kept)
         for setting in [*settings(method), *whole.settings(name, scene(method))]:
             if (file := f"{name}-{setting.name}") in kept:
-                words = setting.name
-                every = setting.name.startswith("full")
-                words += ", every tangent factorised" if every else whole.other_words(setting.name)
-                yield Point(name, setting.name, words, kept.found(file, *exact))
+                yield Point(name, setting.name, words_of(setting), kept.found(file, *exact))
+
+
+def words_of(setting: rungs.Setting) -> str:
+    """What a row calls it."""
+    if setting.profile:
+        return setting.name
+    kinematics, refinement, degree = setting.mesh
+    every = ", every tangent factorised" if setting.name.startswith("full") else whole.other_words(setting.name)
+    return f"{kinematics} refinement {refinement} degree {degree} {setting.steps_in_words}{every}"
 
 
 def report(kept: Kept) -> None:
     """Write the page, its appendix and its picture."""
     found = sorted(points(kept), key=lambda point: point.found.seconds)
     whole_tube = [point for point in found if point.is_whole]
-    parts = {"rows": rows_of(found), "whole": rows_of(whole_tube), "hold": chosen.hold_rows(kept),
-             "end": chosen.end_rows(kept), "made": fill(f"Made with {made_with()}.", 100)}  # fmt: skip
+    made = fill(f"Made with {made_with()}.", 100)
+    parts = {"rows": rows_of(found), "whole": rows_of(whole_tube), "made": made}
     text = filled(Path(__file__).with_suffix(".template.md"), parts)
     (kept.folder / "tables.md").write_text(text, encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")

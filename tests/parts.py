@@ -77,6 +77,13 @@ def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
+def smooth(nodes: np.ndarray, scale: float, seed: int) -> np.ndarray:
+    """A smooth displacement without symmetries, one row per node."""
+    rng = np.random.default_rng(seed)
+    waves, phases = rng.uniform(1.0, 2.0, (3, 3)), rng.uniform(0.0, 6.0, 3)
+    return scale * np.sin(nodes / np.ptp(nodes, axis=0) @ waves + phases)
+
+
 def pulled_cube(end: float, **tables: Any) -> Scene:
     """A cube of eight elements with random cells, pulled for four of `end` units of time and remodeled."""
     return Scene(

@@ -12,11 +12,11 @@ from typing import Any
 COMPILER, TICKS = "cc1", 2  # its name, and hundredths of a second of work after which it has read its source
 
 
-GROUP, SESSION = 2, 3  # which of the numbers of a process, behind its state
+CHILDREN, GROUP, SESSION = 1, 2, 3  # which of the numbers of a process, behind its state
 
 
 def members(number: int, kind: int = SESSION) -> dict[int, str]:
-    """Number and name of every process of a session, or of a group, that has not ended."""
+    """Number and name of every process of a session, a group or a parent, that has not ended."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -28,6 +28,18 @@ def members(number: int, kind: int = SESSION) -> dict[int, str]:
         if int(numbers[kind - 1]) == number and state not in "ZX":
             found[int(folder.name)] = front.partition("(")[2]
     return found
+
+
+def has_ended(number: int, timeout: float = 30) -> bool:
+    """Whether a process ends, but for what its parent has not asked for yet."""
+    deadline, stat = time.monotonic() + timeout, Path(f"/proc/{number}/stat")
+    while time.monotonic() < deadline:
+        with suppress(FileNotFoundError, ProcessLookupError):
+            if stat.read_text().rpartition(")")[2].split()[0] not in "ZX":
+                time.sleep(0.02)
+                continue
+        return True
+    return False
 
 
 def all_end(session: int, timeout: float = 60) -> bool:

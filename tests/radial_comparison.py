@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import dolfinx.fem
 import numpy as np
@@ -48,7 +47,6 @@ class Setting:
     pressure: float = 4.8
     driver: str = "cauchy"
     law: str = "explicit"
-    frame: str = "spatial"
     divisions: Divisions = FINE
     degree: int = 2
     planes: bool = False
@@ -75,14 +73,13 @@ CONVERGENCE = {
 
 @dataclass(frozen=True)
 class Run:
-    """Radii by step; reference radius, final fibre angle and volume by quadrature point; columns of the history."""
+    """Radii by step; reference radius, final fibre angle and volume by quadrature point."""
 
     inner: np.ndarray
     outer: np.ndarray
     R: np.ndarray
     angle: np.ndarray
     volume: np.ndarray
-    columns: dict[str, np.ndarray]
 
 
 def scene(setting: Setting) -> Scene:
@@ -93,7 +90,7 @@ def scene(setting: Setting) -> Scene:
         "mesh": {"degree": setting.degree},
         "cells": {"initial": "isotropic", "axes": "cylindrical"},
         "loads": {"pressure": {"value": setting.pressure}, "elongation": {"value": setting.stretch}},
-        "remodeling": {"driver": setting.driver, "law": setting.law, "frame": setting.frame},
+        "remodeling": {"driver": setting.driver, "law": setting.law},
         "time": {"end": setting.end},
     })  # fmt: skip
 
@@ -118,70 +115,36 @@ def finite_elements(setting: Setting) -> Run:
     if setting.planes:
         hold_symmetry_planes(simulation)
     steps = list(simulation.steps())
-    rows = [step.row for step in steps]
-    angle = Measurement(simulation.observer, steps[-1]).fibre_angle
-    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    x = simulation.quadrature.coordinates
+    inner, outer = (np.array([step.row[f"{face}_radius"] for step in steps]) for face in ("inner", "outer"))
+    angle, x = Measurement(simulation.observer, steps[-1]).fibre_angle, simulation.quadrature.coordinates
     return Run(
-        columns["inner_radius"], columns["outer_radius"], np.hypot(x[..., 0], x[..., 1]).ravel(),
-        angle.ravel(), simulation.quadrature.volumes.ravel(), columns,
+        inner, outer, np.hypot(x[..., 0], x[..., 1]).ravel(), angle.ravel(), simulation.quadrature.volumes.ravel()
+    )
+
+
+@lru_cache(maxsize=None)
+def reference(setting: Setting) -> RadialHistory:
+    """The same by the one-dimensional solver."""
+    return solve_radial(
+        stretch=setting.stretch, pressure=setting.pressure, driver=setting.driver, law=setting.law, end=setting.end,
+        elements=150,
     )  # fmt: skip
 
 
-@lru_cache(maxsize=None)
-def _solve_radial(**arguments: Any) -> RadialHistory:
-    return solve_radial(elements=150, **arguments)
-
-
-def reference(setting: Setting) -> RadialHistory:
-    """The same by the one-dimensional solver."""
-    return _solve_radial(
-        stretch=setting.stretch, pressure=setting.pressure, driver=setting.driver, law=setting.law, end=setting.end
-    )
-
-
-@dataclass(frozen=True)
-class Errors:
+def errors(setting: Setting) -> dict[str, float]:
     """Largest relative error of a radius over all steps; errors of the final fibre angle in degrees.
 
-    `mean` is the volume mean over the wall of the absolute difference at the same radius, `largest` the largest one,
-    `mean_outside` and `outside` the same for the points outside of the setting's front; `points_outside` is their
-    share.
+    `angle_mean` is the volume mean over the wall of the absolute difference at the same radius, `angle_largest` the
+    largest one, `angle_mean_outside` and `angle_outside` the same for the points outside of the setting's front.
     """
-
-    inner_radius: float
-    outer_radius: float
-    mean: float
-    largest: float
-    mean_outside: float
-    outside: float
-    points_outside: float
-
-
-@lru_cache(maxsize=None)
-def errors(setting: Setting) -> Errors:
-    """Run, solve, compare."""
     run, exact = finite_elements(setting), reference(setting)
-    angle = np.abs(angle_errors(run, exact))
+    angle = np.abs(run.angle - np.interp(run.R, exact.points, exact.fibre_angle()))
     outside = (run.R < setting.front[0]) | (run.R > setting.front[1])
-    return Errors(
-        float(np.max(np.abs(run.inner / exact.inner_radii - 1))),
-        float(np.max(np.abs(run.outer / exact.outer_radii - 1))),
-        float(np.average(angle, weights=run.volume)),
-        float(angle.max()),
-        float(np.average(angle[outside], weights=run.volume[outside])),
-        float(angle[outside].max()),
-        float(outside.mean()),
-    )
-
-
-def angle_errors(run: Run, exact: RadialHistory) -> np.ndarray:
-    """Fibre angle minus the reference's at the same radius, by quadrature point, degrees."""
-    return run.angle - np.interp(run.R, exact.points, exact.fibre_angle())
-
-
-def convergence(ladder: tuple[Setting, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of inner radius, outer radius and mean angle by mesh, (3, 3), and the orders between them, (2, 3)."""
-    found = [errors(setting) for setting in ladder]
-    table = np.array([[error.inner_radius, error.outer_radius, error.mean] for error in found])
-    return table, np.log2(table[:-1] / table[1:])
+    return {
+        "angle_mean": float(np.average(angle, weights=run.volume)),
+        "angle_largest": float(angle.max()),
+        "angle_mean_outside": float(np.average(angle[outside], weights=run.volume[outside])),
+        "angle_outside": float(angle[outside].max()),
+        "inner_radius_error": float(np.max(np.abs(run.inner / exact.inner_radii - 1))),
+        "outer_radius_error": float(np.max(np.abs(run.outer / exact.outer_radii - 1))),
+    }

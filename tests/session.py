@@ -21,7 +21,6 @@ from xdist.scheduler import LoadFileScheduling
 
 from tests.forks import what_is_imported_stays
 
-PROJECT = Path(__file__).resolve().parents[1]
 SLOW_LIMIT = 3600  # seconds for a test marked slow; pyproject.toml has the limit of all others
 COMPILED = "REMODEL_FENICSX_COMPILED"  # names the file that gets one line for each kernel that is compiled
 

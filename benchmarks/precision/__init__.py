@@ -1,1 +1,1 @@
-"""What benchmarks/work_precision.py measures beside the artery to t = 150: the whole tube, chosen steps."""
+"""What benchmarks/work_precision.py measures: runs that are kept, and settings of the whole tube."""

@@ -27,21 +27,16 @@ class Found:
 
     Attributes
     ----------
-    seconds, rows, iterations
-        Of the processor; steps; Newton iterations.
-    typical, largest
-        Error of the fibre angle, degrees: root mean square over places and times, and over places at the worst time.
-    anywhere
-        Its largest one.
+    seconds
+        Of the processor.
+    typical, anywhere
+        Error of the fibre angle, degrees: root mean square over places and times, and the largest.
     percent
         Largest relative error of the lengths.
     """
 
     seconds: float
-    rows: int
-    iterations: int
     typical: float
-    largest: float
     anywhere: float
     percent: float
 
@@ -76,27 +71,19 @@ class Kept:
             self.keep(name, measured(scene, times))
 
     def found(self, name: str, angles: Array, lengths: Array) -> Found:
-        """A run against exact angles and lengths; where there are no angles along the body, none are compared."""
+        """A run against exact angles and lengths."""
         run = self[name]
-        apart = (run["angles"] - angles)[:, np.isfinite(angles).all(axis=0)]
-        errors = (
-            [rungs.typical(apart), max(map(rungs.typical, apart)), np.abs(apart).max()] if apart.size else [np.nan] * 3
-        )
+        apart = run["angles"] - angles
         percent = 100 * float(np.max(np.abs(run["lengths"] / lengths - 1)))
-        return Found(float(run["seconds"]), int(run["rows"]), int(run["iterations"]), *map(float, errors), percent)
+        return Found(float(run["seconds"]), float(rungs.typical(apart)), float(np.abs(apart).max()), percent)
 
 
 def measured(scene: Scene, times: list[float]) -> Run:
-    """Angles and lengths at the compared times, seconds of the processor, rows and Newton iterations of a run."""
-    compared = rungs.as_run(rungs.Setting({}, scene, (1,)), 1, times)
-    columns = [*compared.output.columns, "newton_iterations"]
-    rows = rows_of(compared.with_values({"output.columns": columns}))
+    """Angles and radii at the compared times, and seconds of the processor of a run."""
+    rows = rows_of(rungs.as_run(rungs.Setting({}, scene, (1,)), 1, times))
     asked = [next(row for row in rows if same_time(row["time"], time)) for time in times]
-    lengths = [name for name in ("inner_radius", "outer_radius", "mean_stretch") if name in rows[0]]
     return {
         "angles": np.array([[row[name] for name in PROFILE] for row in asked]),
-        "lengths": np.array([[row[name] for name in lengths] for row in asked]),
+        "lengths": np.array([[row["inner_radius"], row["outer_radius"]] for row in asked]),
         "seconds": np.array(sum(row["processor_seconds"] for row in rows)),
-        "rows": np.array(len(rows)),
-        "iterations": np.array(sum(row["newton_iterations"] for row in rows)),
     }

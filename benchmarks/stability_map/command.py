@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +32,7 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     source = running.source_of()
     file = running.file_of(options, source)
     done = {} if options.again else measured(file, source, cases, options.limit)
-    missing = spread([key for key in cases if key not in done], cases)
+    missing = [key for key in cases if key not in done]
     print(f"{source}: {len(cases)} cases, {len(missing)} to run with {options.jobs} processes; {file}", file=sys.stderr)
     jobs = {key: partial(running.evaluated, cases[key], source=source) for key in missing}
     done |= running.measure(jobs, said, source, options)
@@ -73,12 +72,3 @@ def measured(file: Path, source: str, cases: dict[str, Case], limit: float = 0.0
             found[record["key"]] = record
     # what had no end may have one within more time
     return {key: record for key, record in found.items() if record.get("no_end_within", limit) >= limit}
-
-
-def spread(keys: list[str], cases: dict[str, Case]) -> list[str]:
-    """The reduced map first, then the families in turn: a map that is stopped has seen a part of each."""
-    seen, order = Counter[str](), {}
-    for key in keys:
-        seen[cases[key].family] += 1
-        order[key] = (not cases[key].reduced, seen[cases[key].family])
-    return sorted(keys, key=order.__getitem__)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from scipy.optimize import root
 
 from benchmarks.stability_map import bodies
 from benchmarks.stability_map.bodies import MU
 from benchmarks.stability_map.cases import Case, Check, Finding, Place, Run, Values, farthest, named, table, with_values
 from benchmarks.stability_map.homogeneous import VARIANT
-from tests.reference.march import Wall, load_at, march, pressure_curve
+from tests.reference.march import Wall, initial, load_at, march
+from tests.reference.radial import AXIAL, Array, Tube, first_piola_kirchhoff
 
 RAY: dict[str, Any] = with_values(
     bodies.TUBE, {"geometry.length": 8.0, "model.kinematics": "radial", "loads": {}, "time": {"end": 8.0, "step": 1.0}}
@@ -207,6 +210,47 @@ table(
 
 
 # ---------------------------------------------------------------- limit points
+WIDER = 0.02  # of the inner radius, from one state of the curve to the next
+WIDEST = 5.0
+
+
+def pressure_curve(scene: Values, elements: int = 6) -> tuple[Array, Array]:
+    """Inner radii and pressures of a tube that does not remodel, its inner radius raised step by step.
+
+    Where the pressure falls again it has had its largest value: a limit point, however it was loaded. The curve ends
+    there. With closed ends the axial stretch is found with the radii, from the thrust p pi r_i^2 on the ends.
+    """
+    tube = Wall(scene, elements).tube
+    residual = _of_given_inner_radius(tube, initial(scene) ** 2, scene.get("supports", {}).get("ends") == "closed")
+    unknown, found = np.concatenate([[0.0, 1.0], tube.nodes[1:]]), [(tube.inner_radius, 0.0)]
+    for inner in tube.inner_radius * np.arange(1 + WIDER, WIDEST, WIDER):
+        unknown[2:] = np.sqrt(unknown[2:] ** 2 + inner**2 - found[-1][0] ** 2)  # a start that keeps areas
+        solved = root(residual, unknown, (inner,), tol=1e-12)
+        if not np.abs(residual(solved.x, inner)).max() < 1e-9:  # NaN too: chains as long as they can be
+            break
+        unknown = solved.x
+        found.append((inner, float(unknown[0])))
+        if found[-1][1] < found[-2][1]:
+            break
+    radii, pressures = np.array(found).T
+    return radii, pressures
+
+
+def _of_given_inner_radius(tube: Tube, squares: Array, closed: bool) -> Callable[[Array, float], Array]:
+    """Residual of pressure, axial stretch and the other radii."""
+    cells = np.tile(squares, (len(tube.points), 1))
+
+    def residual(unknown: Array, inner: float) -> Array:
+        radii = np.concatenate([[inner], unknown[2:]])
+        pressure, axial = unknown[0], unknown[1]
+        forces = tube.residual(radii, cells, pressure, axial)
+        stress = first_piola_kirchhoff(tube.stretches(radii, axial), cells, tube.material)
+        thrust = float(stress[:, AXIAL] @ tube.areas) - pressure * inner**2 / 2
+        return np.concatenate([forces, [thrust if closed else axial - 1]])
+
+    return residual
+
+
 def check_limit(case: Case, run: Run) -> Finding:
     """Inner radii up to the largest pressure; beyond it there is nothing to go on to."""
     radii, pressures = pressure_curve(case.scene)

@@ -7,12 +7,10 @@ the printed one is that of docs/figures/fig6.csv. A few minutes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from docs.making.pages import EDGES, FIGURES, Columns, drawn
@@ -34,8 +32,7 @@ CAPTION = (
     "The consistent law beside the paper's",
     "Lines by law. (a) Mean angle to the load in the cube of Fig. 5; (b) stretch of the tendon of Fig. 6; (c) "
     "outer and inner radius of the artery of Fig. 7, isotropic cells; (d) its reference fibre angle over the "
-    "radius at t = 150, Fig. 8; (e) the same for the other loads of Fig. 9; (f) for the drivers S (full lines) "
-    "and b (dashed), Figs. 10 and 11.",
+    "radius at t = 150, Fig. 8.",
 )
 
 
@@ -86,44 +83,23 @@ def artery() -> tuple[Columns, Columns]:
 
 # ---------------------------------------------------------------- picture
 def draw(table: Columns, layers: Columns, tendon: Columns) -> Figure:
-    """Six panels; a colour is a law."""
-    figure = Figure(figsize=(7.2, 5.6))
-    panels = figure.subplots(2, 3).ravel()
-    time, radius = table["time"], layers["radius"]
+    """Four panels; a colour is a law."""
+    figure = Figure(figsize=(7.2, 5.2), layout="constrained")
+    panels = figure.subplots(2, 2).ravel()
+    time, stretches = table["time"], table | {"tendon_paper": tendon["mean_stretch"][1:]}
     for variant, (_, _, label, colour) in VARIANTS.items():
-        style: dict[str, Any] = {"color": colour, "lw": 1.2}
-        panels[0].plot(time, table[f"cube_0.025_{variant}"], label=label, **style)
-        if variant == "paper":
-            panels[1].plot(tendon["time"], tendon["mean_stretch"], **style)
-        else:
-            panels[1].plot(time, table[f"tendon_{variant}"], **style)
+        panels[0].plot(time, table[f"cube_0.025_{variant}"], color=colour, label=label)
+        panels[1].plot(time, stretches[f"tendon_{variant}"], color=colour)
         for face in ("outer", "inner"):
-            panels[2].plot(time, table[f"{face}_{variant}"], **style)
-        panels[3].plot(radius, layers[f"10_4.8_{variant}"], "o-", ms=3, **style)
-        for case in LOADS:
-            if case != "10_4.8":
-                panels[4].plot(radius, layers[f"{case}_{variant}"], "-", **style)
-        for driver, line in zip(DRIVERS, ("-", "--"), strict=True):
-            panels[5].plot(radius, layers[f"{driver}_{variant}"], line, **style)
-    _label(panels)
-    return figure
-
-
-def _label(panels: Sequence[Axes]) -> None:
-    names = ("angle to the load (degrees)", "mean stretch", "radius")
-    for axes, name in zip(panels[:3], names, strict=True):
+            panels[2].plot(time, table[f"{face}_{variant}"], color=colour)
+        panels[3].plot(layers["radius"], layers[f"10_4.8_{variant}"], "o-", ms=3, color=colour)
+    names = ("angle to the load (degrees)", "mean stretch", "radius", "fibre angle (degrees)")
+    for axes, name in zip(panels, names, strict=True):
         axes.set(xlabel="$t$", ylabel=name, xlim=(0, END))
-    for axes in panels[3:]:
-        axes.set(xlabel="reference radius $R$", ylabel="fibre angle (degrees)", xlim=(1, 3), ylim=(-8, 98))
-        axes.set_yticks(range(0, 91, 30))
-    panels[0].set_ylim(0, 60)
-    panels[0].legend(loc="upper right", fontsize=7)
-    for words, height in (("10 %, $p$ = 0", 93), ("10 %, 2.4", 66), ("5 %, 4.8", 30), ("0 %, 4.8", -5.5)):
-        panels[4].text(2.97, height, words, fontsize=7, ha="right")
-    figure = panels[0].get_figure()
-    assert isinstance(figure, Figure)
-    figure.subplots_adjust(left=0.08, right=0.975, bottom=0.085, top=0.945, wspace=0.33, hspace=0.33)
+    panels[3].set(xlabel="reference radius $R$", xlim=(1, 3), ylim=(0, 90))
+    panels[0].legend(fontsize=7)
     panel_letters(*panels)
+    return figure
 
 
 # ---------------------------------------------------------------- the numbers on the page

@@ -153,15 +153,6 @@ def test_two_layers_of_a_mesh_file_are_those_of_the_reference(tmp_path: Path) ->
     simulation.close()
 
 
-def test_a_comparison_can_fail() -> None:
-    """Layers the other way round, or one kappa for both: far away."""
-    swapped = {"media": LAYERS["adventitia"] | {"outer_radius": INTERFACE}, "adventitia": LAYERS["media"]}
-    swapped["adventitia"] = {key: value for key, value in LAYERS["media"].items() if key != "outer_radius"}
-    for other in (scene(swapped), scene(**{"regions.adventitia.remodeling.kappa": 0.06})):
-        _, media, adventitia = held_against("explicit", Simulation(other, SELF))
-        assert max(media, adventitia) > 0.5
-
-
 def rows(made: Scene) -> np.ndarray:
     """Columns of the whole body, but those of time and work."""
     found = rows_of(made)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.simulation import Simulation
+from tests.command.test_run import run
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import simulated
 
@@ -158,12 +158,6 @@ method = "direct"
 """
 
 
-def _command(*arguments: str, ranks: int = 1) -> subprocess.CompletedProcess[str]:
-    launcher = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
-    words = [*launcher, "python3", "-m", "remodel_fenicsx", *arguments]
-    return subprocess.run(words, capture_output=True, text=True, check=False)
-
-
 def _history(folder: Path) -> Any:
     table = np.genfromtxt(folder / "history.csv", delimiter=",", names=True)
     names = [name for name in table.dtype.names if "iterations" not in name and name != "seconds"]
@@ -176,16 +170,16 @@ def test_a_run_goes_on_with_its_copy_on_other_ranks(tmp_path: Path) -> None:
     scene = tmp_path / "vessel.toml"
     scene.write_text(RUN)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert _command("run", str(scene), "-o", str(whole), "--no-report").returncode == 0
-    first = _command("run", str(scene), "-o", str(parts), "--set", "time.end=2", "--no-report", ranks=2)
+    assert run("run", str(scene), "-o", str(whole), "--no-report").returncode == 0
+    first = run("run", str(scene), "-o", str(parts), "--set", "time.end=2", "--no-report", ranks=2)
     assert first.returncode == 0, first.stderr
     copy = parts / "tube.msh"
     assert copy.read_bytes() == file.read_bytes()
     file.unlink()  # the run has its own
-    assert _command("run", "--resume", str(parts), "--set", "time.end=4", "--no-report").returncode == 0
+    assert run("run", "--resume", str(parts), "--set", "time.end=4", "--no-report").returncode == 0
     np.testing.assert_allclose(_history(parts), _history(whole), rtol=1e-8, atol=1e-10)
     copy.write_text(copy.read_text() + "\n")
-    refused = _command("run", "--resume", str(parts), "--set", "time.end=5")
+    refused = run("run", "--resume", str(parts), "--set", "time.end=5")
     assert refused.returncode == 2
     assert "tube.msh': has changed" in refused.stderr
 

@@ -78,12 +78,6 @@ def test_faces_that_the_file_has_not(geometry: str, words: str) -> None:
     assert words in refusal(TUBE, **values(geometry))
 
 
-def bent(x: Any) -> Any:
-    """About an axis 4 away."""
-    radius, angle = 4 + x[:, 0], x[:, 2] / 2
-    return np.stack([radius * np.cos(angle), x[:, 1], radius * np.sin(angle)], axis=1)
-
-
 @pytest.mark.parametrize("file", ["lumen.stl", "vessel.inp", "vessel.pvtu", "vessel.msh.gz", "vessel", "", "a/b.txt"])
 @pytest.mark.parametrize("known", [{}, {"element": "hexahedron", "degree": 1}])
 def test_another_ending_is_refused_by_key_and_value(tmp_path: Path, file: str, known: dict[str, Any]) -> None:

@@ -128,15 +128,6 @@ def words_for(folder: Path, scene_file: Path) -> list[str]:
     return ["run", *map(str, begun), "-q"]
 
 
-TUBE = """
-preset = "kuhl-holzapfel-2007"
-geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 3.0, length = 2.0}
-time = {end = 12.0}
-solver = {method = "direct"}  # resumed to the last digit
-output = {every = 4, checkpoint = 2}
-"""
-
-
 def killed_at_random(folder: Path, scene: str, program: str, kills: int) -> None:
     """Whole runs, killed so many times at random moments and gone on with, are the run that nobody kills."""
     (folder / "scene.toml").write_text(scene)
@@ -156,11 +147,6 @@ def killed_at_random(folder: Path, scene: str, program: str, kills: int) -> None
     assert status(f"run-{whole}", None) == 0
     for number in range(whole + 1):
         assert_same(folder / f"run-{number}", folder / "expected")
-
-
-def test_a_run_that_is_killed_20_times_goes_on(tmp_path: Path) -> None:
-    """At random moments of its work: while it meshes, in steps, in writes; after its end, of another one."""
-    killed_at_random(tmp_path, TUBE, "four layers", kills=20)
 
 
 GROWING = """

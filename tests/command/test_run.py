@@ -312,20 +312,6 @@ def test_a_misspelt_petsc_option_is_said_and_logged(tmp_path: Path) -> None:
     assert warning.removeprefix("WARNING: ") in (tmp_path / "out" / "run.log").read_text()
 
 
-def test_the_limit_of_iterations_that_was_reached_is_named(tmp_path: Path) -> None:
-    options = ["--set=solver.petsc_options.snes_max_it=2", "--set=solver.maximum_halvings=0"]
-    done = run("run", demo("cube"), *options, "-q", "-o", tmp_path / "out")
-    assert done.returncode == 3 and "no equilibrium within 2 Newton iterations" in done.stderr
-
-
-@pytest.mark.parametrize("setting", ["pc_type=foo", "snes_rtol=0.5", "snes_type=foo"])
-def test_petsc_options_that_cannot_be(setting: str, tmp_path: Path) -> None:
-    assert "solver.petsc_options" in refusal_of(
-        "run", demo("cube"), "--set", f"solver.petsc_options.{setting}", cwd=tmp_path
-    )
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("version", ["0.5.2", "0.8.0"])
 def test_an_old_dolfinx_is_exit_code_5(
     version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -14,7 +14,6 @@ from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import Cells, Load
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.state import State
 from tests import parts
 from tests.parts import cube
 
@@ -123,20 +122,6 @@ def test_the_cells_in_equilibrium_are_those_before_the_pass() -> None:
 
 
 # ---------------------------------------------------------------- all or nothing
-def everything(state: State) -> dict[str, Any]:
-    """Copies of all that a step changes."""
-    now, solved = state.cells, state.equilibrium_cells
-    functions = (state.unknown, now.dimensions, now.axes, solved.dimensions, solved.axes)
-    arrays = {function.name: function.x.array.copy() for function in functions}
-    magnitudes = [float(constant.value) for pairs in state.loading._magnitudes.values() for constant, _ in pairs]
-    return {**arrays, "loads": dict(state.loading.values), "magnitudes": magnitudes, "time": state.time,
-            "number": state.number}  # fmt: skip
-
-
-def assert_same(first: dict[str, Any], second: dict[str, Any]) -> None:
-    """Bit by bit."""
-    for name, values in first.items():
-        np.testing.assert_equal(second[name], values, err_msg=name)
 
 
 class Raising(Watcher):
@@ -174,29 +159,6 @@ def test_watchers_forget_a_step_that_has_not_happened_the_last_one_first() -> No
     assert notes == [("second", 0.5), ("first", 0.5)]
     stepper.advance(0.5, watchers)
     assert len(notes) == 2
-
-
-def test_a_state_starts_unloaded_and_a_snapshot_is_a_copy() -> None:
-    made, stepper = pulled_cube()
-    made.loading.set({"force": 3.0})
-    fresh = State(made.displacement, made.kinematics, made.cells, made.loading)
-    assert made.loading.values == {"force": 0.0} and fresh.time == 0.0 and fresh.number == 0
-    state = stepper.state
-    before, snapshot = everything(state), state.snapshot()
-    stepper.advance(0.5)
-    state.restore(snapshot)
-    assert_same(before, everything(state))
-
-
-def test_cells_are_the_same_only_if_all_numbers_are() -> None:
-    made, stepper = pulled_cube()
-    solved = stepper.state.equilibrium_cells
-    assert solved.equals(made.cells)
-    for function in (made.cells.dimensions, made.cells.axes):
-        value = function.x.array[-1]
-        function.x.array[-1] += 1e-15
-        assert not solved.equals(made.cells)
-        function.x.array[-1] = value
 
 
 # ---------------------------------------------------------------- limits and loads

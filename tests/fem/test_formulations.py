@@ -18,7 +18,7 @@ from remodel_fenicsx.watch.warnings import WARNED_SHARE, LockingWarning, Pressur
 from tests import parts
 from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, registered, thick_tube
-from tests.parts import cube, tube
+from tests.parts import cube, smooth, tube
 from tests.reference.radial import RadialMaterial, solve_radial
 from tests.runs import SELF, last_row, simulated
 from tests.values import ANGLES, ramped, isotropic
@@ -28,13 +28,6 @@ STIFF = Material(lame_mu=3.103, lame_lambda=3.103e4)
 
 
 # ---------------------------------------------------------------- the formulation on its own
-def smooth(nodes: np.ndarray, scale: float, seed: int) -> np.ndarray:
-    """A smooth displacement without symmetries, one row per node."""
-    rng = np.random.default_rng(seed)
-    waves, phases = rng.uniform(1.0, 2.0, (3, 3)), rng.uniform(0.0, 6.0, 3)
-    return scale * np.sin(nodes @ waves + phases)
-
-
 def distorted_cube(scale: float = 0.1) -> parts.Body:
     """Random cells in eight hexahedra that are no parallelepipeds, with the selective formulation; nothing is held."""
     domain = cube(refinement=2)

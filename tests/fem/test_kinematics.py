@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -203,23 +202,6 @@ def test_axes_of_ones_own_may_have_no_symmetry(monkeypatch: pytest.MonkeyPatch) 
         with pytest.raises(SceneError, match=f"'{name}': cells.axes = 'tilted':? .*{words}"):
             base.with_values({"cells.axes": "tilted", "model.kinematics": name})
         assert not objections(base, name)
-
-
-def test_global_axes_make_another_tube_and_radial_would_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Isotropic cells with axes x, y, z: the repulsive stress follows the axes, so the tube does not stay round.
-
-    A ray, were it allowed, would say that nothing changes.
-    """
-    from remodel_fenicsx.body import Tube
-
-    allowed = {name: replace(reduction, rules=()) for name, reduction in Tube.reductions.items()}
-    monkeypatch.setattr(Tube, "reductions", allowed)
-    pairs = (
-        [scene("tube", name, 8.0, cells=ISOTROPIC | {"axes": axes}) for axes in ("global", "cylindrical")]
-        for name in ("sector", "radial")
-    )
-    quarter, ray = (difference(*pair) for pair in pairs)
-    assert ray < 1e-12 < 3e-3 < quarter
 
 
 @pytest.mark.parametrize(("shape", "tables", "name"), [

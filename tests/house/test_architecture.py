@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import functools
 import pkgutil
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-import remodel_fenicsx
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "remodel_fenicsx"
@@ -100,13 +98,6 @@ def test_no_arrow_runs_upwards() -> None:
     assert not upward
 
 
-@pytest.mark.parametrize(
-    "pair", [("fem", "model"), *((room, "scene") for room in ("state", "solver", "evolution", "watch"))]
-)
-def test_rooms_side_by_side_do_not_know_each_other(pair: tuple[str, str]) -> None:
-    assert not [arrow for arrow in arrows() if {room(arrow.importer), room(arrow.imported)} == set(pair)]
-
-
 def test_scripts_beside_the_package_import_what_is_there() -> None:
     """Nothing else runs most of them: what they import may move away unnoticed."""
     scripts = [path for folder in ("benchmarks", "demos", "docs") for path in sorted((ROOT / folder).rglob("*.py"))]
@@ -115,11 +106,6 @@ def test_scripts_beside_the_package_import_what_is_there() -> None:
         for imported, _ in imports_of(path):
             if imported.split(".")[0] == PACKAGE:
                 pkgutil.resolve_name(imported)  # raises, if it is not
-
-
-def test_no_benchmark_is_without_an_ending() -> None:
-    """Formatters, linters and searches go by it."""
-    assert [path.name for path in (ROOT / "benchmarks").iterdir() if not path.is_dir() and not path.suffix] == []
 
 
 def test_the_package_itself_only_hands_names_on() -> None:
@@ -185,51 +171,6 @@ def test_importing_costs_no_more_than_it_must(module: str, never: str) -> None:
     program = f"import sys, {module}; print(*(name for name in {never.split()} if name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
-
-
-# ---------------------------------------------------------------- what to touch to add something
-THINGS = (
-    "a chain law", "a matrix energy", "a repulsive energy", "a driver", "a frame",
-    "a law towards a target, by rank", "any other law",
-    "a pairing of values and dimensions", "initial axes of the cells", "a load", "a column of every shape",
-    "a column of one shape", "a shape", "a kinematics", "a formulation", "a solver method", "a coupling",
-    "a watcher", "a key of a scene",
-)  # fmt: skip
-
-
-def newcomers_table() -> dict[str, tuple[list[str], list[str], list[str]]]:
-    """CONTRIBUTING.md's table: what is added -> files, registries, tests."""
-    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    section = page.split("## What to touch to add something")[1].split("\n## ")[0]
-    rows = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("|")]
-    assert [cell.strip() for cell in rows[0]] == ["to add", "write", "in", "register in", "as in"]
-    return {
-        thing.strip(): (*(re.findall(r"`([^`]+)`", cell) for cell in (files, registries, tests)),)  # type: ignore[misc]
-        for thing, _, files, registries, tests in rows[2:]
-    }
-
-
-def test_the_newcomers_table_says_all_that_can_be_added() -> None:
-    assert tuple(newcomers_table()) == THINGS
-
-
-@pytest.mark.parametrize("thing", THINGS)
-def test_what_the_newcomers_table_names_is_there(thing: str) -> None:
-    """Files, registries that can take one more, and a test that adds one from outside."""
-    files, registries, tests = newcomers_table()[thing]
-    assert files and registries and tests
-    for name in files:
-        assert (ROOT / PACKAGE / name).is_file(), name
-    source = ast.parse((ROOT / "tests" / "body" / "test_extensions.py").read_text(encoding="utf-8"))
-    functions = {node.name: ast.unparse(node) for node in source.body if isinstance(node, ast.FunctionDef)}
-    for registry in registries:
-        found = pkgutil.resolve_name(registry := f"{PACKAGE}.{registry}")
-        assert isinstance(found, (dict, tuple, type)), registry
-        assert registry.split(".")[1] in ("extend", "parts", *remodel_fenicsx.__all__), registry
-        *_, owner, name = registry.split(".")
-        adding = (f"setitem({name}", f"setitem({owner}.{name}", f"setattr({owner}, '{name}'", f"Healing{name}(")
-        for test in tests:
-            assert any(call in functions[test] for call in adding), f"{test} adds nothing to {registry}"
 
 
 # ---------------------------------------------------------------- one name, one meaning

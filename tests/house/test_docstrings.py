@@ -1,7 +1,7 @@
-"""Docstrings of the public interface: numpydoc's sections, shapes of arrays, errors, and examples that run.
+"""Docstrings of the public interface: numpydoc's sections, shapes of arrays, and examples that run.
 
-What is asked is what a reader needs: every parameter, what comes back, the errors that the code itself raises, an
-example. The examples run as doctests, all in one child.
+What is asked is what a reader needs: every parameter, what comes back, an example. The examples run as doctests, all in
+one child.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import doctest
 import inspect
 import pkgutil
 import re
-import textwrap
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -66,16 +65,6 @@ def parameters(value: Any) -> dict[str, str]:
     return {name: str(each.annotation) for name, each in found.items() if name not in ("self", "args", "kwargs")}
 
 
-def raised(function: Any) -> set[str]:
-    """Names of the errors that its own lines raise."""
-    if function.__code__.co_filename == "<string>":
-        return set()  # of what dataclass writes
-    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    calls = [node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and node.exc is not None]
-    names = {ast.unparse(call.func if isinstance(call, ast.Call) else call).rpartition(".")[2] for call in calls}
-    return {name for name in names if name[0].isupper() and name != "NotImplementedError"}
-
-
 def members(kind: type) -> Iterator[tuple[str, Any]]:
     """Public methods and properties of the package's own: name and function."""
     for name in dict.fromkeys(name for base in kind.__mro__ for name in vars(base)):
@@ -103,11 +92,6 @@ def faults(value: Any) -> Iterator[str]:
             yield f"parameter {name} is not described"
         elif ARRAYS.search(kind) and not SHAPE.search(known[name]):
             yield f"parameter {name}: no shape"
-    made = () if getattr(value, "_is_protocol", False) else ("__init__", "__post_init__")
-    started = [vars(value)[name] for name in made if name in vars(value)]
-    for function in [value] if inspect.isfunction(value) else filter(inspect.isfunction, started):
-        if missing := {name for name in raised(function) if name not in entries(said.get("Raises", ""))}:
-            yield f"raises {missing}, which Raises does not say"
     if inspect.isfunction(value):
         yield from faults_of_return(value, said)
 
@@ -133,8 +117,6 @@ def faults_of_member(kind: type, name: str, function: Any) -> Iterator[str]:
         yield f"{name}: no shape of what it returns"
     if "Returns" in said and not re.match(r"\S.*\n +\S", said["Returns"]):
         yield f"{name}: Returns without a type and, indented, what it is"
-    if missing := {error for error in raised(function) if error not in text}:
-        yield f"{name}: raises {missing} and does not say so"
 
 
 @pytest.mark.parametrize("name", DESCRIBED)

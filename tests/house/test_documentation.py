@@ -26,7 +26,7 @@ def page(name: str) -> str:
 
 
 def test_pages_that_need_no_run_are_those_that_the_code_makes() -> None:
-    """Keys, schema, public interface, columns, sizes; what is added, renamed or dropped shows in their own history."""
+    """Keys, schema, public interface, columns; what is added, renamed or dropped shows in their own history."""
     made = subprocess.run([sys.executable, str(ROOT / "docs" / "make"), "--check"], capture_output=True, text=True)
     assert (
         made.returncode == 0
@@ -129,14 +129,8 @@ def test_a_name_that_the_package_does_not_have_is_refused() -> None:
 
 STUDIES = """
 from docs.making import studies
-(row,) = studies.stiff_tendon("tendon", **{"time.end": 1.0, "material.energy_factor": 1})
+row = studies.stiff_tendon("tendon", **{"time.end": 1.0, "material.energy_factor": 1})
 assert 1.1 < row["mean_stretch"] < 1.3 and row["time"] == 1.0, row
-# with a hint of suction some points are not pulled in any direction
-points = studies.stopped_points("artery-0-4.8", **{"time.end": 1.0, "loads.pressure.value": -1e-6})
-assert 0 < len(points) < 1536 * 8, len(points)
-for point in points:
-    assert point["passes"] == 0 and point["largest_stress"] < 1e-7 and 1 < point["radius"] < 3, point
-print(sorted(points[0]))
 """
 
 
@@ -144,4 +138,3 @@ def test_the_studies_of_the_verification_page_run(tmp_path: Path) -> None:
     """Short ones; the comparisons with the radial reference are tests of their own."""
     done = forked("python", f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{STUDIES}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout == "['element', 'fibre_angle', 'largest_stress', 'passes', 'radius']\n"

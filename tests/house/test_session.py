@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import mpirun, slowly
+from tests.processes import has_ended
 
 PROJECT = Path(__file__).resolve().parents[2]
 RANK = "import os, sys, time; from mpi4py import MPI; open(f'{sys.argv[1]}/{os.getpid()}', 'w'); MPI.COMM_WORLD.recv()"
@@ -48,15 +49,6 @@ def environment_of(**variables: str) -> dict[str, str]:
     """This one, but for what belongs to this session, and without plugins that take longer than these tests do."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "REMODEL_"))}
     return {**inherited, "PYTHONPATH": str(PROJECT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", **variables}
-
-
-def has_ended(process: int) -> bool:
-    """Whether nothing is left of it but, at most, what its parent has not asked for yet."""
-    try:
-        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-    return state == "Z"
 
 
 @pytest.mark.parametrize("name, workers", [("mpirun", "0"), ("deaf", "1"), *slowly(("sleep", "1"), ("deaf", "0"))])

@@ -83,15 +83,6 @@ def test_a_change_of_any_file_or_number_is_another_library(tmp_path: Path, monke
         (copy / name).write_text(text)
 
 
-def test_the_compiler_names_file_and_line(tmp_path: Path) -> None:
-    """After an included file too."""
-    text = kernels.source("tensor.c", tensor.NUMBERS).replace("static inline double stiffness(", "nonsense stiffness(")
-    done = subprocess.run([*CC, "-fsyntax-only", "-x", "c", "-"], input=text, capture_output=True, text=True)
-    lines = (kernels.FOLDER / "tensor.c").read_text().splitlines()
-    number = next(i for i, line in enumerate(lines, start=1) if "double stiffness(" in line)
-    assert f"tensor.c:{number}:" in done.stderr
-
-
 # ---------------------------------------------------------------- numpy in their place
 TENSOR = {"remodeling.law": "tensor", "material.repulsion": "log", "remodeling.frame": "material"}
 

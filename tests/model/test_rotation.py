@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from remodel_fenicsx import Scene
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.laws import LAWS, Array, Drive, angle_left, turned
+from remodel_fenicsx.model.laws import LAWS, Array, Drive, angle_left
 from tests import parts
 from tests.runs import made
 
@@ -171,25 +171,6 @@ def test_the_nearer_sense_is_the_one_in_the_reference_configuration() -> None:
     F = np.tile(np.eye(3) + 3.0 * np.outer(X, Y), (40, 1, 1))
     goal = updated(old, pulled(stress, F), 1e9).axes[:, 0]
     assert np.all(np.sum(goal * old.axes[:, 0], axis=1) > -1e-3)
-
-
-@pytest.mark.parametrize("relative_step", [0.0, 1e-9, 1e-3, 1.0, 30.0, 1e9])
-def test_what_an_implicit_step_leaves_of_an_angle(relative_step: float) -> None:
-    angle = np.concatenate([[0.0, 1e-300, 1e-9], np.linspace(0.01, np.pi / 2 + 1e-3, 200)])
-    left = angle_left(angle, relative_step)
-    np.testing.assert_allclose(left + relative_step * np.sin(left), angle, rtol=1e-13)
-    assert np.all((left >= 0.0) & (left <= angle))
-    with pytest.raises(FloatingPointError, match="no angle is left"):
-        angle_left(np.array([np.nan]), relative_step)
-
-
-def test_rotations_by_vectors_of_any_size() -> None:
-    rng = np.random.default_rng(10)
-    axes = parts.random_rotations(rng, 60)
-    vectors = rng.normal(size=(60, 3)) * np.logspace(-12, 1, 60)[:, None]
-    expected = axes @ np.swapaxes(Rotation.from_rotvec(vectors).as_matrix(), 1, 2)
-    np.testing.assert_allclose(turned(axes, vectors), expected, atol=1e-14)
-    np.testing.assert_array_equal(turned(axes, 0 * vectors), axes)
 
 
 # ---------------------------------------------------------------- with the rest

@@ -259,11 +259,14 @@ def test_who_reads_a_file_keeps_it(tmp_path):
             grid.append(k, {"u": np.full(8, k)}, constant={"depth": [0.5]})
             grid.publish()
             assert len(raw_series(path, "u", 8)) == k + 1
-        with h5py.File(path) as file:
+        with h5py.File(path) as file, path.open("rb") as opened:
+            data = opened.read()
             for k in range(20, 23):
                 grid.append(k, {"u": np.full(8, k)}, constant={"depth": [0.5]})
                 grid.publish()
             assert int(file["VTKHDF/Steps"].attrs["NSteps"]) == 20
+            opened.seek(0)
+            assert opened.read() == data
         assert len(raw_series(path, "u", 8)) == 23
     with h5py.File(path) as file:
         assert file["VTKHDF/CellData/depth"].shape == (1,)

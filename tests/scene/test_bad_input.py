@@ -29,10 +29,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.tube import Tube
 from remodel_fenicsx.results.checkpoint_file import read_checkpoint
 from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import preset_scene, read_scene
-from remodel_fenicsx.schema.tables import SceneError as SchemaError
-from remodel_fenicsx.schema.text import parse_override
 from remodel_fenicsx.simulation import checked_domain
 from tests.parts import tube
 from tests.results.test_resume import SELF, first_half, rows
@@ -165,7 +162,7 @@ def written(values: dict[str, Any]) -> str | None:
 
 @bad(
     "scenes with odd values",
-    120,
+    220,
     "NaN, infinities, huge and tiny numbers, other types, keys missing or unknown, units that are none",
     shape=st.sampled_from(sorted(SHAPES)),
     changes=CHANGES,
@@ -182,7 +179,7 @@ def test_a_scene_with_odd_values(shape: str, changes: list[tuple[int, str, Any]]
         assert read_scene(tmp_path / "again.toml") == good
 
 
-@bad("scenes of damaged text", 100, "cut off, other bytes, holes of zeros, foreign, empty", data=st.data())
+@bad("scenes of damaged text", 200, "cut off, other bytes, holes of zeros, foreign, empty", data=st.data())
 def test_a_scene_that_is_damaged_text(data: st.DataObject, tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_bytes(damaged(data, preset_scene("kuhl-holzapfel-2007", "tube").to_toml().encode()))
     answer("validate", str(tmp_path / "scene.toml"))
@@ -239,7 +236,7 @@ COMMANDS = st.tuples(st.sampled_from(["run", "run", "status", "validate", "new"]
 
 @bad(
     "command lines",
-    180,
+    280,
     "words in any order; scenes that are folders, links in a circle, binary; settings that are none",
     command=COMMANDS,
 )
@@ -258,27 +255,6 @@ def _kept(folder: Path, changes: list[str]) -> Path:
     with locked(folder, SELF, new=False):
         running._kept(folder, changes, SELF)
     return folder
-
-
-@bad("`--set`", 100, "any text", text=st.text(max_size=20))
-def test_an_override(text: str) -> None:
-    try:
-        key, _ = parse_override(text)
-    except SchemaError as error:
-        assert len(str(error).splitlines()) == 1
-    else:
-        assert all(key.split("."))
-
-
-@bad(
-    "`--max-wall-time`",
-    100,
-    "any text",
-    text=st.one_of(st.text(max_size=8), st.from_regex(r"-?[0-9.e]{1,6} ?(s|min|h|d|y)", fullmatch=True)),
-)
-def test_a_wall_time(text: str) -> None:
-    code, _, errors = ask("run", "nowhere", f"--max-wall-time={text}")
-    assert code == 2 and errors.splitlines()[-1].startswith("remodel-fenicsx")
 
 
 # ---------------------------------------------------------------- checkpoints
@@ -307,16 +283,6 @@ def test_a_recording_that_is_damaged(data: st.DataObject, first_half: Path, tmp_
     except (RecordingError, SceneError) as error:
         assert len(str(error).splitlines()) == 1
     answer("status", str(folder))
-
-
-@bad("damaged fields to go on with", 100, "fields.vtkhdf", data=st.data())
-def test_fields_that_are_damaged_are_not_written_on(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
-    path = tmp_path / "fields.vtkhdf"
-    path.write_bytes(damaged(data, (first_half / path.name).read_bytes()))
-    try:
-        TransientGrid.continued(path, 4.0).close()
-    except ValueError as error:
-        assert len(str(error).splitlines()) == 1
 
 
 @bad(

@@ -16,7 +16,7 @@ from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear, newton
 from remodel_fenicsx.solver.newton import Limits, LoadPhase
-from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants, worth
+from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants
 from remodel_fenicsx.watch.warnings import VolumeResponse
 from tests import parts
 from tests.parts import tube
@@ -238,30 +238,6 @@ def test_a_kept_factor_stays_when_its_matrix_changes(monkeypatch: pytest.MonkeyP
     factor.close()
 
 
-def test_a_factor_is_worth_more_iterations_of_a_larger_body() -> None:
-    """As measured: a factor costs as much as 11 iterations of 5,616 unknowns, and 25 of 40,800."""
-    assert worth(100) == worth(5616) == pytest.approx(11, abs=1) and worth(40_800) == pytest.approx(25, abs=2)
-
-
-def test_a_factor_is_renewed_where_steps_become_dearer_than_their_mean() -> None:
-    """The mean cost of a step, its share of the factor included, is least there; a slow step counts by itself."""
-    lagged = object.__new__(Lagged)
-    lagged.worth, lagged._always = 12.0, False
-
-    def due_after(*iterations: int) -> list[bool]:
-        lagged._spent, lagged._solves = lagged.worth, 0
-        due = []
-        for count in iterations:
-            lagged.ended(count)
-            due.append(lagged._due)
-        return due
-
-    assert due_after(3, 3, 3, 3, 3, 3) == [False] * 6  # as cheap as ever
-    # the mean of seven, (12 + 20) / 7, is less than 5; that of six, (12 + 15) / 6, is not less than 4
-    assert due_after(2, 2, 2, 2, 3, 4, 5) == [False] * 6 + [True]
-    assert due_after(9) == [True]
-
-
 def test_a_solve_of_many_factors_goes_on_by_newtons_method(
     direct: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -274,18 +250,6 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
     simulation.close()
     assert_same(rows, direct)
     assert 2 < max(made) <= 4 and "once more" not in caplog.text
-
-    lagged = object.__new__(Lagged)
-    lagged._norms, lagged._due, lagged._always, lagged._before, lagged.secants = [], False, False, 0, Secants()
-    monkeypatch.setattr(Lagged, "renew", lambda self: made.append(self.tangents))
-    for lagged.tangents, every, given_up in ((2, False, False), (3, True, False), (4, True, False), (5, True, True)):
-        made.clear()
-        lagged.tangent(1.0, 1e-9)
-        assert (made == [lagged.tangents], lagged.given_up) == (every, given_up)
-        assert not (every and lagged.improve(None, None, None, True))
-        lagged._norms.clear()
-    lagged.keep_nothing()
-    assert not lagged.given_up
 
 
 @pytest.mark.parametrize("method", ["auto", "lagged"])
@@ -325,25 +289,6 @@ def test_where_old_factors_do_not_do_every_tangent_is_taken(
     rows = [simulated(method, **changes)[1] for method in ("direct", "lagged")]
     assert "solved once more, with new factors in every iteration: no equilibrium within 24 Newton" in caplog.text
     assert_same(rows[1], rows[0])
-
-
-@pytest.mark.parametrize(
-    ("norms", "renewed"),
-    [([1.0, 0.1, 0.01, 1e-3], False), ([1.0, 0.9, 0.8, 0.7], True), ([1.0, 1.0, 2.0, 3.0], True), ([1.0, 3.0], True),
-     ([1.0], False), ([1.0, 0.1], False), ([1.0, 0.5], True), ([1.0, 0.01, 0.9], False)],
-)  # fmt: skip
-def test_a_factor_is_renewed_where_that_costs_less(norms: list[float], renewed: bool) -> None:
-    lagged = object.__new__(Lagged)
-    lagged._norms, lagged.worth = norms, worth(5616)
-    assert lagged._costs_more(1e-8) is renewed
-
-
-@pytest.mark.parametrize(("norms", "renewed"), [([1.0], False), ([1.0, 0.01, 0.9], True), ([1.0, 0.5, 0.01], False)])
-def test_in_parts_each_iteration_is_judged_by_itself(norms: list[float], renewed: bool) -> None:
-    lagged = object.__new__(Lagged)
-    lagged._norms, lagged.worth = norms, worth(5616)
-    lagged.keep_nothing()
-    assert lagged._costs_more(1e-8) is renewed
 
 
 def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptureFixture) -> None:

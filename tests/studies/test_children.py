@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time as clock
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import pytest
 
 from remodel_fenicsx.system.children import Worker, wait_for_one
 from tests.parts import pulled_cube
+from tests.processes import CHILDREN, has_ended, members
 
 
 @pytest.fixture
@@ -75,34 +75,13 @@ def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert process.stderr.readline().startswith("artery ensemble: 0 of 33 runs done")
-        (child,) = children_of(process.pid)
+        (child,) = members(process.pid, CHILDREN)
         process.send_signal(number)
         said = "" if number == signal.SIGKILL else process.stderr.read()
     expected = {signal.SIGTERM: 143, signal.SIGUSR1: 4, signal.SIGKILL: -signal.SIGKILL}
-    assert process.returncode == expected[signal.Signals(number)] and has_ended(child, 30.0)
+    assert process.returncode == expected[signal.Signals(number)] and has_ended(child)
     kept = "; all that is recorded is kept, the same command goes on"
     assert not said or said.splitlines()[-1].endswith(kept)
     assert number == signal.SIGKILL or said
     assert not (tmp_path / "runs" / "ensemble.csv").exists()
     assert all(history.read_text().count("\n") < 152 for history in (tmp_path / "runs").rglob("history.csv"))
-
-
-def children_of(number: int) -> list[int]:
-    """Process numbers of the children of a process."""
-    return [int(text) for text in Path(f"/proc/{number}/task/{number}/children").read_text().split()]
-
-
-def is_alive(number: int) -> bool:
-    """Whether a process runs; one that has ended and that nobody asks for does not."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def has_ended(number: int, seconds: float) -> bool:
-    """Whether a process ends within so many seconds."""
-    end = clock.monotonic() + seconds
-    while is_alive(number) and clock.monotonic() < end:
-        clock.sleep(0.05)
-    return not is_alive(number)

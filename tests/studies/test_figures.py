@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import re
 import signal
@@ -139,16 +138,6 @@ def test_fig1_is_eq_2(drawn: Path) -> None:
         np.testing.assert_allclose(table[f"force_A_{A}"], (4 * x + (1 - x) ** -2 - 1) / (4 * A), rtol=1e-6, atol=1e-12)
 
 
-def test_fig5_is_the_closed_form_of_the_cells_before_the_pass(drawn: Path) -> None:
-    table = page.read_table(drawn / "fig5.csv")
-    np.testing.assert_array_equal(table["time"][table["time"] > 0], np.arange(1.0, 101.0))
-    for kappa in (0.01, 0.025, 0.05, 0.1):
-        s = 1 - np.exp(-kappa * np.maximum(table["time"] - 1.0, 0.0))
-        exact = np.degrees(np.arctan2(math.sqrt(2) * (1 - s), 1 - s + math.sqrt(3) * s))
-        np.testing.assert_allclose(table[f"angle_kappa_{kappa:g}"], exact, rtol=0, atol=1e-3)
-        np.testing.assert_allclose(table[f"exact_kappa_{kappa:g}"], exact, rtol=1e-6)
-
-
 def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     histories = sorted((drawn / "runs").glob("cube-*/history.csv"))
     assert len(histories) == 4
@@ -163,48 +152,18 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monke
 # ---------------------------------------------------------------- all of it
 
 
-@pytest.fixture(scope="module")
-def everything(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every figure, drawn by the script."""
-    folder = tmp_path_factory.mktemp("everything")
-    with pytest.MonkeyPatch.context() as patch:
-        assert draw(patch, "-o", folder, "--runs", folder / "runs") == 0
-    return folder
-
-
 @pytest.mark.slow
-def test_all_numbers_are_those_of_the_page(everything: Path) -> None:
+def test_all_numbers_are_those_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """To what another machine rounds: of angles in elements that hardly decide."""
+    assert draw(monkeypatch, "-o", tmp_path, "--runs", tmp_path / "runs") == 0
     tables = [path for name in figures.FIGURES for path in (DOCS / "figures").glob(f"{name}[.-]*csv")]
     assert len(tables) == 14
     for path in tables:
-        found, kept = (page.read_table(folder / path.name) for folder in (everything, DOCS / "figures"))
+        found, kept = (page.read_table(folder / path.name) for folder in (tmp_path, DOCS / "figures"))
         assert list(found) == list(kept)
         for column, values in kept.items():
             if values.dtype.kind == "f":
                 np.testing.assert_allclose(found[column], values, rtol=1e-4, atol=0.01, err_msg=f"{path} {column}")
-
-
-@pytest.mark.slow
-def test_the_figures_show_what_the_design_says(everything: Path) -> None:
-    tendon = page.read_table(everything / "fig6.csv")
-    assert 1.735 <= tendon["mean_stretch"][tendon["time"] == 12.0].item() <= 1.750
-    assert 1.4244 <= tendon["mean_stretch"][-1] <= 1.4250
-    radial = page.read_table(everything / "fig7.csv")["mean_l_radial"]
-    assert 0.49 < radial[0] < 0.53 and 0.02 < radial[-1] < 0.035
-    layers = page.read_table(everything / "fig8.csv")
-    target = [1.1, 4.2, 14.0, 36.9, 60.2, 66.7, 70.3, 72.7]
-    np.testing.assert_allclose(layers["fibre_angle"], target, rtol=0, atol=1.5)
-    cases = page.read_table(everything / "fig9.csv")
-    stretched, pressed = (cases["pressure"] == 0.0, cases["stretch"] == 0.0)
-    assert np.all(cases["fibre_angle"][stretched] > 89.0)
-    assert np.all(cases["fibre_angle"][pressed][:4] < 1.5) and np.all(cases["fibre_angle"][pressed] < 13.0)
-    second, strain = page.read_table(everything / "fig10.csv"), page.read_table(everything / "fig11.csv")
-    variation = {name: np.ptp(table[f"fibre_angle_{name}"]) for name, table in
-                 (("cauchy", second), ("pk2", second), ("finger", strain))}  # fmt: skip
-    assert variation["finger"] < 25 < 60 < variation["pk2"] < variation["cauchy"] < variation["pk2"] + 6
-    rate = page.read_table(everything / "rate.csv")
-    assert 15 < rate["fibre_angle_explicit"][-1] - rate["fibre_angle_rate"][-1] < 25
 
 
 # ---------------------------------------------------------------- docs/verification.md
@@ -235,9 +194,3 @@ def test_the_verification_page_shows_the_proof(make_verification: Any) -> None:
     assert all(row["radii_percent"] < 0.2 for row in [*cases, *drivers])
     explicit = [*cases, *(row for row in drivers if row["law"] == "explicit")]
     assert all(row["angle_mean"] < 1.0 and row["angle_outside"] < 1.0 for row in explicit)
-    objective = make_verification.rows_of(kept / "invariance.csv")
-    assert len(objective) == 12
-    for row in objective:
-        changes = row["frame"] == "spatial" and row["driver"] != "pk2" and row["turned"] == "deformed body"
-        assert (row["lengths"] > 0.01) == changes and (row["energy"] > 0.01) == changes
-        assert changes or max(row["lengths"], row["tensor"], row["energy"]) < 1e-8

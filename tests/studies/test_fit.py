@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.recovery import MOST, TRUTH as RECOVERED, fitted, noisy, tables, tube as tube_of_the_benchmark
 from remodel_fenicsx import Scene, SceneError, cli, preset_scene, read_scene
 from remodel_fenicsx.schema.settings import STRESS_UNITS
 from remodel_fenicsx.studies.fit import Problem, fit, minimised
@@ -154,19 +153,6 @@ def test_what_changes_nothing_is_named(folder: Path) -> None:
     (folder / "data.toml").write_text(text)
     with pytest.raises(SceneError, match="remodeling.kappa changes nothing that is measured; fix it"):
         fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out")
-
-
-@pytest.mark.slow
-def test_six_numbers_are_recovered() -> None:
-    """A part of benchmarks/recovery.py: one minimum from two starts, the truth within three standard deviations."""
-    scene, random = tube_of_the_benchmark(), np.random.default_rng(1)
-    data = noisy(tables(scene), random)
-    assert sum(one.rows * len(one.sd) for one in data) == 46
-    ends = [fitted(scene, data, factors)[0] for factors in (np.ones(6), np.array([2, 0.5, 2, 0.9, 0.5, 2]))]
-    assert ends[0].minima[0] == pytest.approx(ends[1].minima[0], rel=1e-4)
-    assert max(one.runs for one in ends) <= MOST["runs"]
-    width = np.log(ends[0].upper / ends[0].lower) / 2
-    assert np.all(np.abs(np.log(ends[0].values / list(RECOVERED.values()))) < 1.6 * width)
 
 
 EVERY = (FITS / "every.toml").read_text()

@@ -262,27 +262,6 @@ def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:
     assert {entry["trusted"] for entry in table} == {"0", "1"} and "error_radii" in table[0]
 
 
-def test_the_picture_stays_in_its_frame_and_names_the_front_from_left_to_right() -> None:
-    """Filled points are the front, and the margin has their settings in the order of their cost."""
-    rows, _ = estimated()
-    figure = trade.Trade(artery(), rows).figure()
-    figure.draw_without_rendering()
-    (axes,) = figure.axes
-    shown = [row for row in rows if row.angle_error > 0]
-    front = [row for row in shown if row.on_front]
-    filled = [line for line in axes.lines if line.get_marker() == "o" and line.get_markerfacecolor() != "white"]
-    points = sorted(place for line in filled for place in zip(*line.get_data(), strict=True))
-    assert points == [(row.result.seconds, row.angle_error) for row in front]
-    frame, whole = axes.get_window_extent(), figure.bbox
-    assert all(frame.contains(*axes.transData.transform((row.result.seconds, row.angle_error))) for row in shown)
-    for legend in figure.legends:
-        box = legend.get_window_extent()
-        assert whole.x0 <= box.x0 and box.x1 <= whole.x1 and whole.y0 <= box.y0 and box.y1 <= whole.y1
-        assert not box.overlaps(frame)
-    named = [text.get_text() for text in figure.legends[1].get_texts()]
-    assert named == [row.result.setting.name for row in front] and len(named) > 5
-
-
 @pytest.mark.slow
 def test_estimates_of_the_artery_are_the_true_errors(tmp_path: Path) -> None:
     """Against the one-dimensional reference with small steps: eight of ten rows within a factor of two."""

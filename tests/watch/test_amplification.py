@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -19,7 +16,7 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.stability import AmplificationWatcher, LinearPass, verdict
-from tests.conftest import Refused, mpirun
+from tests.conftest import Refused
 from tests.runs import AtSolved
 from tests.watch.test_over_correction import Tilt
 
@@ -113,22 +110,6 @@ def test_the_command_writes_table_and_picture(
     refused("stability", *arguments)  # the folder is taken
     nothing = ("--set", "remodeling.law=none", "-o", tmp_path / "none")
     assert "nothing remodels" in refused("stability", scene, *nothing) and not (tmp_path / "none").exists()
-
-
-@pytest.mark.slow
-def test_two_ranks_find_the_same_factor(tmp_path: Path) -> None:
-    scene = tmp_path / "weak.toml"
-    scene.write_text(f'preset = "{PAPER}"\n[geometry]\nshape = "cube"\n[mesh]\nrefinement = 2\n')
-    found = []
-    for ranks in (1, 2):
-        folder = tmp_path / f"out{ranks}"
-        command = ["-m", "remodel_fenicsx", "stability", str(scene), "-o", str(folder), "-q", "--times", "1"]
-        command += ["--set", "time.end=14", "--set", "loads.force.value=0.01"]
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-        done = subprocess.run(mpirun(ranks, sys.executable, *command), env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr[-2000:]
-        found.append(read(folder)["factor"][0])
-    assert found[1] == pytest.approx(found[0], rel=1e-2) and found[0] < -1.0
 
 
 def table(factors: list[float], growing: float = 0.5, share: float = 1.0) -> dict[str, list[float]]:

@@ -10,7 +10,6 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
@@ -145,48 +144,7 @@ def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(coupling: 
     assert scripted.watcher.said == said
 
 
-def test_passes_around_a_rest_do_not_count() -> None:
-    """Cells that go on after a rest jump. The same swing without one is warned of at 6, as above."""
-    scripted = Scripted(-3.0, 4e-5)
-    scripted.watcher.started(scripted.step(0))
-    for number in range(1, 9):
-        step = scripted.step(number)
-        if number == 5:
-            scripted.step(4)  # cells as they were
-        scripted.watcher.completed(step)
-        scripted.watcher.committed(step)
-    assert not scripted.watcher.said
-
-
-def test_a_step_that_is_undone_leaves_no_trace() -> None:
-    """What is remembered is part of the state, which forgets the step."""
-    scripted = Scripted(-3.0, 1e-6)
-    watcher = scripted.watcher
-    watcher.started(scripted.step(0))
-    for number in range(1, 6):
-        with pytest.raises(KeyboardInterrupt), scripted.simulation.state.transaction():
-            watcher.completed(scripted.step(number))
-            raise KeyboardInterrupt
-        step = scripted.step(number)
-        watcher.completed(step)
-        watcher.committed(step)
-    assert watcher.swing is not None and watcher.swing.cells_factor == pytest.approx(-3.0, rel=1e-6)
-
-
 # ---------------------------------------------------------------- rounding
-def test_axes_stay_where_the_tensor_says_so_within_its_error() -> None:
-    rng = np.random.default_rng(1)
-    axes = parts.random_rotations(rng, 20)
-    values = np.sort(rng.uniform(1e-9, 1.0, (20, 3)), axis=1)[:, ::-1]
-    values[:, 1] = values[:, 0] - 1e-9  # so close that an error of 1e-12 turns them by a milliradian
-    exact = np.swapaxes(axes, 1, 2) @ (values[:, :, None] * axes)
-    error = rng.standard_normal((20, 3, 3)) * 1e-13
-    noisy = exact + error + np.swapaxes(error, 1, 2)
-    cleaned = spectral.without_noise(noisy, 3.0 * axes, 1e-11)
-    kept = axes @ cleaned @ np.swapaxes(axes, 1, 2)
-    assert np.abs(kept * (1 - np.eye(3))).max() < 1e-15
-    np.testing.assert_allclose(np.einsum("nii->ni", kept), values, atol=1e-12)
-    np.testing.assert_array_equal(spectral.without_noise(noisy, axes, 1e-14), noisy)  # more than its error
 
 
 # ---------------------------------------------------------------- cells that rest
