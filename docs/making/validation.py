@@ -133,7 +133,7 @@ def agreements() -> Iterator[Row]:
         label = "V10 sheet at rest, forces {} and {} N, degrees".format(*forces)
         yield row(label, "tan a = sigma_y / sigma_x", theirs, found["fibre_angle"], 0.05, False)
     force = 1.381e-23 * 310.0 / 14.5e-9 * 0.5 * extend.CHAINS["wormlike"].stiffness(0.5, 1.0)
-    yield row("Wormlike chain, 14.5 nm, half extended, pN", "Marko, Siggia 1995", 0.369, 1e12 * force, 1e-3)
+    yield row("Wormlike chain, 14.5 nm, half extended, pN", "Marko and Siggia 1995", 0.369, 1e12 * force, 1e-3)
 
 
 # ---------------------------------------------------------------- against measurements
