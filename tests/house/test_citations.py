@@ -24,3 +24,17 @@ def test_every_work_that_a_page_names_is_in_the_bibliography_and_the_other_way_r
     assert len(keys) > 15 and len(set(keys)) == len(keys)
     assert not {work for work in wanted if not any(key.endswith(work) for key in keys)}
     assert not [key for key in keys if key.casefold() not in text.casefold()]
+
+
+def test_the_paper_and_its_bibliography_name_the_same_works_and_its_figures_are_there() -> None:
+    """As the Journal of Open Source Software asks for them."""
+    paper = ROOT / "paper" / "paper.md"
+    _, head, text = paper.read_text(encoding="utf-8").split("---\n", 2)
+    works = (paper.parent / "paper.bib").read_text(encoding="utf-8")
+    assert set(re.findall(r"@(\w+)", text)) == set(re.findall(r"^@\w+\{(\w+),", works, re.MULTILINE))
+    for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text):
+        assert (paper.parent / picture).is_file(), picture
+    assert all(
+        f"\n{key}:" in f"\n{head}" for key in ("title", "tags", "authors", "affiliations", "date", "bibliography")
+    )
+    assert all(f"\n# {title}" in text for title in ("Summary", "Statement of need", "State of the field", "References"))
