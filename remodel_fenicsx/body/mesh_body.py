@@ -131,9 +131,8 @@ class FileBody(WithRegions, FromFile):
 
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
         description=(
-            "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one of VTK or meshio "
-            "(`.vtu`, `.vtk`, `.xdmf`). Its path is relative to the scene's folder. In a list, surfaces of its "
-            "triangles may follow (`.vtp`, `.stl`, `.ply`, `.obj`), faces by the names of their files."
+            "The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`, `.stl`, "
+            "`.ply`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."
         ),
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"},
     )
@@ -152,9 +151,9 @@ class FileBody(WithRegions, FromFile):
     faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
         description=(
-            "Names of faces, each with the name or number of a face in the file, or a list of them. "
-            "`inner`, `outer`, `inlet` and `outlet` are needed where the file has other names. Further "
-            'faces are for supports and loads. A surface of its own is a face too: `{ file = "lumen.vtp" }`.'
+            "Names of faces, each with the name or number of a face in the file, or a list of them: `inner`, `outer`, "
+            "`inlet` and `outlet` where the file has other names, and more for supports and loads. A surface of its "
+            'own is a face too: `{ file = "lumen.vtp" }`.'
         ),
         json_schema_extra=_GROUPS,
     )

@@ -464,9 +464,8 @@ _is: Any = {  # a word of Python
         Literal["unloaded", "loaded"],
         Field(
             default="unloaded",
-            description="What the geometry describes. 'unloaded': the body without loads. 'loaded', for a tube or a "
-            "body of your own: the body under the loads at the end of their ramps; the unloaded body is found first "
-            "(docs/tissue_that_lives.md).",
+            description="What the geometry describes: the body without loads, or (a tube, a body of your own) the one "
+            "under the loads at the end of their ramps; the unloaded body is found first (docs/tissue_that_lives.md).",
         ),
     )
 }
