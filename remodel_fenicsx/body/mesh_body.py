@@ -432,8 +432,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: None,  # a part of the supports (`support`)
-            "prescribed engineering strain of the length: the outlet moves along its own normal by this share of the "
-            "length of the body",
+            "prescribed engineering strain of the length: the outlet moves along its own normal",
             column="axial_elongation",
             above=-1.0,
             doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
@@ -443,7 +442,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         Column(
             "lumen_volume",
             "length^3",
-            "volume inside the deformed inner face, closed by flat caps at its ends; empty where it encloses none",
+            "volume inside the deformed inner face, closed by flat caps; empty where it encloses none",
             lambda m: m.lumen_volume(),
         ),
         *WalledMesh.columns,
