@@ -28,14 +28,9 @@ from remodel_fenicsx.schema.tables import Table, description, sections
 
 HEAD = """# The public interface
 
-This page is made from the code: `./with-fenicsx docs/make interface`. A test compares the
-two, so that nothing here changes unnoticed.
-
-What stands here is public: the names of three modules with their parameters, the keys of scenes,
-the columns of histories, the commands with their options, and the exit codes. Scripts, scenes and
-notebooks may rely on it; [CHANGELOG.md](../CHANGELOG.md) says when some of it changes. Everything
-else is private and changes without notice: all other modules, names with a leading underscore, and
-whatever a public object hands out that is not listed.
+This page is made from the code: `./with-fenicsx docs/make interface`. Scripts, scenes and notebooks
+may rely on what stands here; [CHANGELOG.md](../CHANGELOG.md) says when some of it changes. All else
+is private and changes without notice, also what a public object hands out and is not listed.
 
 Docstrings say what a name means, [scene.md](scene.md) what a key, [commands.md](commands.md) what a
 command, a column and an exit code.

@@ -168,9 +168,7 @@ def _drivers(folder: Path) -> dict[str, str]:
     return found | {
         "rate_mean_outside": f"{rate['angle_mean_outside']:.2f}",
         "largest_difference_pk2": f"{np.abs(angles['cauchy'] - angles['pk2']).max():.1f}",
-        "finger_exact_inner_radius": f"{exact['inner']:.3f}",
         "finger_inner_error": f"{100 * (inner / exact['inner'] - 1):+.1f}",
-        "finger_exact_outer_radius": f"{exact['outer']:.3f}",
         "finger_outer_error": f"{100 * (outer / exact['outer'] - 1):+.1f}",
         "rate_difference": f"{angles['cauchy'][-1] - angles['rate'][-1]:.1f}",
     }
