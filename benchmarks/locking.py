@@ -29,7 +29,7 @@ MESHES = [  # elements, their degree, and how many of them go around and through
     ("hexahedron", 1, 16, 8), ("hexahedron", 1, 32, 16), ("hexahedron", 2, 8, 4), ("tetrahedron", 1, 16, 8),
 ]  # fmt: skip
 COLUMNS_OF_CELLS = (*(f"fibre_angle_{place}" for place in ("inner", "middle", "outer")), "inner_radius", "outer_radius")
-RATIOS_OF_CELLS = (8.8, 20.0, 50.0, 100.0, 300.0, 1e3, 1e4)  # lambda/mu
+RATIOS_OF_CELLS = (8.8, 100.0, 1e3, 1e4)  # lambda/mu
 
 
 def tube_rows() -> Iterator[list[str]]:
@@ -57,7 +57,7 @@ def tube_cell(scene: Scene, divisions: tuple[int, int, int]) -> str:
 
 def turning_rows() -> Iterator[list[str]]:
     """Tubes that remodel, kinematics `radial`: errors of angles and radii against a reference that shares no code."""
-    for radius, pressure in ((1.3, 1.2), (2.0, 3.0), (3.0, 4.8)):
+    for radius, pressure in ((1.3, 1.2), (3.0, 4.8)):
         exact = {ratio: reference_cells(ratio, radius, pressure) for ratio in RATIOS_OF_CELLS}
         for degree, name in product((1, 2), FORMULATIONS):
             yield [f"{radius:g}", str(degree), name, *(

@@ -32,8 +32,12 @@ def counts(records: Iterable[Record]) -> dict[str, Counter[str]]:
 
 
 def table(records: Iterable[Record]) -> str:
-    """Outcomes by family; columns that are not empty, and `wrong` in any case, which should be."""
+    """Outcomes by family, those without a blemish in one row; columns that are not empty, and `wrong` in any case."""
     rows = counts(records)
+    total = rows.pop("**all**")
+    plain = [name for name, row in rows.items() if not sum(row.values()) - row["right"]]
+    rows[f"{len(plain)} other families"] = sum(map(rows.pop, plain), Counter())
+    rows["**all**"] = total
     columns = [name for name in (*OUTCOMES, *EXTRA) if rows["**all**"][name] or name == "wrong"]
     cells = (
         [name, str(sum(row[outcome] for outcome in OUTCOMES)), *(str(row[column] or "") for column in columns)]

@@ -106,7 +106,7 @@ def draw(table: Columns, layers: Columns, tendon: Columns) -> Figure:
 def page_values(folder: Path) -> dict[str, str]:
     """What the page shows of the tables."""
     table, layers = (read_table(folder / f"{name}.csv") for name in ("consistent", "consistent-layers"))
-    found = {"caption_consistent": CAPTION[1]}
+    found: dict[str, str] = {}
     for variant in ("once", "twice"):
         # at the same time of the cells: a row of the printed method has those of the step before
         names = [(f"cube_{k:g}_{variant}", f"cube_{k:g}_paper") for k in KAPPAS]

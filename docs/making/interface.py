@@ -20,25 +20,19 @@ from typing import Any
 from mpi4py import MPI
 
 import remodel_fenicsx
-from remodel_fenicsx import Scene, cli, extend, parts
+from remodel_fenicsx import cli, extend, parts
 from docs.making.pages import DOCS, markdown
 from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, WithRegions, columns_of, columns_on_request
-from remodel_fenicsx.scene.presets import PRESETS, PROFILES
-from remodel_fenicsx.schema.tables import Table, description, sections
+from remodel_fenicsx.schema.tables import Table
 
 HEAD = """# The public interface
 
-This page is made from the code: `./with-fenicsx docs/make interface`. A test compares the
-two, so that nothing here changes unnoticed.
+This page is made from the code: `./with-fenicsx docs/make interface`. Scripts, scenes and notebooks
+may rely on what stands here; [CHANGELOG.md](../CHANGELOG.md) says when some of it changes. All else
+is private and changes without notice, also what a public object hands out and is not listed.
 
-What stands here is public: the names of three modules with their parameters, the keys of scenes,
-the columns of histories, the commands with their options, and the exit codes. Scripts, scenes and
-notebooks may rely on it; [CHANGELOG.md](../CHANGELOG.md) says when some of it changes. Everything
-else is private and changes without notice: all other modules, names with a leading underscore, and
-whatever a public object hands out that is not listed.
-
-Docstrings say what a name means, [scene.md](scene.md) what a key, [commands.md](commands.md) what a
-command, a column and an exit code.
+Public are also the keys of scenes ([scene.md](scene.md)), and the columns of histories and the exit
+codes ([commands.md](commands.md)). Docstrings say what a name means.
 """
 MODULES = {
     remodel_fenicsx: "run a scene, read what it left",
@@ -52,9 +46,7 @@ def page() -> str:
     text, seen = HEAD, dict[int, str]()
     for module, use in MODULES.items():
         text += f"\n## `{module.__name__}`: {use}\n\n```python\n{_wrapped(_module(module, seen), '        ')}\n```\n"
-    text += f"\n## Keys of a scene\n\n{_wrapped(_keys())}\n\n## Columns of a history\n\n{_wrapped(_columns())}\n"
-    text += f"\n## Commands\n\n```text\n{_wrapped(_commands(cli.parser()), '    ')}\n```\n\n## Exit codes\n\n"
-    return text + "\n".join(f"- {code}: {meaning}" for code, meaning in cli.EXIT_CODES.items()) + "\n"
+    return text + f"\n## Commands\n\n```text\n{_wrapped(_commands(cli.parser()), '    ')}\n```\n"
 
 
 def schema() -> str:
@@ -144,31 +136,6 @@ class _Default:
 
 
 # ---------------------------------------------------------------- the rest
-def _listed(what: str, names: Iterable[str]) -> str:
-    return f"- {what}: " + ", ".join(f"`{name}`" for name in names)
-
-
-def _keys() -> Iterator[str]:
-    for key, variant, table in sections(Scene):
-        what = (f"`[{key}]`" if key else "top of the file") + (f" of shape `{variant}`" if variant else "")
-        yield _listed(what, (name for name in table.model_fields if description(table, name)))
-    for shape, kind in extend.SHAPES.items():
-        yield _listed(f"`[loads]` of shape `{shape}`", kind.loads)
-    yield _listed("presets", PRESETS)
-    yield _listed("profiles", PROFILES)
-
-
-def _columns() -> Iterator[str]:
-    for number, when in enumerate(("", " on request")):
-        columns = {shape: [column.name for column in of_shape(kind)[number]] for shape, kind in extend.SHAPES.items()}
-        columns = {shape: names + list(COLUMNS_ON_REQUEST) * number for shape, names in columns.items()}
-        common = [name for name in columns["cube"] if all(name in names for names in columns.values())]
-        yield _listed("every shape" + when, common)
-        for shape, names in columns.items():
-            if own := [name for name in dict.fromkeys(names) if name not in common]:
-                yield _listed(f"shape `{shape}`{when}", own)
-
-
 def _commands(parser: argparse.ArgumentParser) -> Iterator[str]:
     (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
     yield " ".join([parser.prog, *_arguments(parser)])

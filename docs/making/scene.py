@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from docs.making.pages import filled, lines, markdown
+from docs.making.pages import filled, lines
 from remodel_fenicsx.extend import SHAPES, Dimension, markdown_reference
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES, RANDOM_CELLS
@@ -58,7 +58,7 @@ def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str
         if isinstance(value, Mapping):
             yield from flat(value, f"{before}{name}.")
         else:
-            yield f"{before}{name}", f"`{shown(value)}`"
+            yield f"{before}{name}", shown(value)
 
 
 def _presets() -> Iterator[str]:
@@ -70,9 +70,11 @@ def _presets() -> Iterator[str]:
         if number:
             yield from (f"All else is as in the preset `{next(iter(PRESETS))}`.", "")
             rows = {row: having for row, having in rows.items() if first.get(row) != having}
-        of = ("all" if having == list(shapes) else ", ".join(having) for having in rows.values())
-        cells = ([f"`{key}`", value, shape] for (key, value), shape in zip(rows, of, strict=True))
-        yield from (markdown(["key", "value", "of"], cells), "")
+        groups: dict[str, list[str]] = {"all": []}
+        for (key, value), having in rows.items():
+            groups.setdefault("all" if having == list(shapes) else ", ".join(having), []).append(f"{key} = {value}")
+        texts = ("\n".join([f"# {of}", *keys]) for of, keys in groups.items())
+        yield from ("```toml", "\n\n".join(texts), "```", "")
 
 
 def _by_key(shapes: Mapping[str, Any]) -> dict[tuple[str, str], list[str]]:

@@ -131,9 +131,8 @@ class FileBody(WithRegions, FromFile):
 
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
         description=(
-            "The mesh: a file by Gmsh (`.msh`, format 2.2 or 4.1, text) or one of VTK or meshio "
-            "(`.vtu`, `.vtk`, `.xdmf`). Its path is relative to the scene's folder. In a list, surfaces of its "
-            "triangles may follow (`.vtp`, `.stl`, `.ply`, `.obj`), faces by the names of their files."
+            "The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`, `.stl`, "
+            "`.ply`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."
         ),
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"},
     )
@@ -152,9 +151,9 @@ class FileBody(WithRegions, FromFile):
     faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
         default={},
         description=(
-            "Names of faces, each with the name or number of a face in the file, or a list of them. "
-            "`inner`, `outer`, `inlet` and `outlet` are needed where the file has other names. Further "
-            'faces are for supports and loads. A surface of its own is a face too: `{ file = "lumen.vtp" }`.'
+            "Names of faces, each with the name or number of a face in the file, or a list of them: `inner`, `outer`, "
+            "`inlet` and `outlet` where the file has other names, and more for supports and loads. A surface of its "
+            'own is a face too: `{ file = "lumen.vtp" }`.'
         ),
         json_schema_extra=_GROUPS,
     )
@@ -433,8 +432,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: None,  # a part of the supports (`support`)
-            "prescribed engineering strain of the length: the outlet moves along its own normal by this share of the "
-            "length of the body",
+            "prescribed engineering strain of the length: the outlet moves along its own normal",
             column="axial_elongation",
             above=-1.0,
             doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
@@ -444,7 +442,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         Column(
             "lumen_volume",
             "length^3",
-            "volume inside the deformed inner face, closed by flat caps at its ends; empty where it encloses none",
+            "volume inside the deformed inner face, closed by flat caps; empty where it encloses none",
             lambda m: m.lumen_volume(),
         ),
         *WalledMesh.columns,

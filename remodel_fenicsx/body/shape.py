@@ -126,7 +126,7 @@ _PROFILE_COLUMNS = tuple(
         name,
         "degrees",
         f"mean reference fibre angle near {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, or "
-        "along z in a cube or tendon; the weight is a hat function as wide as a quarter of the way",
+        "along z in a cube or tendon",
         partial(_profile, number),
         by_case=False,
     )
@@ -143,14 +143,14 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
         Column(
             f"fibre_angle_{name}",
             "degrees",
-            f"mean reference fibre angle in the region `{name}`; chains without an angle do not count",
+            f"mean reference fibre angle in the region `{name}`",
             lambda m: float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name))),
             by_case=False,
         ),
         Column(
             f"max_chain_extension_{name}",
             "",
-            f"largest r/L in the region `{name}`; 0 where the chain law has no limit",
+            f"largest r/L in the region `{name}`",
             lambda m: float(m.quadrature.maximum(m.chain_extension * m.elements_of_region(name)[:, None])),
             extreme=True,
         ),
@@ -170,7 +170,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "max_chain_extension",
             "",
-            "largest r/L of all chains, always below 1; 0 where the chain law has no limit",
+            "largest r/L of all chains, below 1; 0 where the chain law has no limit",
             lambda m: m.step.extension.max_chain_extension,
             extreme=True,
         ),
@@ -190,15 +190,13 @@ COLUMNS: dict[str, Column] = {
         Column(
             "remodeling_power",
             "stress length^3 / time",
-            "energy per time that the remodeling pass after this row releases (docs/theory.md)",
+            "energy per time that the pass after this row releases (docs/theory.md)",
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),
-        _of_work("newton_iterations", "Newton iterations of the step, with those of failed attempts"),
-        _of_work("linear_iterations", "iterations of the linear solver in the step, with those of failed attempts"),
-        _of_work(
-            "substeps", "number of solves that made up the step; 1 where it was solved in one piece, as in the paper"
-        ),
+        _of_work("newton_iterations", "Newton iterations of the step, of failed attempts too"),
+        _of_work("linear_iterations", "iterations of the linear solver, of failed attempts too"),
+        _of_work("substeps", "number of solves that made up the step"),
         Column("seconds", "s", "wall time of the step", lambda m: m.step.seconds, after_pass=True),
     )
 }
@@ -215,29 +213,28 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "pass_residual",
             "squared link length",
-            "distance of the cells from those that their own stress asks for: largest norm of A_pass - A",
+            "distance of the cells from those of their own stress: largest norm of A_pass - A",
             lambda m: m.observer.stepper.remodeling.distance(),
             after_pass=True,
         ),
         Column(
             "time_error",
             "degrees",
-            "estimated error in time, the larger of two: of chain directions (root mean square over the body) and of "
-            "lengths (relative, 100 % count as 1 radian); with `time.tolerance` it is there without being asked for",
+            "estimated error in time (docs/theory.md); with `time.tolerance` it is there without being asked for",
             lambda m: m.step.time_error,
             after_pass=True,
         ),
         Column(
             "negative_eigenvalues",
             "",
-            "number of negative eigenvalues of the tangent's symmetric part; 0 where the equilibrium is stable",
+            "negative eigenvalues of the tangent's symmetric part; 0 where the equilibrium is stable",
             lambda m: m.step.negative_eigenvalues,
             by_case=False,
         ),
         Column(
             "asleep_share",
             "",
-            "share of the volume that does not remodel: no principal value of the driver is above remodeling.threshold",
+            "share of the volume that does not remodel, below remodeling.threshold",
             lambda m: m.observer.stepper.remodeling.asleep_share(),
             by_case=False,
         ),
@@ -245,7 +242,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             Column(
                 name,
                 "",
-                f"{what} of the collagen over that at the start, volume mean; for scenes with remodeling.turnover",
+                f"{what} of the collagen over that at the start, volume mean; with remodeling.turnover",
                 partial(_turned_over, name),
                 by_case=False,
             )
@@ -268,15 +265,14 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             TURNOVER_POWER,
             "stress length^3 / time",
-            "power that turnover releases in the state of the row, at its F and without growth; for scenes with "
-            "remodeling.turnover",
+            "power that turnover releases at the F of the row, without growth",
             lambda m: m.observer.stepper.turnover.power(),
             by_case=False,
         ),
         Column(
             "processor_seconds",
             "s",
-            "processor time of the first rank in the step; other programs on the machine change it less than `seconds`",
+            "processor time of the first rank in the step",
             lambda m: m.step.processor_seconds,
             after_pass=True,
         ),
@@ -464,9 +460,8 @@ _is: Any = {  # a word of Python
         Literal["unloaded", "loaded"],
         Field(
             default="unloaded",
-            description="What the geometry describes. 'unloaded': the body without loads. 'loaded', for a tube or a "
-            "body of your own: the body under the loads at the end of their ramps; the unloaded body is found first "
-            "(docs/tissue_that_lives.md).",
+            description="What the geometry describes: the body without loads, or (a tube, a body of your own) the one "
+            "under the loads at the end of their ramps; the unloaded body is found first (docs/tissue_that_lives.md).",
         ),
     )
 }

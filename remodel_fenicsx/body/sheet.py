@@ -123,8 +123,8 @@ class Sheet(Shape):
             Column(
                 f"nominal_stress_{words}",
                 "stress",
-                f"first Piola-Kirchhoff stress P_{words * (3 - len(words))}, force over reference area, volume mean: "
-                f"along {words[0]} on the edges across {words[-1]}",
+                f"first Piola-Kirchhoff stress P_{words * (3 - len(words))}, volume mean: along {words[0]} on edges "
+                f"across {words[-1]}",
                 _nominal(*place),
             )
             for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)), ("yx", (1, 0)))

@@ -280,8 +280,7 @@ class Tube(RoundWall):
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
-            "prescribed engineering strain of the length (0.1: 10 % longer); where the length is an unknown the column "
-            "shows the strain that was found",
+            "engineering strain of the length (0.1: 10 % longer), prescribed, or found where the length is an unknown",
             column="axial_elongation",
             above=-1.0,
             reductions=("radial", "axisymmetric", "sector"),
@@ -290,8 +289,8 @@ class Tube(RoundWall):
         ),
         "axial_force": LoadKind(
             lambda shape, loading, name: loading.add_axial_force(name),
-            "force along z in the wall at the end z = `length`. As a load it is a dead force on the ends, which stay "
-            "parallel; the length is then an unknown, and the pressure on the caps of closed ends acts beside it",
+            "force along z in the wall at the end z = `length`. As a load it is a dead force on the ends, beside the "
+            "pressure on caps; the length is then an unknown",
             FORCE,
             reductions=("radial", "axisymmetric", "sector"),
             frees_length=True,
@@ -312,13 +311,13 @@ class Tube(RoundWall):
         Column(
             "reduced_axial_force",
             "force",
-            "what a testing machine measures: `axial_force` less the pressure on the lumen at that end, p pi r_i^2",
+            "what a testing machine measures: `axial_force` less p pi r_i^2 at that end",
             partial(_of_the_end, "reduced"),
         ),
         Column(
             "opening_angle",
             "degrees",
-            "angle by which the unloaded tube would open if it were cut along its length now: the missing sector",
+            "the sector by which the unloaded tube would open if it were cut along its length now",
             _opening_angle,
             by_case=False,
             of_one_tissue=True,
@@ -328,13 +327,13 @@ class Tube(RoundWall):
         Column(
             "mean_hoop_stress",
             "stress",
-            "Cauchy stress around the wall, mean over the deformed thickness: by the law of Laplace p r_i / h",
+            "Cauchy stress around the wall, mean over the deformed thickness: p r_i / h",
             _mean_hoop_stress,
         ),
         Column(
             "wall_thickness",
             "length",
-            "mean distance of the deformed outer face from the axis, less that of the inner face",
+            "outer less inner radius",
             lambda m: _mean_radius("outer")(m) - _mean_radius("inner")(m),
         ),
         *RoundWall.columns_on_request,

@@ -159,8 +159,8 @@ ANGLE_IN = "mean reference fibre angle (0 circumferential, 90 axial) of the chai
 
 
 CONFIGURATIONS = {
-    "unloaded": "measured in the unloaded body; it differs where the unloaded body has residual stress",
-    "deformed": "measured in the deformed body, in local axes that move with it",
+    "unloaded": "in the unloaded body; it differs where that has residual stress",
+    "deformed": "in the deformed body, in local axes that move with it",
 }
 """Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
 
@@ -229,11 +229,11 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ..
         Column(
             f"{name}_stress_{where}",
             "stress",
-            f"mean Cauchy stress {direction} the wall, in local axes that move with it, in the elements {words}",
+            f"mean Cauchy stress {direction} the deformed wall, where `fibre_angle_{where}` is measured",
             partial(_stress, mean, component),
         )
         for name, (direction, component) in STRESSES.items()
-        for where, (words, mean) in means.items()
+        for where, (_, mean) in means.items()
     )
 
 
@@ -261,7 +261,7 @@ class Walled(Shape):
         Column(
             "radial_share",
             "",
-            "share of the chains that points out of the wall, the volume mean of A_rr / tr A: 0 none, 1 all",
+            "share of the chains that points out of the wall, the volume mean of A_rr / tr A",
             lambda m: m.quadrature.mean_of_known(m.radial_share),
             by_case=False,
         ),

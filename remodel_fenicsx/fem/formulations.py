@@ -197,12 +197,9 @@ tetrahedra lost 0.6 degrees at 300; with U at one point they have 0.3 % of error
 
 FORMULATIONS: dict[str, Formulation] = {
     # docs/what_may_go_wrong.md, Elements that lock, has the measurements behind these numbers
-    "displacement": AtAllPoints(
-        "at all quadrature points; right where the bulk is soft or elements are small. A run whose elements lock warns"
-    ),
+    "displacement": AtAllPoints("at all quadrature points; a run whose elements lock warns"),
     NOT_LOCKING: Selective(
-        "the volumetric part of the matrix at fewer points, in linear hexahedra at the centroid. Hexahedra, and "
-        "tetrahedra of degree 2, do not lock with it",
+        "the volumetric part of the matrix at fewer points; not for tetrahedra of degree 1",
         {(kind, degree): degree for kind in ("hexahedron", "quadrilateral", "interval") for degree in (1, 2)}
         | {("tetrahedron", 2): 1},
         STIFF_BULK,

@@ -69,7 +69,7 @@ SOLVER_METHODS = {
             "pc_factor_mat_solver_type": "mumps",
             "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
         },
-        "Newton's method; MUMPS factorises each system. Runs on the same number of ranks are equal to the last digit",
+        "Newton's method; MUMPS factorises each system, and runs repeat to the last digit",
         on_several_ranks={
             "pc_type": "telescope",
             "telescope_ksp_type": "preonly",
@@ -79,7 +79,7 @@ SOLVER_METHODS = {
     ),
     LAGGED: SolverMethod(
         NEWTON | {"ksp_type": "preonly"},
-        "few tangents are factorised, and quasi-Newton steps (L-BFGS) correct for it",
+        "few factorisations, and quasi-Newton steps (L-BFGS)",
         linear="remodel_fenicsx.solver.linear.Lagged",
     ),
     # GMRES, because tangents of random cells are not always definite; levels cost as much as 20 of its iterations, and
@@ -99,7 +99,7 @@ SOLVER_METHODS = {
             "mg_levels_ksp_type": "chebyshev",
             "mg_levels_pc_type": "sor",
         },
-        "Newton's method with GMRES and algebraic multigrid (GAMG); levels are kept for some iterations",
+        "Newton's method with GMRES and algebraic multigrid (GAMG)",
         linear="remodel_fenicsx.solver.linear.Multigrid",
     ),
 }

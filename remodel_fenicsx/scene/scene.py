@@ -196,9 +196,7 @@ class Scene(Table):
     preset: Annotated[str | None, OneOf(presets.PRESETS)] = None
     """A published model whose values hold where the scene says nothing, table by table (see the presets below)."""
     profile: Annotated[str | None, OneOf(presets.PROFILES)] = None
-    """Chooses speed or accuracy: settings of mesh, kinematics and steps (docs/speed_and_accuracy.md has their errors
-    and costs). They replace those of the preset, and the scene's own keys replace them. `--profile` on the command line
-    replaces all of these."""
+    """Speed or accuracy: settings of mesh, kinematics and steps (docs/speed_and_accuracy.md)."""
     geometry: Annotated[SerializeAsAny[Shape], VariantOf(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()

@@ -92,8 +92,8 @@ class Mesh(Table):
     formulation: Annotated[str, OneOf(FORMULATIONS, (AUTO,))] = Field(
         default=AUTO,
         description=f"How elements treat the change of volume. 'auto' takes {NOT_LOCKING!r} where lambda/mu is above "
-        f"{STIFF_BULK['hexahedron']:g} (tetrahedra of degree 2: {STIFF_BULK['tetrahedron']:g}) and nothing of the "
-        f"scene needs 'displacement'; the scene as run has its name. {meanings(FORMULATIONS)}.",
+        f"{STIFF_BULK['hexahedron']:g} (tetrahedra of degree 2: {STIFF_BULK['tetrahedron']:g}), unless something else "
+        f"needs 'displacement'. {meanings(FORMULATIONS)} (docs/what_may_go_wrong.md).",
     )
 
     @model_validator(mode="after")
@@ -118,8 +118,8 @@ class Model(Table):
 
     kinematics: Annotated[str, OneOf(KINEMATICS, (AUTO,))] = Field(
         default=AUTO,
-        description="'auto' takes the cheapest one that is exact for the scene; the scene as run has its name. "
-        f"{meanings(KINEMATICS)}. One that would be wrong is refused with the reason (docs/kinematics.md).",
+        description="'auto' takes the cheapest one that is exact for the scene. "
+        f"{meanings(KINEMATICS)} (docs/kinematics.md).",
     )
 
     def check_with(self, scene: Scene, key: str) -> None:
@@ -138,12 +138,11 @@ class Support(Table):
 
     kind: Literal["guided", "sliding", "held", "elastic", "free"] = "guided"
     """'guided': the face stays in its plane and its circle stays centred, but may grow. 'sliding': the face stays in
-    its plane. 'held': the face does not move, except along N as loads.elongation says. 'elastic': springs of fixed
-    direction hold the face, like the tissue around a vessel. 'free': nothing holds the face."""
+    its plane. 'held': the face moves along N alone, as loads.elongation says. 'elastic': springs of fixed direction.
+    'free': nothing holds the face (docs/my_own_vessel.md, Supports)."""
     stiffness: Annotated[float | None, FOUNDATION] = Field(default=None, gt=0)
     """Force per area and displacement, in stress_unit over the scene's unit of length. 'elastic' needs it. For 'guided'
-    and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over the wall's thickness: a plane moves by a thousandth
-    of the wall's own compression."""
+    and 'sliding' the default is 1000 (lame_lambda + 2 lame_mu) over the wall's thickness."""
     tangential: float = Field(default=1.0, ge=0, le=1)
     """For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown may twist. With 0 a
     tube may be solved on one radius, which cannot twist."""
@@ -231,27 +230,23 @@ class Material(Table):
     """Persistence length A_p of a chain, in link lengths: its bending stiffness over k theta."""
     initial_stiffness: Annotated[float | None, STRESS] = Field(default=None, gt=0)
     """In place of chain_density: the slope of a measured curve at stretch 1, nominal stress of the network over stretch
-    along aligned chains, in stress_unit. It is c r0^2 (d(g r)/dr + g) at r0. The scene as run has chain_density
-    (docs/which_numbers.md)."""
+    along aligned chains, in stress_unit (docs/which_numbers.md)."""
     locking_stretch: float | None = Field(default=None, gt=1)
-    """In place of contour_length: the stretch L / r0 along aligned chains at which they lock. The scene as run has
-    contour_length (docs/which_numbers.md)."""
+    """In place of contour_length: the stretch L / r0 at which aligned chains lock (docs/which_numbers.md)."""
     temperature: Annotated[float, TEMPERATURE] = Field(default=310.0, gt=0)
     """Absolute temperature theta, in K."""
     energy_factor: Annotated[int, OneOf((1, 4))] = 1
-    """Factor omega of the chain energy. 1 gives the stress as printed (eq. 7) and reproduces Fig. 6. 4 gives the energy
-    as printed (eq. 4b)."""
+    """Factor omega of the chain energy. 1: the stress as printed (eq. 7). 4: the energy as printed (eq. 4b)."""
     matrix: Annotated[str, OneOf(MATRICES)] = "neo-hookean"
     """Energy of the matrix."""
     chain: Annotated[str, OneOf(CHAINS)] = "wormlike"
     """Force law of a single chain."""
     repulsion: Annotated[str, OneOf(REPULSIONS)] = "axes"
-    """Form of the repulsive energy that makes the reference state free of stress. 'axes' is the paper's, in the
-    stretches along the three cell axes. 'log' depends on the structure tensor alone (A : ln C), and suits the law
-    'tensor'. 'length' depends on the length of the chains alone. Default with the law 'tensor': 'log'."""
+    """Repulsive energy, which makes the reference state free of stress. 'axes': the paper's, in the stretches along the
+    cell axes. 'log': of the structure tensor alone (A : ln C); the default with the law 'tensor'. 'length': of the
+    length of the chains alone."""
     stress_unit: Literal["Pa", "kPa", "MPa"] = "Pa"
-    """Unit of every stress, pressure and Lame constant of the scene. Forces are in this unit times the unit of length
-    squared."""
+    """Unit of every stress of the scene. Forces are in this unit times the unit of length squared."""
 
     @property
     def tells_volume_apart(self) -> bool:
@@ -369,9 +364,8 @@ class Natural(Table):
     """The configuration in which the tissue is free of stress, if that is not the mesh (docs/tissue_that_lives.md)."""
 
     opening_angle: float = Field(default=0.0, ge=0, le=180)
-    """For a tube: how far a cut ring opens, the angle of the missing sector in degrees. Fung's opening angle, between
-    the lines from the middle of the inner arc to its ends, is half of it. 0: the tissue of the mesh is free of
-    stress."""
+    """For a tube: how far a cut ring opens, the angle of the missing sector in degrees. Fung's opening angle is half of
+    it. 0: the tissue of the mesh is free of stress."""
     layers: Annotated[tuple[NaturalLayer, ...], IN_A_LIST] = Field(
         default=(), json_schema_extra={"allowed": "a list of tables, each [[natural.layers]]"}
     )
@@ -380,8 +374,7 @@ class Natural(Table):
 
     cells: Literal["as-given", "equilibrium"] = AS_GIVEN
     """Cells of a tube whose geometry is the loaded one (geometry.is). 'as-given': those of [cells]. 'equilibrium':
-    those that remodeling comes to under these loads, as in a vessel that was scanned; it needs time.end =
-    'equilibrium'."""
+    those that remodeling comes to under these loads; it needs time.end = 'equilibrium'."""
 
     fibres: bool | None = Field(default=None, json_schema_extra={"allowed": "true or false"})
     """Whether the run begins with what the file of cells.fibres has beside the cells, as `export` writes it:
@@ -478,13 +471,13 @@ class Cells(Table):
         json_schema_extra={"allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]"},
     )
     """Cell dimensions l_I at t = 0, with |l| = end_to_end_length. 'random': one draw per element, uniform on the
-    positive octant of the sphere. 'isotropic': three equal ones. 'aligned': all of it along aligned_axis. 'fibres':
-    those of the file cells.fibres; naming the file is enough. [l1, l2, l3]: these, in link lengths."""
+    positive octant of the sphere. 'isotropic': three equal ones. 'aligned': all along aligned_axis. 'fibres': those of
+    the file cells.fibres. [l1, l2, l3]: these, in link lengths."""
     fibres: str | None = Field(
         default=None, min_length=1, json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"}
     )
-    """File of measured fibres (.vtu, .xdmf or .csv, relative to the scene). It gives axes and dimensions of the cells
-    at t = 0 (docs/my_own_vessel.md, Measured fibres in). The run keeps a copy in its folder."""
+    """File of measured fibres, relative to the scene: axes and dimensions of the cells at t = 0 (docs/my_own_vessel.md,
+    Measured fibres in)."""
     fibres_sha256: str | None = Field(
         default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
     )
@@ -494,16 +487,15 @@ class Cells(Table):
     z axis. 'local': the same, found on a mesh (docs/my_own_vessel.md). Where nothing names them, a tube has
     'cylindrical'."""
     aligned_axis: Annotated[int, OneOf((1, 2, 3))] = 3
-    """Number of the axis that 'aligned' cells lie along. With global axes 3 is z, the load axis of cube and tendon.
-    With cylindrical axes 1 is circumferential, 2 axial and 3 radial."""
+    """Number of the axis that 'aligned' cells lie along: x, y, z, or circumferential, axial, radial."""
     seed: int = Field(default=1, ge=0)
     """Seed of the random cells. The same seed and mesh give the same cells on any number of ranks."""
     antithetic: bool = False
-    """Random cells only. Seeds 1 to 3, 4 to 6 and so on have the same draws, with l_1, l_2 and l_3 in turn (antithetic
-    variates). Means over whole threes scatter less."""
+    """Random cells: seeds 1 to 3, 4 to 6 and so on have the same draws, with l_1, l_2 and l_3 in turn. Means over whole
+    threes scatter less."""
     end_to_end_length: float = Field(default=1.0, gt=0)
-    """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It is a material constant:
-    the repulsive energy keeps this value while the cells remodel."""
+    """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It stays in the repulsive
+    energy while the cells remodel."""
 
     @model_validator(mode="after")
     def _length_of_the_chain(self) -> Cells:
@@ -644,24 +636,24 @@ COUPLINGS = {
         takes_turnover=True,
     ),
     "relaxed": CouplingKind(
-        "as 'staggered', but only the share relaxation_factor of each change is made; one half is stable for every "
-        "driver and frame except under weak loads, while 'staggered' over-corrects with 'pk2' and 'finger'",
+        "as 'staggered', but only the share relaxation_factor of each change is made, for drivers with which "
+        "'staggered' over-corrects",
         "remodel_fenicsx.evolution.coupling:Staggered",
         makes_a_share=True,
         takes_cases=True,
         takes_turnover=True,
     ),
     "extrapolated": CouplingKind(
-        "first remodel towards the stress of the middle of the step, extrapolated from the two steps before, then "
-        "solve; of second order, for the law 'tensor'",
+        "first remodel towards the stress expected at the middle of the step, then solve; of second order, for the "
+        "law 'tensor'",
         "remodel_fenicsx.evolution.coupling:Extrapolated",
         needs_a_target=True,
         takes_cases=True,
         takes_turnover=True,
     ),
     "implicit": CouplingKind(
-        "find cells and equilibrium of the same step together, by Newton's method; for the law 'tensor' (with a "
-        "repulsion that does not depend on axes), and for the laws of the paper with cells that are not random",
+        "find cells and equilibrium of the same step together; for the law 'tensor', and for the laws of the paper "
+        "with cells that are not random",
         "remodel_fenicsx.evolution.implicit:Implicit",
         takes_turnover=True,
         solves_cells=True,
@@ -752,24 +744,22 @@ class Remodeling(Table):
 
     driver: Annotated[str, OneOf(DRIVERS)] = "cauchy"
     """Tensor whose positive eigenvalues the cells follow. 'cauchy': the Cauchy stress. 'pk2': the second
-    Piola-Kirchhoff stress. 'finger': the Finger tensor b; it remodels even a body without load, and l_3 does not
-    vanish."""
+    Piola-Kirchhoff stress. 'finger': the Finger tensor b."""
     law: Annotated[str, OneOf(LAWS)] = "explicit"
-    """How the cells change in time. 'explicit' is eq. (11), in absolute time. 'rate' integrates eq. (10). 'relaxation'
-    is dl/dt = kappa (r0 e - l), right for changing loads. 'rotation' (Remark 5) turns the axis of the largest dimension
-    and keeps the dimensions. 'tensor' is 'relaxation' for the structure tensor as a whole, without ranks and axes.
-    'none': cells stay. Default without a preset: 'tensor'."""
+    """How the cells change in time. 'explicit': eq. (11), in absolute time. 'rate': eq. (10). 'relaxation': dl/dt =
+    kappa (r0 e - l), right for changing loads. 'tensor': 'relaxation' of the structure tensor, without ranks and axes;
+    the default without a preset. 'rotation' (Remark 5): the dimensions stay. 'none': cells stay."""
     frame: Annotated[str, OneOf(FRAMES)] = "material"
     """Axes of the remodeled cells, for the drivers 'cauchy' and 'finger'. 'material': the fibres that the deformation
     carries onto the principal directions (objective). 'spatial': the principal directions themselves, as printed."""
     pairing: Annotated[str, OneOf(PAIRINGS)] = "sorted"
     """Which cell dimension follows which principal value. 'sorted': by rank, as printed; where two values cross, the
-    cell turns by 90 degrees at once. 'continuous': by axis; each principal direction continues the axis that it
-    overlaps most. The law 'rotation' does not use it."""
+    cell turns by 90 degrees at once. 'continuous': each principal direction continues the axis that it overlaps
+    most."""
     coupling: Annotated[str, OneOf(COUPLINGS)] = Field(
         default="staggered",
-        description=f"In which order a step solves and remodels. {meanings(COUPLINGS)}. Where neither scene nor preset "
-        "names one, the law 'tensor' has 'extrapolated'.",
+        description=f"In which order a step solves and remodels. {meanings(COUPLINGS)}. The default with the law "
+        "'tensor' is 'extrapolated' (docs/laws_and_couplings.md).",
     )
     relaxation_factor: float = Field(default=0.5, gt=0, le=1)
     """For the coupling 'relaxed': the share theta of a pass's change of the structure tensor that is made. With 1 it is
@@ -777,13 +767,10 @@ class Remodeling(Table):
     kappa: float = Field(default=0.025, ge=0)
     """Speed of remodeling, in 1/time. A difference fades like exp(-kappa t)."""
     half_life: float | None = Field(default=None, gt=0)
-    """In place of kappa: the time after which half of a difference is left, ln 2 / kappa. The scene as run has kappa
-    (docs/which_numbers.md)."""
+    """In place of kappa: the time after which half of a difference is left, ln 2 / kappa."""
     threshold: Annotated[float, STRESS] = Field(default=0.0, ge=0)
-    """Lazy zone: the principal stress s0 up to which a point does not remodel. Above it kappa has the factor max(0, 1 -
-    s0/s), where s is the largest principal stress. For the law 'tensor' and drivers that are stresses
-    (docs/laws_and_couplings.md).
-    """
+    """Principal stress s0 up to which a point does not remodel; above it kappa has the factor 1 - s0/s. For the law
+    'tensor' and drivers that are stresses (docs/laws_and_couplings.md)."""
     exponent: float = Field(default=2.0, gt=0, le=16)
     """Exponent n of the target (D+)^n over its trace: 2 is the paper's, 1 that of netting analysis. For the law
     'tensor' (docs/laws_and_couplings.md)."""
@@ -1042,20 +1029,14 @@ class Load(Table):
     """A load by name: `force` of cube and tendon, `pressure` and `elongation` of a tube. One that is left out is zero.
 
     A body of your own (shapes `'mesh'`, `'solid'`) may have further loads under names of your choice, each on one of
-    its faces.
-
-    `force` is the total dead force along z on the top. `pressure` acts on the deformed inner face. `elongation` is the
-    prescribed engineering strain of the length (0.1: 10 % longer). A tube may have `axial_force` in place of
-    `elongation`; its length is then an unknown.
+    its faces. docs/scene.md lists the loads of each shape.
     """
 
     value: float
-    """Full value, at factor 1. A force is in stress_unit times length squared, a pressure in stress_unit. An elongation
-    has no unit and is above -1."""
+    """Full value, at factor 1. An elongation has no unit and is above -1."""
     ramp: Ramp = Field(json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"})
-    """Factor on the value over time: pairs [time, factor] with increasing times. The factor is linear between pairs,
-    and constant before the first and after the last. Times up to time.end must be multiples of time.step; with
-    time.tolerance a step ends at each."""
+    """Factor on the value over time, linear between pairs, constant before the first and after the last. Times up to
+    time.end must be multiples of time.step; with time.tolerance a step ends at each."""
 
     kind: Literal["pressure", "displacement"] | None = None
     """For a further load of a body of your own: 'pressure' acts against the outward normal of the deformed face.
@@ -1171,17 +1152,16 @@ class Time(Table):
     end: Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_End))] = Field(
         json_schema_extra={"allowed": "a finite number greater than 0, or 'equilibrium'"}
     )
-    """Last time, a whole number of steps; with a tolerance any time. 'equilibrium' goes at once to the state that
-    remodeling comes to under the loads at the end of their ramps (docs/theory.md, Equilibrium at once)."""
+    """Last time, a whole number of steps; with a tolerance any time. 'equilibrium': the state that remodeling comes to
+    under the loads at the end of their ramps (docs/theory.md, Equilibrium at once)."""
     step: float = Field(default=1.0, gt=0)
     """Time between two remodeling passes. With a tolerance it is the first step."""
     tolerance: float | None = Field(
         default=None, gt=0, json_schema_extra={"allowed": "a number greater than 0, in degrees"}
     )
-    """Lets the program choose the steps so that the estimated error in time stays below this angle, in degrees: that of
-    chain directions (root mean square over the body), and that of lengths (relative; 1 degree stands for 1.7 %). A step
-    ends at each time of a ramp and of output.times. With end = 'equilibrium' the default is 3 degrees, or 0.5 where a
-    load falls."""
+    """Steps are chosen so that the estimated error in time stays below this angle, in degrees: that of directions, and
+    that of lengths (1 degree stands for 1.7 %; docs/theory.md, Error-controlled steps). With end = 'equilibrium'
+    the default is 3 degrees, or 0.5 where a load falls."""
 
     @model_validator(mode="after")
     def _whole_number_of_steps(self) -> Time:
@@ -1301,18 +1281,16 @@ class Solver(Table):
     """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' one
     increment further, as large as the last one at the same speed. The solutions are the same to the tolerance."""
     absolute_tolerance: Annotated[float, FORCE] = Field(default=0.0, ge=0)
-    """A step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|, where R has the
-    out-of-balance nodal forces. It is a force, in the units of the scene."""
+    """A force: a step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|."""
     relative_tolerance: float = Field(default=1e-10, ge=0, lt=1)
-    """Relative to the norm of the internal nodal forces; see absolute_tolerance."""
+    """Relative to the internal nodal forces; see absolute_tolerance."""
     maximum_iterations: int = Field(default=25, ge=1)
     """Newton iterations after which a step counts as failed."""
     maximum_halvings: int = Field(default=12, ge=0)
     """How often a failed step is halved before the run ends with an error."""
     unstable: Literal["warn", "stop"] = "warn"
-    """What to do at an equilibrium that the body would leave: the tangent has more negative eigenvalues than before.
-    'warn': say where, and go on. 'stop': look in every step, and end the run after the last stable one (exit code
-    3)."""
+    """What to do at an equilibrium that the body would leave. 'warn': say where, and go on. 'stop': look in every step,
+    and end the run after the last stable one (exit code 3)."""
     petsc_options: Annotated[dict[str, str | bool | int | float], AfterValidator(_are_options)] = Field(
         default_factory=dict,
         json_schema_extra={"allowed": "a table with a string, a finite number, true or false for each option"},
@@ -1369,8 +1347,8 @@ class Output(Table):
     columns: Annotated[tuple[str, ...], IN_A_LIST, AfterValidator(lambda names: tuple(dict.fromkeys(names)))] = Field(
         default=(), json_schema_extra={"allowed": "a list of names of columns"}
     )
-    """Columns of the history. Those that are there on request only (docs/commands.md) are added. Where any others are
-    named, only those are measured, with time and loads."""
+    """Columns of the history (docs/commands.md). Those on request are added. Where any others are named, only those are
+    measured, with time and loads."""
     every: int = Field(default=1, ge=1)
     """Write the fields of every n-th step, and of the last one."""
     times: Annotated[tuple[Annotated[float, Field(gt=0)], ...], IN_A_LIST, AfterValidator(_increasing)] = Field(
@@ -1381,8 +1359,8 @@ class Output(Table):
     report: bool = True
     """Make a page of the run for a browser, report.html, at its end (docs/report.md)."""
     checkpoint: int | None = Field(default=None, ge=0)
-    """Number of steps between two checkpoints, from which a run can be resumed; 0 means only at the end. Without it at
-    most 10 minutes are lost, and checkpoints cost less than 5 % of the run. There is always one at the end."""
+    """Number of steps between two checkpoints; 0 means only at the end. Without it at most 10 minutes are lost, and
+    checkpoints cost less than 5 % of the run."""
 
     def check_with(self, scene: Scene, key: str) -> None:
         """Times, fields and columns that the run will have."""

@@ -532,11 +532,10 @@ def _section(key: str, variant: str, table: type[BaseModel], told: dict[str, str
     """`told`: rows of other variants of the table, with the variant; they are named only."""
     name = f"[[{key[:-2]}]]" if key.endswith("[]") else f"[{key}]"
     title = f"## `{name}`" + (f" of shape `{variant!r}`" if variant else "") if key else "## Top of the file"
-    texts = {name: text for name in table.model_fields if (text := description(table, name))}
+    fields = {name: field for name, field in table.model_fields.items() if choices(field) != [variant]}  # in the title
+    texts = {name: text for name in fields if (text := description(table, name))}
     rows = {
-        name: " | ".join(
-            [f"| `{name}`", _default(table.model_fields[name]), _cell(allowed(table.model_fields[name])), _cell(text)]
-        )
+        name: " | ".join([f"| `{name}`", _default(fields[name]), _allowed_in_words(fields[name]), _cell(text)])
         for name, text in texts.items()
     }
     elsewhere: dict[str, list[str]] = {}
@@ -560,9 +559,15 @@ def paragraphs(text: str) -> list[str]:
     return "\n\n".join(map("\n".join, filled)).split("\n")
 
 
+def _allowed_in_words(field: FieldInfo) -> str:
+    """What a field allows, without what stands once above all tables."""
+    words = re.sub(r"^(must be|allowed is|allowed are) ", "", allowed(field))
+    return _cell(words.replace("a finite number", "a number").replace("greater than", "above"))
+
+
 def _cell(text: str) -> str:
     """Text for a cell of a Markdown table, where a bar would end the cell."""
-    return re.sub(r"^(must be|allowed is|allowed are) ", "", text).replace("|", r"\|")
+    return text.replace("|", r"\|")
 
 
 def _default(field: FieldInfo) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -117,6 +118,13 @@ def test_commands_that_pages_show_are_commands(capsys: pytest.CaptureFixture[str
                     assert not end.code, f"{path.name}: {line}: {capsys.readouterr().err}"
                 found += 1
     assert found > 50
+
+
+def test_the_docs_keep_within_their_ceilings() -> None:
+    """Of pages and words (tests/house/size)."""
+    size = runpy.run_path(str(ROOT / "tests" / "house" / "size"))
+    sizes, _ = size["measured"]()
+    assert all(sizes[name] <= size["CEILINGS"][name] for name in ("docs pages", "docs words")), sizes
 
 
 def test_a_name_that_the_package_does_not_have_is_refused() -> None:

@@ -1,0 +1,40 @@
+"""Works that pages name are in their bibliography, works that the paper cites in its own, and the other way round."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+MONTHS = ("January February March April May June July August September October November December").split()
+
+
+def in_one_form(text: str) -> str:
+    """Names and years as `A, B and C 2006`, whatever stands around them."""
+    return re.sub(r"\s+", " ", text.replace("(", "").replace(", 1", " 1").replace(", 2", " 2"))
+
+
+def test_every_work_that_a_page_names_is_in_the_bibliography_and_the_other_way_round() -> None:
+    pages = [ROOT / "README.md", *(page for page in (ROOT / "docs").glob("*.md") if page.stem != "bibliography")]
+    text = in_one_form(" ".join(page.read_text(encoding="utf-8") for page in pages))
+    entries = (ROOT / "docs" / "bibliography.md").read_text(encoding="utf-8")
+    keys = [in_one_form(key) for key in re.findall(r"^- \*\*(.*)\.\*\*", entries, re.MULTILINE)]
+    named = re.findall(r"\b(([A-Z][\w-]+)(?: et al\.)? (?:18|19|20)\d\d)\b(?![.-]?\d)", text)
+    wanted = {work for work, name in named if name not in MONTHS}
+    assert len(keys) > 15 and len(set(keys)) == len(keys)
+    assert not {work for work in wanted if not any(key.endswith(work) for key in keys)}
+    assert not [key for key in keys if key.casefold() not in text.casefold()]
+
+
+def test_the_paper_and_its_bibliography_name_the_same_works_and_its_figures_are_there() -> None:
+    """As the Journal of Open Source Software asks for them."""
+    paper = ROOT / "paper" / "paper.md"
+    _, head, text = paper.read_text(encoding="utf-8").split("---\n", 2)
+    works = (paper.parent / "paper.bib").read_text(encoding="utf-8")
+    assert set(re.findall(r"@(\w+)", text)) == set(re.findall(r"^@\w+\{(\w+),", works, re.MULTILINE))
+    for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text):
+        assert (paper.parent / picture).is_file(), picture
+    assert all(
+        f"\n{key}:" in f"\n{head}" for key in ("title", "tags", "authors", "affiliations", "date", "bibliography")
+    )
+    assert all(f"\n# {title}" in text for title in ("Summary", "Statement of need", "State of the field", "References"))
