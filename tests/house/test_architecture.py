@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import pkgutil
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
