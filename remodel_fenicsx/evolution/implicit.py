@@ -27,7 +27,7 @@ from remodel_fenicsx.model.tensors import det
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
-from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.solver.newton import Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.state import State, at_points
 
 
@@ -41,6 +41,7 @@ Flags = NDArray[np.bool_]
 
 BEFORE_REFUSAL = 5  # Newton iterations after which states are refused where some point has no cells
 PASSES = 8  # with frozen cells, before a second try
+ROOM_PASSES, ROOM_ACCURACY = 30, 1e-8  # a tenth to a thirtieth of the change of J_g is left by each; of J_g
 SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
 
 
@@ -53,6 +54,7 @@ class AnsweringCells:
         self.stress = self.quadrature.function("answering_stress", (3, 3))
         self.tangent = self.quadrature.function("answering_tangent", (9, 9))
         self.frozen: UnitCell | None = None
+        self._growth = None if remodeling.turnover is None else remodeling.turnover.growth
         self._kernels = tensor_kernels(state.comm) if remodeling.law.target is not None else None
         self._points: condensed.CondensedPoints
         self._found: condensed.LocalSolution
@@ -93,6 +95,26 @@ class AnsweringCells:
         self.update()
         cells = self._points.unit_cells(self._points.passed(self._found))
         self.freeze(relaxed(self.frozen, cells, factor))
+
+    @property
+    def room(self) -> Array | None:
+        """J_g at all points, where tissue grows."""
+        return None if self._growth is None else self._growth.ratio
+
+    @room.setter
+    def room(self, ratio: Array | None) -> None:
+        if self._growth is not None and ratio is not None:
+            self._growth.set(ratio)
+
+    def make_room(self) -> float:
+        """Take J_g from the content of the last update: by how much it changes, over itself."""
+        if self._growth is None:
+            return 0.0
+        self.update()
+        assert self.turnover is not None
+        before = self._growth.ratio
+        self._growth.follow(np.exp(self.turnover[0]).reshape(before.shape))
+        return self.quadrature.maximum(np.abs(self._growth.ratio / before - 1.0))
 
     def accept(self) -> None:
         """The present state is a solved one."""
@@ -285,14 +307,23 @@ class AnsweringNewton(GuardedNewton):
 
     def _solved(self, origin: Array | None = None) -> Solution:
         self.answering.release()
-        start = self.unknown.x.array.copy()
-        solution = super().solve(origin)
-        if not self.answering.complete():
-            extension = self.equilibrium.extension()
-            self.unknown.x.array[:] = start
-            iterations = solution.newton_iterations, solution.linear_iterations
-            text = "points without cells that fit their own stress"
-            raise SolveFailure(text, *iterations, extension, tangents=solution.tangents)
+        start, room, spent = self.unknown.x.array.copy(), self.answering.room, Counted()
+        try:
+            for _ in range(ROOM_PASSES):  # the points of an element share it: no function of one point's deformation
+                solution = super().solve(origin)
+                solution.count(spent)
+                spent, origin = solution, None
+                if self.answering.make_room() <= ROOM_ACCURACY:
+                    break
+            else:
+                raise SolveFailure("what is made does not find its room", 0, 0, self.equilibrium.extension())
+            if not self.answering.complete():
+                text = "points without cells that fit their own stress"
+                raise SolveFailure(text, 0, 0, self.equilibrium.extension())
+        except SolveFailure as failure:
+            failure.count(spent)
+            self.unknown.x.array[:], self.answering.room = start, room
+            raise
         self.answering.accept()
         return solution
 

@@ -68,7 +68,7 @@ class Growth:
         """Content and J_g of an earlier run: m_ref is such that they belong together."""
         volume = self.settings.volume
         self._reference[:] = content * volume / (ratio - 1.0 + volume)
-        self._set(ratio)
+        self.set(ratio)
 
     def of_content(self, content: Array) -> Array:
         """J_g at every point by itself, as the content has it; of all points in one row, or (elements, points)."""
@@ -85,9 +85,10 @@ class Growth:
         if (least := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
             text = f"after time {self.state.time:g} less than {100 * LEAST_VOLUME:g} % of the tissue's volume is left"
             raise StepFailure(self.state.time, f"{text}: J_g = {least:.3g}", GONE)
-        self._set(ratio)
+        self.set(ratio)
 
-    def _set(self, ratio: Array) -> None:
+    def set(self, ratio: Array) -> None:
+        """Other J_g."""
         self._gradient[:] = self._initial - (1.0 - 1.0 / ratio)[..., None, None] * self._across
 
 

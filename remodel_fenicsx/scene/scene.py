@@ -491,11 +491,11 @@ class Scene(Table):
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
         if chosen or COUPLINGS[self.remodeling.coupling].solves_cells or step <= (turnover.time or math.inf):
             return [*found]
-        remedy = " or time.tolerance" if turnover.grows else ", time.tolerance, or remodeling.coupling = 'implicit'"
         return [
             *found,
             f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
-            f"length overshoot in each step; set a shorter time.step{remedy}",
+            "length overshoot in each step; set a shorter time.step, time.tolerance, or remodeling.coupling = "
+            "'implicit'",
         ]
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:

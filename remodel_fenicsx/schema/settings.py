@@ -619,8 +619,6 @@ def missing_for_steps_of_cells(scene: Scene) -> str | None:
         return "chains: material.chain_density above 0"
     if scene.cases[1:]:
         return "a scene without [[cases]]: it finds the cells for the stress of one load case"
-    if remodeling.turnover.grows:
-        return "remodeling.turnover.volume = 0: room is shared by the points of an element"
     if remodeling.has_set_point:
         return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
     parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
@@ -830,9 +828,6 @@ class Remodeling(Table):
         if self.turnover.is_on and not coupling.takes_turnover:
             able = named(COUPLINGS, lambda kind: kind.takes_turnover)
             raise fault(f"with remodeling.turnover must be one of: {able}", "coupling", self.coupling)
-        if self.turnover.grows and coupling.solves_cells:
-            rule = f"must be 0 with remodeling.coupling = {self.coupling!r}: room is shared by the points of an element"
-            raise fault(rule, "turnover.volume", self.turnover.volume)
         if coupling.needs_a_target and law.target is None:
             rule = f"needs a remodeling.law with a target that can be extrapolated: {_laws_with_a_target()}"
             raise fault(rule, "coupling", self.coupling)

@@ -168,11 +168,13 @@ def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, f
     np.testing.assert_allclose(np.log2(found["implicit", 4.0][1] / found["implicit", 2.0][1]), 1.0, atol=0.1)
 
 
-def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces() -> None:
-    """In the middle of growth."""
-    with made(wall(48.0, 8.0, GROWS, [], coupling="implicit")) as simulation:
+@pytest.mark.parametrize("room", [{}, {"rates": "cauchy", "volume": 0.5}], ids=["none", "volume"])
+def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces(room: Any) -> None:
+    """In the middle of growth; what is made has its room from the pass before."""
+    with made(wall(48.0, 16.0, GROWS | room, [], coupling="implicit")) as simulation:
         list(simulation.steps())
         coupling: Any = simulation.stepper.coupling
+        assert coupling.answering.room is None or coupling.answering.room.max() > 1.2
         coupling.answering.begin(60.0, 0.0)
         np.testing.assert_allclose(taylor_orders(simulation, coupling.newton.equilibrium, 1e-4), 2.0, atol=0.15)
 

@@ -263,20 +263,24 @@ def test_a_long_step_is_followed_where_newtons_method_does_not_find_its_end() ->
 RULE = TurnoverRule(40.0, 1.1, 1.0, TURNOVER_RATES["tension"])
 
 
-def turning_over(repulsion: str, driver: str, duration: float) -> implicit.CondensedPoints:
+def turning_over(repulsion: str, driver: str, duration: float, rule: TurnoverRule = RULE) -> implicit.CondensedPoints:
     """With content and natural length of their own at the start of the step."""
     some, rng = points("tensor", repulsion, driver, "material", 40), np.random.default_rng(11)
     content, length = rng.uniform(0.7, 2.0, 40), rng.uniform(0.95, 1.3, 40)
-    step = some.step._replace(time_new=some.step.time_old + duration, turnover=RULE)
+    step = some.step._replace(time_new=some.step.time_old + duration, turnover=rule)
     return implicit.CondensedPoints(replace(some.tissue, content=content, natural_length=length), step)
 
 
 @pytest.mark.parametrize("duration", [4.0, 1e3, 1e5])
-@pytest.mark.parametrize(("repulsion", "driver"), [("log", "cauchy"), ("length", "pk2"), ("log", "finger")])
-def test_the_tangent_with_turnover_is_the_derivative(repulsion: str, driver: str, duration: float) -> None:
+@pytest.mark.parametrize(
+    ("repulsion", "driver", "rates"),
+    [("log", "cauchy", "tension"), ("length", "pk2", "cauchy"), ("log", "finger", "tension")],
+)
+def test_the_tangent_with_turnover_is_the_derivative(repulsion: str, driver: str, rates: str, duration: float) -> None:
     """Taylor remainders a quarter at half the way."""
     rng = np.random.default_rng(1)
-    some, F = turning_over(repulsion, driver, duration), deformations(40, rng)
+    rule = RULE._replace(followed=TURNOVER_RATES[rates])
+    some, F = turning_over(repulsion, driver, duration, rule), deformations(40, rng)
     found = solved(some, F)
     assert found.converged.mean() > 0.9
     tangent, ok = some.tangent(found), found.converged
