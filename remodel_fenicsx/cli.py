@@ -12,14 +12,11 @@ import time as clock
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.body.reductions import explained
-from remodel_fenicsx.errors import BAD_ENVIRONMENT, BAD_INPUT, PAUSED, RemodelError, SOLVE_FAILED
-from remodel_fenicsx.scene.presets import PRESETS, PROFILES, profile_for
-from remodel_fenicsx.scene.scene import Scene, SceneError, preset_scene, read_scene
-from remodel_fenicsx.schema.tables import printable, shortened
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, BAD_INPUT, PAUSED, RemodelError, SOLVE_FAILED, printable, shortened
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import (
@@ -32,6 +29,11 @@ from remodel_fenicsx.system.environment import (
     versions,
 )
 from remodel_fenicsx.system.files import positive, refusal_in_words, wall_time, write_new
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.scene.scene import Scene
+
+presets, scenes = Late("remodel_fenicsx.scene.presets"), Late("remodel_fenicsx.scene.scene")  # no help needs them
 
 # what an error of Python's begins with, and the option for it
 OPTIONS = {"folder": "-o", "path": "-o", "times": "--time", "layers": "--layers", "cut": "--cut", "view": "--view"}
@@ -156,7 +158,7 @@ def _done(arguments: list[str]) -> int:
         if chosen.alone and not interrupts.is_first_rank():
             return 0
         if getattr(options, "file", None) is not None:
-            options.scene = read_scene(options.file, options.set, options.profile)
+            options.scene = scenes.read_scene(options.file, options.set, options.profile)
         for reason in chosen.needs:
             check_usable(reason())
         return chosen.do(options) or 0
@@ -262,6 +264,16 @@ def _drawn_in(name: str) -> Option:
     return option(f"-o --output FILE  {text}")
 
 
+class _Names:
+    """Those of a registry, which is imported when they are asked for."""
+
+    def __init__(self, registry: Callable[[], Mapping[str, Any]]):
+        self._registry = registry
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._registry())
+
+
 WITH = option(
     f"--with FILE.py  Run this Python file first, whose parts scenes may then name; repeatable (or {EXTENSIONS}).",
     action="append",
@@ -277,8 +289,10 @@ CHANGES = (
         default=[],
     ),
     option(
-        "--profile NAME  Choose speed or accuracy: mesh, step and element of a measured profile replace the scene's.",
-        choices=PROFILES,
+        "--profile NAME  Choose speed or accuracy: mesh, step and element of a measured profile (%(choices)s) replace "
+        "the scene's.",
+        choices=_Names(lambda: presets.PROFILES),
+        metavar="NAME",
     ),
 )
 SCENE_AND_CHANGES = (option(SCENE_FILE), *CHANGES)
@@ -433,12 +447,12 @@ def _export(options: argparse.Namespace) -> None:
 @command(
     "new",
     ["new kuhl-holzapfel-2007 --shape tube > mine.toml"],
-    option(f"preset PRESET  The model: {', '.join(PRESETS)}."),
+    option("preset PRESET  The model: %(choices)s.", choices=_Names(lambda: presets.PRESETS), metavar="PRESET"),
     option("--shape SHAPE  The body: cube, tendon, sheet or tube (default: tube).", default="tube"),
 )
 def _new(options: argparse.Namespace) -> None:
     """Print a scene of a published model, with every key."""
-    scene: Scene = preset_scene(options.preset, options.shape)
+    scene: Scene = scenes.preset_scene(options.preset, options.shape)
     _say(scene.to_toml(f"a scene of the preset {options.preset}").rstrip("\n"))
 
 
@@ -476,13 +490,15 @@ def _wall(options: argparse.Namespace) -> None:
 @command("validate", ["validate artery.toml", "validate artery.toml --profile fast"], *SCENE_AND_CHANGES)
 def _validate(options: argparse.Namespace) -> None:
     """Check a scene without running it, and show what it means."""
+    from remodel_fenicsx.body.reductions import explained
+
     scene, unseen, warnings = options.scene, "", []
     if interrupts.is_first_rank():
         unseen, warnings = _unseen_files(scene), scene.warnings()
     _say(f"{options.file}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
     _say("\n".join([scene.summary(), *explained(scene), scene.formulation_in_words()]))
     if scene.profile is not None:
-        _say(profile_for(scene.profile, scene).in_words(scene.profile))
+        _say(presets.profile_for(scene.profile, scene).in_words(scene.profile))
     for warning in warnings:
         _complain(f"warning: {warning}")
     if unseen:
@@ -529,7 +545,7 @@ def _unload(options: argparse.Namespace) -> None:
     from remodel_fenicsx.running import write_unloaded
 
     if not options.scene.geometry.is_loaded:
-        raise SceneError("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'")
+        raise scenes.SceneError("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'")
     place = options.output or Path(f"{options.scene.name}-unloaded")
     with _stopping("nothing is written"):
         words = write_unloaded(options.scene, place)

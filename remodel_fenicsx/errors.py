@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+
+LONGEST_MESSAGE = 2000  # characters: all columns of a shape are a thousand
 BAD_INPUT, SOLVE_FAILED, PAUSED, BAD_ENVIRONMENT = 2, 3, 4, 5
 
 
@@ -37,3 +40,13 @@ class RemodelError(Exception):
             One line.
         """
         return " ".join(str(self).split())
+
+
+def printable(text: str) -> str:
+    """Text on one line: control characters and line ends become spaces."""
+    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)
+
+
+def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
+    """A text without its middle where it is longer: its ends say where and why."""
+    return text if len(text) <= most else f"{text[: most // 2 - 3]} ... {text[-(most // 2 - 2) :]}"

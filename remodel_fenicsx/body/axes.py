@@ -19,11 +19,12 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, dof_of_node
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import SolveStopped, of_all_ranks, over_ranks, solve_positive
+from remodel_fenicsx.fem.assembly import Positive, SolveStopped, of_all_ranks, over_ranks
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.kinematics import lagrange
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -47,72 +48,66 @@ def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outle
     inner, outer, starts, ends = (facets_of(domain, names) for names in (["inner"], ["outer"], inlets, outlets))
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
     dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
-    radial = _radial(mesh, degree, dx, inner, outer, thickness)
+    stiffness = slopes(mesh, degree, dx)
+    radial = _radial(harmonic(stiffness, inner, outer), dx, thickness)
     axial = _axial(radial, dx, starts, ends, thickness)
-    through = [_length(radial, dx, inner, 1.0), _length(radial, dx, outer, -1.0)]
-    return [radial, axial, *through, _potential(axial, dx, starts, 1.0), _potential(axial, dx, ends, -1.0)]
+    across = _across(radial, dx)
+    through = [_length(across, radial, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))]
+    # Lengths along single lines, as through the wall, would differ over the section of a bend.
+    along = [_length(stiffness, axial, dx, facets, sign, True) for facets, sign in ((starts, 1.0), (ends, -1.0))]
+    return [radial, axial, *through, *along]
 
 
-def _radial(mesh: Any, degree: int, dx: Any, inner: Facets, outer: Facets, thickness: float) -> Any:
+def slopes(mesh: Any, degree: int, dx: Any) -> Positive:
+    """The form of harmonic functions. Collective."""
+    function = lagrange(mesh, degree, ())
+    trial, test = _arguments(function)
+    return Positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx, function.function_space)
+
+
+def harmonic(stiffness: Positive, low: Facets, high: Facets) -> Any:
+    """The harmonic function that is 0 on some facets and 1 on others. Collective."""
+    return stiffness.solve(None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)])
+
+
+def _radial(phi: Any, dx: Any, thickness: float) -> Any:
     """Projected unit gradients of the harmonic function."""
-    phi, found = harmonic(mesh, degree, dx, inner, outer), lagrange(mesh, degree, (3,))
+    space = phi.function_space
+    mesh, found = space.mesh, lagrange(space.mesh, space.ufl_element().degree, (3,))
     slope, least = ufl.grad(phi), dolfinx.fem.Constant(mesh, np.float64(LEAST_SLOPE / thickness))
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
-    trial, test = _arguments(found)
-    solve_positive(ufl.inner(trial, test) * dx, ufl.inner(direction, test) * dx, found)
-    return found
-
-
-def harmonic(mesh: Any, degree: int, dx: Any, low: Facets, high: Facets) -> Any:
-    """The harmonic function that is 0 on some facets and 1 on others. Collective."""
-    found = lagrange(mesh, degree, ())
-    solve_positive(_stiffness(found, dx), None, found, [_held(found, low, 0.0), _held(found, high, 1.0)])
+    trial, test = _arguments(phi)
+    mass, way = Positive(trial * test * dx, space), dolfinx.fem.Constant(mesh, np.zeros(3))
+    for component in range(3):
+        way.value[:] = np.eye(3)[component]
+        found.x.array[component::3] = mass.solve(ufl.inner(direction, way) * test * dx).x.array
     return found
 
 
 def _axial(radial: Any, dx: Any, starts: Facets, ends: Facets, thickness: float) -> Any:
     """The smoothest field: least integral of |grad a|^2 + k (a . r)^2 / thickness^2 with the ends' normals."""
-    mesh, found = radial.function_space.mesh, dolfinx.fem.Function(radial.function_space)
-    weight, normal = dolfinx.fem.Constant(mesh, np.float64(SQUARE_TO_RADIAL / thickness**2)), _unit(radial)
-    trial, test = _arguments(found)
+    space = radial.function_space
+    weight, normal = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2)), _unit(radial)
+    trial, test = _arguments(radial)
     across = weight * ufl.inner(trial, normal) * ufl.inner(test, normal)
-    bilinear = (ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx
-    solve_positive(bilinear, None, found, [_normal_to_ends(found, starts, ends)], multigrid=True)
-    return found
+    smooth = Positive((ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx, space)
+    return smooth.solve(None, [_normal_to_ends(radial, starts, ends)], multigrid=True)
 
 
-def _length(direction: Any, dx: Any, facets: Facets, sign: float) -> Any:
-    """Length along a direction from facets: least integral of (d . grad - sign)^2, which is 0 on the facets."""
-    found, along = _scalar(direction), _unit(direction)
-    trial, test = _arguments(found)
-    bilinear = ufl.inner(along, ufl.grad(trial)) * ufl.inner(along, ufl.grad(test)) * dx
-    solve_positive(bilinear, _flux(direction, test, dx, sign), found, [_held(found, facets, 0.0)])
-    return found
-
-
-def _potential(direction: Any, dx: Any, facets: Facets, sign: float) -> Any:
-    """The function, 0 on facets, whose gradient is nearest to a direction: a length of a bent body, of its middle."""
-    # Lengths along single lines, as through the wall, would differ over the section of a bend.
-    found = _scalar(direction)
-    _, test = _arguments(found)
-    bilinear, held = _stiffness(found, dx), [_held(found, facets, 0.0)]
-    solve_positive(bilinear, _flux(direction, test, dx, sign), found, held, multigrid=True)
-    return found
-
-
-def _scalar(vector: Any) -> Any:
-    space = vector.function_space
-    return lagrange(space.mesh, space.ufl_element().degree, ())
-
-
-def _stiffness(function: Any, dx: Any) -> Any:
+def _across(radial: Any, dx: Any) -> Positive:
+    """Slopes along r alone."""
+    space, along = radial.function_space, _unit(radial)
+    function = lagrange(space.mesh, space.ufl_element().degree, ())
     trial, test = _arguments(function)
-    return ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx
+    bilinear = ufl.inner(along, ufl.grad(trial)) * ufl.inner(along, ufl.grad(test)) * dx
+    return Positive(bilinear, function.function_space)
 
 
-def _flux(direction: Any, test: Any, dx: Any, sign: float) -> Any:
-    factor = dolfinx.fem.Constant(direction.function_space.mesh, np.float64(sign))
-    return factor * ufl.inner(_unit(direction), ufl.grad(test)) * dx
+def _length(form: Positive, direction: Any, dx: Any, facets: Facets, sign: float, multigrid: bool = False) -> Any:
+    """The function, 0 on facets, whose gradient is nearest to a direction: along it alone, or as a vector."""
+    test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(form.space.mesh, np.float64(sign))
+    flux = factor * ufl.inner(_unit(direction), ufl.grad(test)) * dx
+    return form.solve(flux, [_held(form.space, facets, 0.0)], multigrid)
 
 
 def _arguments(function: Any) -> tuple[Any, Any]:
@@ -123,8 +118,7 @@ def _unit(vector: Any) -> Any:
     return vector / ufl.sqrt(ufl.inner(vector, vector) + TINY)
 
 
-def _held(function: Any, facets: Facets, value: float) -> Any:
-    space = function.function_space
+def _held(space: Any, facets: Facets, value: float) -> Any:
     dofs = dolfinx.fem.locate_dofs_topological(space, space.mesh.topology.dim - 1, facets)
     held = dolfinx.fem.Constant(space.mesh, np.float64(value))
     return dolfinx.fem.dirichletbc(held, dofs, space)
@@ -200,6 +194,7 @@ def found_axes(
         radial, axial, *lengths = _fields(domain, quadrature, inlets, outlets)
     except SolveStopped as stopped:
         raise UndefinedAxes(f"geometry.faces: the local axes were not found: {stopped}") from stopped
+    PETSc.garbage_cleanup(domain.mesh.comm)  # several ranks keep matrices that nobody has any more until then
     values = _at_points([*radial, *axial, *lengths], quadrature)
     axes, known = _axes(values[..., :3], values[..., 3:6])
     share = quadrature.mean((~known).astype(np.float64))

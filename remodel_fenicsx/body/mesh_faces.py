@@ -91,16 +91,17 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     normals = _area_vectors(places)
     owner = np.full(len(facets), "", dtype=object)
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
-    inside = set(as_rows(np.sort(twice, axis=1)))
     for name, numbers in groups.items():
         chosen = np.isin(file.facet_groups, numbers)
         for key in as_rows(np.sort(file.facets[chosen], axis=1)):
-            row, where = index.get(key), "at " + in_place(file.points[list(key)].mean(axis=0))
-            if row is None:
-                words = "inside the body" if key in inside else "that are no facets of its elements"
-                raise FaceError(name, f"has facets {words}, the first {where}")
-            if owner[row] not in ("", name):
-                raise FaceError(name, f"shares facets with the face {owner[row]!r}, the first {where}")
+            row = index.get(key)
+            if row is None or owner[row] not in ("", name):
+                words = "has facets that are no facets of its elements"
+                if row is not None:
+                    words = f"shares facets with the face {owner[row]!r}"
+                elif key in as_rows(np.sort(twice, axis=1)):
+                    words = "has facets inside the body"
+                raise FaceError(name, f"{words}, the first at {in_place(file.points[list(key)].mean(axis=0))}")
             owner[row] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
@@ -195,7 +196,7 @@ def components(rows: Integers, nodes: int) -> Integers:
 
 def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
     """Facets of the boundary with normals outwards, the elements behind them, and the facets between two elements."""
-    _check_elements(file)
+    signs = _checked_signs(file)  # elements may be numbered as in a mirror
     local = np.array(FACETS[file.kind])
     facets = file.corners[:, local].reshape(-1, local.shape[1])
     _, first, inverse, count = np.unique(
@@ -206,13 +207,13 @@ def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
         raise MeshFileError(f"element {file.cell_numbers[bad]} shares a facet with two others")
     one = np.flatnonzero(count[inverse.reshape(-1)] == 1)
     facets_one, cell = facets[one], one // len(local)
-    flipped = jacobian_determinants(file).mean(axis=1)[cell] < 0  # elements may be numbered as in a mirror
+    flipped = signs[cell] < 0
     facets_one[flipped] = facets_one[flipped][:, ::-1]
     return facets_one, cell, facets[first[count == 2]]
 
 
-def _check_elements(file: MeshFile) -> None:
-    """One body of elements that have a volume, none twice."""
+def _checked_signs(file: MeshFile) -> Array:
+    """Of det J of each element; refused is what is not one body of elements that have a volume, none twice."""
     ordered = np.sort(file.corners, axis=1)
     _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
@@ -225,8 +226,8 @@ def _check_elements(file: MeshFile) -> None:
     if bodies > 1:
         raise MeshFileError(f"{bodies} bodies that have no node in common; allowed is one (in Gmsh: BooleanFragments)")
     determinants = jacobian_determinants(file)
-    turned = determinants * np.sign(determinants.mean(axis=1, keepdims=True))
-    bad = np.flatnonzero(turned.min(axis=1) <= FLAT * np.abs(determinants).mean())
+    signs: Array = np.sign(determinants.mean(axis=1))
+    bad = np.flatnonzero((determinants * signs[:, None]).min(axis=1) <= FLAT * np.abs(determinants).mean())
     if len(bad):
         cell = int(bad[0])
         where = in_place(file.points[file.corners[cell]].mean(axis=0))
@@ -234,6 +235,7 @@ def _check_elements(file: MeshFile) -> None:
             f"element {file.cell_numbers[cell]} at {where} is twisted or flat: its volume is not above zero "
             f"everywhere in it ({len(bad)} such element{'s' if len(bad) > 1 else ''})"
         )
+    return signs
 
 
 def jacobian_determinants(file: MeshFile) -> Array:

@@ -7,6 +7,7 @@ energies in few operations, matrices in memory that dolfinx and PETSc share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from numbers import Real
 from typing import Any, Generic, TypeVar, cast
 
@@ -24,6 +25,7 @@ from ufl.corealg.traversal import traverse_unique_terminals, unique_post_travers
 from ufl.domain import extract_unique_domain
 
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.kinematics import lagrange
 
 
 # ---------------------------------------------------------------- a linear equation with a positive definite form
@@ -46,41 +48,69 @@ class SolveStopped(ArithmeticError):
     """The iterations did not converge."""
 
 
-def solve_positive(
-    bilinear: Any, linear: Any, unknown: Any, conditions: Sequence[Any] = (), multigrid: bool = False
-) -> None:
-    """Solve bilinear(unknown, v) = linear(v) for all v. Collective."""
-    # Conjugate gradients, with no memory for factors. Multigrid has three times fewer seconds where what is held is
-    # far away (92,000 tetrahedra), and twice as many where it is near.
-    tangent, answer = jit.form(bilinear), unknown.x.petsc_vec
-    matrix, load = create_matrix(tangent), answer.duplicate()
-    assemble_matrix(matrix, [tangent], [])
-    load.set(0.0)
-    if linear is not None:
-        external = dolfinx.fem.assemble_vector(jit.form(linear))
-        external.scatter_reverse(dolfinx.la.InsertMode.add)
-        load.array[:] = external.array[: load.getLocalSize()]
-    held = []
-    for condition in conditions:
-        condition.set(unknown.x.array)
-        dofs, _ = condition.dof_indices()  # of a vector, dolfinx counts ghosts among its own ones
-        held.append(dofs[dofs < load.getLocalSize()])
-    if conditions:
-        rows = np.unique(np.concatenate(held)) + answer.getOwnershipRange()[0]
-        matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0, answer, load)
-    solver = PETSc.KSP().create(unknown.function_space.mesh.comm)  # type: ignore[attr-defined]
-    solver.setOperators(matrix)
-    solver.setType("cg")
-    solver.getPC().setType("gamg" if multigrid else "jacobi")
-    solver.setInitialGuessNonzero(True)
-    solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
-    solver.solve(load, answer)
-    reason, iterations = solver.getConvergedReason(), solver.getIterationNumber()
-    unknown.x.scatter_forward()
-    for thing in (solver, matrix, load):
-        thing.destroy()
-    if reason < 0:
-        raise SolveStopped(f"the linear solve stopped after {iterations} iterations (reason {reason} of PETSc)")
+class Positive:
+    """A positive definite form over a space: its matrix, which several solves share. Collective."""
+
+    def __init__(self, bilinear: Any, space: Any):
+        form, self.space = jit.form(bilinear), space
+        self._matrix = create_matrix(form)
+        assemble_matrix(self._matrix, [form], [])
+
+    @cached_property
+    def _prolongation(self) -> Any:
+        """From elements of degree 1. Collective."""
+        coarse = lagrange(self.space.mesh, 1, tuple(self.space.value_shape)).function_space
+        made = dolfinx.fem.petsc.interpolation_matrix(coarse, self.space)
+        made.assemble()
+        return made
+
+    def solve(self, linear: Any, conditions: Sequence[Any] = (), multigrid: bool = False) -> Any:
+        """The function u with bilinear(u, v) = linear(v) for all v; linear is 0 where it is None. Collective."""
+        # Conjugate gradients, with no memory for factors. Multigrid is for where what is held is far away; it cannot be
+        # where all is held.
+        unknown = dolfinx.fem.Function(self.space)
+        answer, matrix = unknown.x.petsc_vec, self._matrix.copy()
+        load = answer.duplicate()
+        if linear is not None:
+            external = dolfinx.fem.assemble_vector(jit.form(linear))
+            external.scatter_reverse(dolfinx.la.InsertMode.add)
+            load.array[:] = external.array[: load.getLocalSize()]
+        held = []
+        for condition in conditions:
+            condition.set(unknown.x.array)
+            dofs, _ = condition.dof_indices()  # of a vector, dolfinx counts ghosts among its own ones
+            held.append(dofs[dofs < load.getLocalSize()])
+        if conditions:
+            rows = np.unique(np.concatenate(held)) + answer.getOwnershipRange()[0]
+            matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0, answer, load)
+        solver = PETSc.KSP().create(matrix.comm)
+        solver.setOperators(matrix)
+        solver.setType("cg")
+        solver.getPC().setType("gamg" if multigrid else "jacobi")
+        if multigrid and self.space.ufl_element().degree > 1:
+            self._begin_with_degree_one(solver.getPC(), matrix)
+        solver.setInitialGuessNonzero(True)
+        solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
+        solver.solve(load, answer)
+        reason, iterations = solver.getConvergedReason(), solver.getIterationNumber()
+        unknown.x.scatter_forward()
+        for thing in (solver, matrix, load):
+            thing.destroy()
+        if reason < 0:
+            raise SolveStopped(f"the linear solve stopped after {iterations} iterations (reason {reason} of PETSc)")
+        return unknown
+
+    def _begin_with_degree_one(self, pc: Any, matrix: Any) -> None:
+        """Multigrid whose first level are elements of degree 1: the others then cost next to nothing."""
+        pc.setType("mg")
+        pc.setMGLevels(2)
+        pc.setMGType(PETSc.PC.MGType.ADDITIVE)
+        pc.setMGInterpolation(1, self._prolongation)
+        fine, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
+        coarse.setOperators(matrix.PtAP(self._prolongation))
+        for solver, kind in ((fine, "jacobi"), (coarse, "gamg")):
+            solver.setType("preonly")
+            solver.getPC().setType(kind)
 
 
 T = TypeVar("T")

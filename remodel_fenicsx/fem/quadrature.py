@@ -102,9 +102,9 @@ class Quadrature:
         element = self.mesh.ufl_domain().ufl_coordinate_element().basix_element
         functions = element.tabulate(1, self.points)[..., 0]
         nodes = self.mesh.geometry.x[geometry_dofmap(self.mesh)[self.elements]]
-        places = np.einsum("pk,nki->npi", functions[0], nodes)
-        jacobians = np.einsum("dpk,nki->npid", functions[1:], nodes)
-        return places, np.linalg.svd(jacobians, compute_uv=False)
+        slopes = functions[1:].swapaxes(0, 1).reshape(-1, functions.shape[2])
+        jacobians = (slopes @ nodes).reshape(len(nodes), *self.points.shape, 3)
+        return functions[0] @ nodes, np.linalg.svd(jacobians, compute_uv=False)
 
     @property
     def dx(self) -> ufl.Measure:
@@ -190,7 +190,8 @@ class Quadrature:
 
     def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
-        return np.einsum("ep,ep...->e...", self._shares, values)
+        means = self._shares[:, None] @ values.reshape(*values.shape[:2], int(np.prod(values.shape[2:])))
+        return means.reshape(len(values), *values.shape[2:])
 
     def element_mean_of_known(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over the points of each element whose value is not NaN, (elements, points) to (elements,)."""

@@ -32,10 +32,9 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
 
-from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.errors import RemodelError, printable, shortened
 
 LONGEST_VALUE = 60  # characters of a value in an error
-LONGEST_MESSAGE = 2000  # characters: all columns of a shape are a thousand
 PAGE_WIDTH = 98  # characters of a line of a page
 # annotation of a tuple: what is a list in TOML becomes one
 IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
@@ -259,16 +258,6 @@ def is_number(value: Any) -> bool:
 
 
 # ---------------------------------------------------------------- one line for an error
-
-
-def printable(text: str) -> str:
-    """Text on one line: control characters and line ends become spaces."""
-    return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)
-
-
-def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
-    """A text without its middle where it is longer: its ends say where and why."""
-    return text if len(text) <= most else f"{text[: most // 2 - 3]} ... {text[-(most // 2 - 2) :]}"
 
 
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:

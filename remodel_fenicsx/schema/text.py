@@ -21,8 +21,8 @@ import tomlkit
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.schema.tables import SceneError, description, printable, shown
+from remodel_fenicsx.errors import RemodelError, printable
+from remodel_fenicsx.schema.tables import SceneError, description, shown
 from remodel_fenicsx.schema.units import is_quantity
 from remodel_fenicsx.system.files import read_regular
 
