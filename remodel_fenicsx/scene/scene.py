@@ -442,6 +442,11 @@ class Scene(Table):
                 loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
         found = self.properties()
         parts = [_words(name) + properties.material.summary(loads) for name, properties in found.items()]
+        turnover = self.remodeling.turnover
+        if turnover.is_on:
+            parts.append(f"turnover with rates = {turnover.rates!r} and volume = {turnover.volume:g}")
+            if not {"rates", "volume"} & turnover.model_fields_set:
+                parts[-1] += " by default; in 0.3.0 'tension' and 0"
         return "; ".join(parts)
 
     def warnings(self) -> list[str]:
