@@ -354,7 +354,9 @@ def test_the_summary_is_one_line_in_one_unit():
     line = "network modulus c = 0.004116 kPa, shear modulus mu = 3.103 kPa, largest force over its area 2.5 kPa"
     assert stiff.summary() == line
     assert scene_from_dict(CUBE).summary() == beginning
-    grows = preset_scene(PAPER, "tube").with_values({"remodeling.turnover": {"time": 40.0, "deposition_stretch": 1.1}})
+    grows = preset_scene(PAPER, "tube").with_values(
+        {"remodeling.law": "tensor", "remodeling.turnover": {"time": 40.0, "deposition_stretch": 1.1}}
+    )
     assert grows.summary().endswith("'cauchy' and volume = 0.3 by default; in 0.3.0 'tension' and 0")
 
 
