@@ -303,7 +303,8 @@ def _way_to_rest(scene: Scene, stepper: Stepper) -> Any:
     if missing_for_steps_of_cells(scene) is None:
         until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
         limit = homeostasis.Limit(stepper.state, stepper.tissue, stepper.remodeling, until)
-    return homeostasis.Homeostasis(control, max(stops[:-1], default=0.0), limit)
+    first = scene.last_hold if scene.remodeling.turnover.starts_at_rest else None
+    return homeostasis.Homeostasis(control, max(stops[:-1], default=0.0), limit, first)
 
 
 def on_mesh_alone(scene: Scene, domain: Domain) -> Any:

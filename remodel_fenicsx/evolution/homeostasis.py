@@ -64,8 +64,11 @@ class Limit(Implicit):
 class Homeostasis:
     """The way through ramps and held loads until the cells rest, as one step of a stepper."""
 
-    def __init__(self, control: StepControl, held_from: float, limit: Limit | None):
+    def __init__(
+        self, control: StepControl, held_from: float, limit: Limit | None, first: tuple[float, float] | None = None
+    ):
         self.control, self.held_from, self.limit = control, held_from, limit
+        self.first = first  # hold of the loads in which the way rests once before, from and to
         self.stepper, self.state, self.tolerance = control.stepper, control.state, control.tolerance
         self.remodeling, self.turnover = self.stepper.remodeling, self.stepper.turnover
         self.quadrature = self.state.cells.quadrature
@@ -89,6 +92,8 @@ class Homeostasis:
         state, work = self.state, Work()
         start, number, self.steps, self._held = state.time, state.number, 0, None
         coarsens = not self.stepper.coupling.traits.accumulates and self.tolerance < UNCHECKED and self.turnover is None
+        if self.first is not None:
+            self._rest_before(*self.first, work)
         self._go(time, loads, max(start, self.held_from), coarsens, work)
         if coarsens and self._held is not None and self._largest_jump()[0] > FRONT:
             log.info(
@@ -102,6 +107,21 @@ class Homeostasis:
         self._residual = work.residual
         return work
 
+    def _rest_before(self, held: float, change: float, work: Work) -> None:
+        """Wait under loads that are held until all rests; what is made from there on takes room."""
+        control, stepper, growth = self.control, self.stepper, self.turnover.growth
+        stops, given = control.stops, stepper.load_values
+        control.stops = [*(stop for stop in stops if stop <= held), stops[-1]]
+        stepper.load_values = lambda time: given(min(time, held))
+        try:
+            self._go(stops[-1], given(held), held, False, work)
+        finally:
+            control.stops, stepper.load_values = stops, given
+        self.state.settle_cells()
+        log.info("growth begins, after %d steps", self.steps)
+        growth.start = change
+        self.state.reach(change, self.state.number)
+
     def _go(self, time: float, loads: LoadValues, held: float, coarsens: bool, work: Work) -> None:
         """From where the state is until the cells rest."""
         # The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
@@ -114,7 +134,7 @@ class Homeostasis:
             work.substeps += step.work.substeps
             work.residual = step.work.residual
             log.info("on the path: time %g, %d Newton iterations", step.time, step.work.newton_iterations)
-            if state.time < self.held_from:
+            if state.time < held:
                 continue
             if coarsens:
                 self.control.tolerance = UNCHECKED

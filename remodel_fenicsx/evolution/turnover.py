@@ -44,6 +44,7 @@ class Growth:
 
     def __init__(self, state: State, settings: Turnover):
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
+        self.start = settings.start  # a way to rest says where it is, where that is asked for
         kinematics: Any = state.kinematics
         self._gradient = self.quadrature.values(kinematics.gradient, (3, 3))
         self._initial = self.quadrature.values(kinematics.initial, (3, 3))
@@ -76,7 +77,7 @@ class Growth:
 
     def follow(self, content: Array) -> None:
         """J_g = 1 + phi (m/m_ref - 1) of the content (elements, points), and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
-        if self.state.time < self.settings.start:
+        if self.state.time < self.start:
             self._reference[:] = content
         ratio = self.of_content(content)
         if self.quadrature.shape[1] > 1:

@@ -6,6 +6,7 @@ keys.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import re
@@ -330,6 +331,18 @@ class Scene(Table):
         return max((load.ramp[-1][0] for load in self.loads.values()), default=0.0)
 
     @property
+    def last_hold(self) -> tuple[float, float] | None:
+        """When loads stay for the last time before they change again: from and to; None where they never do."""
+        corners = sorted({time for load in self.loads.values() for time, _ in load.ramp})
+        found, held = None, None
+        for start, end in itertools.pairwise(corners):
+            if all(load.factor(start) == load.factor(end) for load in self.loads.values()):
+                held = start, end
+            else:
+                found = held
+        return found
+
+    @property
     def last_time(self) -> float:
         """The time of the last row: where the equilibrium is asked for, one at which nothing is left of the start."""
         if not self.time.is_equilibrium:
@@ -402,7 +415,7 @@ class Scene(Table):
         """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
         end = self.last_time
         times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < end}
-        growth = {self.remodeling.turnover.start} - {0.0}
+        growth = {self.remodeling.turnover.start} - {0.0, math.inf}
         return sorted({*times, *growth, *self.output.times, end})
 
     @property

@@ -661,10 +661,18 @@ COUPLINGS = {
 """Couplings by the name that a scene gives them."""
 
 
+AT_REST = "rest"
+_Start: Any = Annotated[float, Field(ge=0)] | Literal["rest"]
 _start: Any = {  # `from` is a word of Python
     "from": (
-        float,
-        Field(default=0.0, ge=0, description="Time from which what is made takes room; a step ends there. 0: always."),
+        Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_Start))],
+        Field(
+            default=0.0,
+            json_schema_extra={"allowed": "a finite number of at least 0, or 'rest'"},
+            description="Time from which what is made takes room; a step ends there. 0: always. With time.end = "
+            "'equilibrium' it is 'rest': the path waits under the loads that are held before their last change until "
+            "the tissue rests, and room is made from there on.",
+        ),
     )
 }
 _WithStart: Any = create_model("_WithStart", __base__=Table, **_start)
@@ -696,9 +704,14 @@ class Turnover(_WithStart):  # type: ignore[misc]
         return self.is_on and self.volume > 0
 
     @property
+    def starts_at_rest(self) -> bool:
+        """Whether it does so from a rest on the path."""
+        return bool(getattr(self, "from") == AT_REST)
+
+    @property
     def start(self) -> float:
-        """The time from which it does."""
-        return float(getattr(self, "from"))
+        """The time from which it does; without end where nobody knows it yet."""
+        return math.inf if self.starts_at_rest else float(getattr(self, "from"))
 
     @property
     def rule(self) -> TurnoverRule:
@@ -856,12 +869,19 @@ class Remodeling(Table):
             raise fault(rule, f"{key}.volume", self.turnover.volume)
         if scene.formulation != "displacement":
             raise fault("must be 0 unless mesh.formulation is 'displacement'", f"{key}.volume", self.turnover.volume)
-        start = self.turnover.start
-        if start and scene.time.is_equilibrium:
-            raise fault("must be 0 with time.end = 'equilibrium', which has no times", f"{key}.from", start)
-        if start and start > scene.time.end:
+        start, at_once = self.turnover.start, scene.time.is_equilibrium
+        if self.turnover.starts_at_rest:
+            reasons = {
+                "needs time.end = 'equilibrium'; give the time of rest": not at_once,
+                "needs loads.NAME.ramp that stay for a while and change again": scene.last_hold is None,
+                "needs a scene without [[cases]]": scene.cases,
+            }
+            refuse(f"{key}.from", AT_REST, reasons)
+        elif start and at_once:
+            raise fault("must be 0 or 'rest' with time.end = 'equilibrium', which has no times", f"{key}.from", start)
+        elif start and start > scene.time.end:
             raise fault(f"must be at most time.end = {shown(scene.time.end)}", f"{key}.from", start)
-        if start:
+        elif start:
             scene.time.check_hit(start, f"{key}.from")
 
 

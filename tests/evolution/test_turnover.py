@@ -171,7 +171,7 @@ def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, f
 @pytest.mark.parametrize("room", [{}, {"rates": "cauchy", "volume": 0.5}], ids=["none", "volume"])
 def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces(room: Any) -> None:
     """In the middle of growth; what is made has its room from the pass before."""
-    with made(wall(48.0, 16.0, GROWS | room, [], coupling="implicit")) as simulation:
+    with made(wall(48.0, 12.0, GROWS | room, [], coupling="implicit")) as simulation:
         list(simulation.steps())
         coupling: Any = simulation.stepper.coupling
         assert coupling.answering.room is None or coupling.answering.room.max() > 1.2
