@@ -8,8 +8,8 @@ pass amplifies a small tilt of the axes (docs/theory.md, Stability of the pass):
 - drivers `pk2` and `finger`: the pass over-corrects. A swirl (pk2) or a twist (finger, frame `spatial`) changes its
   sign and grows by 1.5 and 1.9 in every pass, from rounding on, also with half the time step, and shows from about
   t = 80. These runs are held in the planes of symmetry x = 0 and y = 0, which the reference has too; `finger` also
-  takes elements of degree 1, whose mesh has no difference between its nodes that would feed the next mode, and
-  `pk2` no finer mesh, which would have room for the next mode too;
+  takes elements of degree 1, whose mesh has no difference between its nodes that would feed the next mode, and ends
+  before that one shows all the same, and `pk2` no finer mesh, which would have room for the next mode;
 - law `rate`: l_1 and l_2 differ where the eigenvalues cross, so the axes there turn steadily (a tilt doubles in every
   pass) before the reference, which can only exchange them, does so: around the front these are two solutions.
 """
@@ -56,7 +56,7 @@ class Setting:
 
 LOAD_CASES = tuple(Setting(*loads) for loads in ((0.1, 0.0), (0.1, 2.4), (0.1, 4.8), (0.05, 4.8), (0.0, 4.8)))  # Fig. 9
 PK2 = Setting(driver="pk2", planes=True, divisions=(8, 8, 1))
-FINGER = Setting(driver="finger", planes=True, divisions=(48, 16, 1), degree=1)
+FINGER = Setting(driver="finger", planes=True, divisions=(48, 16, 1), degree=1, end=120.0)
 PK2_FREE = Setting(driver="pk2", divisions=(8, 8, 1), end=60.0)
 FINGER_FREE = Setting(driver="finger", divisions=CURVED, end=75.0)
 RATE = Setting(law="rate", planes=True, divisions=CURVED, front=(1.9, 2.35))
