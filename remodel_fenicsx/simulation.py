@@ -122,7 +122,7 @@ class Simulation:
         """Solve and remodel step by step, from where the state is; what is yielded has been accepted.
 
         The state seen at a yield is one pass ahead of the row: the row and the fields belong to the solved state,
-        before the remodeling pass (docs/theory.md).
+        before the remodeling pass (docs/theory.md, Couplings).
 
         Parameters
         ----------

@@ -190,7 +190,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "remodeling_power",
             "stress length^3 / time",
-            "energy per time that the pass after this row releases (docs/theory.md)",
+            "energy per time that the pass after this row releases (docs/theory.md, Power of remodeling)",
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),
@@ -220,7 +220,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "time_error",
             "degrees",
-            "estimated error in time (docs/theory.md); with `time.tolerance` it is there without being asked for",
+            "estimated error in time (docs/theory.md, Error-controlled steps); with `time.tolerance` it is there without being asked for",
             lambda m: m.step.time_error,
             after_pass=True,
         ),

@@ -1,6 +1,6 @@
 """The strain energy of tissue with remodeling collagen, in UFL or on arrays: the only place where it is written.
 
-Stresses, drivers, residual and tangent follow by differentiation. Per reference volume (docs/theory.md):
+Stresses, drivers, residual and tangent follow by differentiation. Per reference volume (docs/theory.md, Energy):
 
     W      = W_iso + W_chn + W_rep
     W_iso  = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J

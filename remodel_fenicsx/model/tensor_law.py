@@ -1,4 +1,4 @@
-"""The consistent evolution law: one symmetric tensor A per point, without ranks and without axes (docs/theory.md).
+"""The consistent evolution law: one symmetric tensor A per point, without ranks and without axes (docs/theory.md, Law).
 
     dA/dt = kappa s (r0^2 E - A),    E = N / tr N,  N = (D+)^n,  n = 2
 

@@ -1,4 +1,7 @@
-"""What looks on and warns, off the path of a step: each is a `Watcher`, and a run is the same without it."""
+"""What looks on and warns, off the path of a step: each is a `Watcher`. Without it a run is the same.
+
+One is no warning: `EquilibriumStability` ends a run where `solver.unstable` is "stop".
+"""
 
 from __future__ import annotations
 
