@@ -220,7 +220,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "time_error",
             "degrees",
-            "estimated error in time (docs/theory.md, Error-controlled steps); with `time.tolerance` it is there without being asked for",
+            "estimated error in time (docs/theory.md, Error-controlled steps); always there with `time.tolerance`",
             lambda m: m.step.time_error,
             after_pass=True,
         ),

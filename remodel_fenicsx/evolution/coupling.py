@@ -345,7 +345,7 @@ def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
 
 
 class Extrapolated(Staggered):
-    """Remodel, then solve: sE + h/2 d(sE)/dt from the targets of the last two states, h the step (docs/theory.md, Extrapolated coupling)."""
+    """Remodel, then solve: sE + h/2 d(sE)/dt from the last two targets (docs/theory.md, Extrapolated coupling)."""
 
     traits = Traits(order=2, accumulates=True, longest=0.5)
 

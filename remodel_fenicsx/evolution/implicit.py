@@ -1,4 +1,4 @@
-"""The implicit coupling: the cells at the end of a step belong to the stress of its end (docs/theory.md, Implicit coupling)."""
+"""Cells at the end of a step belong to the stress of its end (docs/theory.md, Implicit coupling)."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Remodeled(NamedTuple):
 
 
 class TimeError:
-    """Compares each row with a better one, which the coupling has from the same step (docs/theory.md, Error-controlled steps)."""
+    """Compares each row with a better one that the coupling has (docs/theory.md, Error-controlled steps)."""
 
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
