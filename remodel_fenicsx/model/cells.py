@@ -89,8 +89,7 @@ def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
     """Angle in degrees between the chain direction and a unit vector, from the structure tensor.
 
     cos^2 = d . A d / tr A, which is the angle of sum_I l_I n_I when d is one of the axes (docs/theory.md,
-    Angles). The part
-    across d is summed by itself, so that small angles keep their digits.
+    Angles). The part across d is summed by itself, so that small angles keep their digits.
 
     Parameters
     ----------
