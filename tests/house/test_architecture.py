@@ -197,11 +197,12 @@ def test_no_name_has_two_meanings() -> None:
 
 
 def test_names_in_docstrings_are_there() -> None:
-    """`module.name` in a docstring or a comment is a name of this module."""
+    """`module.name` in a docstring, a comment or docs/architecture.md is a name of this module."""
+    pages = [*modules().values(), ROOT / "docs" / "architecture.md"]
     files = {path.stem: path for path in modules().values() if path.stem != "__init__"}
     lost = [
         f"{path.name}: {owner}.{name}"
-        for path in modules().values()
+        for path in pages
         for owner, name in re.findall(r"`+(?:\w+\.)*(\w+)\.(\w+)(?:\.\w+)*`+", path.read_text(encoding="utf-8"))
         if owner in files.keys() - {"parts", "extend"}
         and not re.search(rf"\b{name}\b", files[owner].read_text(encoding="utf-8"))
