@@ -49,20 +49,20 @@ def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outle
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
     dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
     stiffness = slopes(mesh, degree, dx)
-    radial = _radial(harmonic(stiffness, inner, outer), dx, thickness)
+    radial = _radial(harmonic(stiffness, inner, outer), degree, dx, thickness)
     axial = _axial(radial, dx, starts, ends, thickness)
-    across = _across(radial, dx)
-    through = [_length(across, radial, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))]
+    (trial, test), r, a = _arguments(stiffness.space), _unit(radial), _unit(axial)
+    along_r = Positive(ufl.inner(r, ufl.grad(trial)) * ufl.inner(r, ufl.grad(test)) * dx)
+    through = [_length(along_r, r, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))]
     # Lengths along single lines, as through the wall, would differ over the section of a bend.
-    along = [_length(stiffness, axial, dx, facets, sign, True) for facets, sign in ((starts, 1.0), (ends, -1.0))]
+    along = [_length(stiffness, a, dx, facets, sign, True) for facets, sign in ((starts, 1.0), (ends, -1.0))]
     return [radial, axial, *through, *along]
 
 
 def slopes(mesh: Any, degree: int, dx: Any) -> Positive:
     """The form of harmonic functions. Collective."""
-    function = lagrange(mesh, degree, ())
-    trial, test = _arguments(function)
-    return Positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx, function.function_space)
+    trial, test = _arguments(lagrange(mesh, degree, ()).function_space)
+    return Positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
 
 
 def harmonic(stiffness: Positive, low: Facets, high: Facets) -> Any:
@@ -70,14 +70,12 @@ def harmonic(stiffness: Positive, low: Facets, high: Facets) -> Any:
     return stiffness.solve(None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)])
 
 
-def _radial(phi: Any, dx: Any, thickness: float) -> Any:
+def _radial(phi: Any, degree: int, dx: Any, thickness: float) -> Any:
     """Projected unit gradients of the harmonic function."""
-    space = phi.function_space
-    mesh, found = space.mesh, lagrange(space.mesh, space.ufl_element().degree, (3,))
-    slope, least = ufl.grad(phi), dolfinx.fem.Constant(mesh, np.float64(LEAST_SLOPE / thickness))
+    mesh, slope, (trial, test) = phi.function_space.mesh, ufl.grad(phi), _arguments(phi.function_space)
+    least, way = (dolfinx.fem.Constant(mesh, number) for number in (np.float64(LEAST_SLOPE / thickness), np.zeros(3)))
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
-    trial, test = _arguments(phi)
-    mass, way = Positive(trial * test * dx, space), dolfinx.fem.Constant(mesh, np.zeros(3))
+    mass, found = Positive(trial * test * dx), lagrange(mesh, degree, (3,))
     for component in range(3):
         way.value[:] = np.eye(3)[component]
         found.x.array[component::3] = mass.solve(ufl.inner(direction, way) * test * dx).x.array
@@ -86,32 +84,23 @@ def _radial(phi: Any, dx: Any, thickness: float) -> Any:
 
 def _axial(radial: Any, dx: Any, starts: Facets, ends: Facets, thickness: float) -> Any:
     """The smoothest field: least integral of |grad a|^2 + k (a . r)^2 / thickness^2 with the ends' normals."""
-    space = radial.function_space
-    weight, normal = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2)), _unit(radial)
-    trial, test = _arguments(radial)
+    space, normal = radial.function_space, _unit(radial)
+    weight = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2))
+    trial, test = _arguments(space)
     across = weight * ufl.inner(trial, normal) * ufl.inner(test, normal)
-    smooth = Positive((ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx, space)
+    smooth = Positive((ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx)
     return smooth.solve(None, [_normal_to_ends(radial, starts, ends)], multigrid=True)
-
-
-def _across(radial: Any, dx: Any) -> Positive:
-    """Slopes along r alone."""
-    space, along = radial.function_space, _unit(radial)
-    function = lagrange(space.mesh, space.ufl_element().degree, ())
-    trial, test = _arguments(function)
-    bilinear = ufl.inner(along, ufl.grad(trial)) * ufl.inner(along, ufl.grad(test)) * dx
-    return Positive(bilinear, function.function_space)
 
 
 def _length(form: Positive, direction: Any, dx: Any, facets: Facets, sign: float, multigrid: bool = False) -> Any:
     """The function, 0 on facets, whose gradient is nearest to a direction: along it alone, or as a vector."""
     test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(form.space.mesh, np.float64(sign))
-    flux = factor * ufl.inner(_unit(direction), ufl.grad(test)) * dx
+    flux = factor * ufl.inner(direction, ufl.grad(test)) * dx
     return form.solve(flux, [_held(form.space, facets, 0.0)], multigrid)
 
 
-def _arguments(function: Any) -> tuple[Any, Any]:
-    return ufl.TrialFunction(function.function_space), ufl.TestFunction(function.function_space)
+def _arguments(space: Any) -> tuple[Any, Any]:
+    return ufl.TrialFunction(space), ufl.TestFunction(space)
 
 
 def _unit(vector: Any) -> Any:
@@ -195,7 +184,8 @@ def found_axes(
     except SolveStopped as stopped:
         raise UndefinedAxes(f"geometry.faces: the local axes were not found: {stopped}") from stopped
     PETSc.garbage_cleanup(domain.mesh.comm)  # several ranks keep matrices that nobody has any more until then
-    values = _at_points([*radial, *axial, *lengths], quadrature)
+    fields = ufl.as_vector([*radial, *axial, *lengths])
+    values = quadrature.evaluate(jit.expression(fields, quadrature.points), (len(fields),))
     axes, known = _axes(values[..., :3], values[..., 3:6])
     share = quadrature.mean((~known).astype(np.float64))
     if share > 0:
@@ -233,11 +223,6 @@ def _share(first: Array, second: Array) -> Array:
     low, high = np.maximum(first, 0.0), np.maximum(second, 0.0)
     total = low + high
     return np.divide(low, total, out=np.full_like(total, 0.5), where=total > 0)
-
-
-def _at_points(fields: Sequence[Any], quadrature: Quadrature) -> Array:
-    compiled = jit.expression(ufl.as_vector(fields), quadrature.points)
-    return quadrature.evaluate(compiled, (len(fields),))
 
 
 def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:

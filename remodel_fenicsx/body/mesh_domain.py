@@ -126,15 +126,10 @@ def shared(
     domain = MeshDomain(
         mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), parts, {}, lines, volume
     )
-    touched = {}
-    for name in faces:
-        numbers = None
-        if found is not None:
-            numbers = np.full(len(cells), -1, dtype=np.int64)
-            for number, part in enumerate(parts):
-                if part.name == name:
-                    numbers[boundary.cell[part.facets]] = number
-        touched[name] = domain.scatter_elements(numbers)
+    beside: dict[str, Any] = {name: None if found is None else np.full(len(cells), -1, np.int64) for name in faces}
+    for number, part in enumerate(parts if found is not None else ()):
+        beside[part.name][boundary.cell[part.facets]] = number
+    touched = {name: domain.scatter_elements(numbers) for name, numbers in beside.items()}
     own = domain.scatter_elements(None if found is None else file.cell_groups.astype(np.int32))
     return replace(domain, element_region=own, part_of_element=touched)
 

@@ -49,10 +49,10 @@ class SolveStopped(ArithmeticError):
 
 
 class Positive:
-    """A positive definite form over a space: its matrix, which several solves share. Collective."""
+    """A positive definite form: its matrix, which several solves share. Collective."""
 
-    def __init__(self, bilinear: Any, space: Any):
-        form, self.space = jit.form(bilinear), space
+    def __init__(self, bilinear: Any):
+        form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
         self._matrix = create_matrix(form)
         assemble_matrix(self._matrix, [form], [])
 

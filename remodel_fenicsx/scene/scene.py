@@ -782,7 +782,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
 
 def _with_profile(name: str, made: Callable[[Mapping[str, Any]], Scene]) -> Scene:
     """The scene that is made with a profile's settings: they depend on its cells and loads."""
-    scene = made(presets.PROFILES[name].values)
+    scene = made(presets.PROFILES[name].values if name in presets.PROFILES else {})  # refuses a name that is none
     settings = presets.profile_for(name, scene).settings(scene)
     return scene if settings == presets.PROFILES[name].values else made(settings)
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
+from remodel_fenicsx.body.reductions import explained
 from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
@@ -304,9 +305,8 @@ PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
 def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], kept: Kept | None = None) -> dict[str, Array]:
     """What a scene says where a table has measurements, by column, (rows,)."""
-    scene = scene.with_values(PRECISE | {"output.columns": [*table.sd], "output.times": [], "output.fields": False})
-    if kept is not None or table.state == "after":
-        scene = with_choices(scene)
+    changes = PRECISE | {"output.columns": [*table.sd], "output.times": [], "output.fields": False}
+    scene = with_choices(scene.with_values(changes))
     if table.state == "history":
         measured, step = table.columns["time"], scene.time.step
         end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
@@ -548,6 +548,8 @@ def fit(
             unknowns, tables = read_measurements(Path(data), scene)
             mark = fingerprint(scene, unknowns, tables)
             place, journal = _place(folder, f"{scene.name}-fit", mark)
+            for words in (*explained(scene), scene.formulation_in_words()):
+                log.info("%s", words)
             problem, first = Problem(scene, unknowns, tables, journal), np.log([u.start for u in unknowns])
             line.show(f"the start, and derivatives there: {2 * len(unknowns) + 1} runs")
             try:

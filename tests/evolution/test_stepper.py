@@ -14,6 +14,7 @@ from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import Cells, Load
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.state import State
 from tests import parts
 from tests.parts import cube
 
@@ -161,7 +162,25 @@ def test_watchers_forget_a_step_that_has_not_happened_the_last_one_first() -> No
     assert len(notes) == 2
 
 
+def test_cells_are_the_same_only_if_all_numbers_are() -> None:
+    made, stepper = pulled_cube()
+    solved = stepper.state.equilibrium_cells
+    assert solved.equals(made.cells)
+    for function in (made.cells.dimensions, made.cells.axes):
+        value = function.x.array[-1]
+        function.x.array[-1] += 1e-15
+        assert not solved.equals(made.cells)
+        function.x.array[-1] = value
+
+
 # ---------------------------------------------------------------- limits and loads
+def test_a_state_starts_unloaded() -> None:
+    made, _ = pulled_cube()
+    made.loading.set({"force": 3.0})
+    fresh = State(made.displacement, made.kinematics, made.cells, made.loading)
+    assert made.loading.values == {"force": 0.0} and fresh.time == 0.0 and fresh.number == 0
+
+
 def test_admissible_is_below_the_contour_length_with_volume_left() -> None:
     here = (0.0, 0.0, 0.0)
     assert Extension(0.999, 1e-3, here).admissible

@@ -365,6 +365,8 @@ def test_numbers_of_another_kind_are_doubted(
     log = (folder / "o" / "fit.log").read_text()
     assert all(line.removeprefix("WARNING: ") in log for line in warned)
     assert f"{path.name}: {len(table) - 1} rows of " in log
+    kinds = re.findall("INFO ([^:]*):", log)
+    assert sorted(kinds) == sorted(set(kinds)), "one line of each kind"
 
 
 def test_virgin_tissue_whose_collagen_will_be_turned_over(tmp_path: Path) -> None:

@@ -144,7 +144,17 @@ def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(coupling: 
     assert scripted.watcher.said == said
 
 
-# ---------------------------------------------------------------- rounding
+def test_passes_around_a_rest_do_not_count() -> None:
+    """Cells that go on after a rest jump. The same swing without one is warned of at 6, as above."""
+    scripted = Scripted(-3.0, 4e-5)
+    scripted.watcher.started(scripted.step(0))
+    for number in range(1, 9):
+        step = scripted.step(number)
+        if number == 5:
+            scripted.step(4)  # cells as they were
+        scripted.watcher.completed(step)
+        scripted.watcher.committed(step)
+    assert not scripted.watcher.said
 
 
 # ---------------------------------------------------------------- cells that rest
