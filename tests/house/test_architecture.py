@@ -205,6 +205,7 @@ def test_names_in_docstrings_are_there() -> None:
         for path in pages
         for owner, name in re.findall(r"`+(?:\w+\.)*(\w+)\.(\w+)(?:\.\w+)*`+", path.read_text(encoding="utf-8"))
         if owner in files.keys() - {"parts", "extend"}
+        and name not in ("py", "c", "toml", "csv", "msh")
         and not re.search(rf"\b{name}\b", files[owner].read_text(encoding="utf-8"))
     ]
     assert not lost
