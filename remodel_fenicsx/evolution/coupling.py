@@ -8,10 +8,12 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
@@ -30,7 +32,9 @@ COUNTS = 0.01  # share of a target from which on it is one: what is less moves t
 
 
 # ---------------------------------------------------------------- where Newton's method starts a step
+ORDER, FITTED = 3, 2  # increments that predict the next one; increments to which the weights are fitted
 SAME_RATE = 1e-9  # relative difference of two rates of a load that are the same
+INDEPENDENT = 1e-12  # of increments: what is less is rounding
 
 
 class LoadStep(NamedTuple):
@@ -47,36 +51,59 @@ class LoadStep(NamedTuple):
 
 
 class Predictor:
-    """Expects the unknowns to go on as fast as over the last step, while loads go on at the same rates."""
+    """Expects the increment of a step by those of the last ones, d_n = sum_j a_j d_(n-j), while load rates stay."""
 
     def __init__(self, state: State):
         self.state = state
-        self._increment = Earlier(state, "last_increment", state.unknown.copy, 1)
+        self._increments = Earlier(state, "predictor_increment", state.unknown.copy, ORDER + FITTED)
         rates = {f"rate_{name}": 0.0 for name in state.loading.values}
-        self._numbers = Numbers(state, "last_step", {"time": 0.0, "duration": 0.0} | rates)
+        durations = {f"duration_{age}": 0.0 for age in range(ORDER + FITTED)}  # of the increments, the newest first
+        self._numbers = Numbers(state, "predictor", {"time": 0.0} | durations | rates)
 
     def expected(self, step: LoadStep) -> Array | None:
         """The unknowns at its end, ghosts included, with what supports and loads prescribe; None at first."""
-        numbers = self._numbers
-        apart = (abs(rate - numbers[f"rate_{name}"]) > SAME_RATE * abs(rate) for name, rate in step.rates.items())
-        if not self._increment.known or any(apart):
+        if not self._increments.known or not self._goes_on(step):
             return None
-        values: Array = self.state.unknown.x.array + step.duration / numbers["duration"] * self._increment.values[0]
+        # as they would be over a step of this length, at their own speeds
+        known = enumerate(self._increments.values)
+        increments = [step.duration / self._numbers[f"duration_{age}"] * increment for age, increment in known]
+        increment = increments[0]
+        if len(increments) == ORDER + FITTED:
+            increment = self._weights(increments) @ np.array(increments[:ORDER])
+        values: Array = self.state.unknown.x.array + increment
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def solved(self, step: LoadStep, before: Array) -> None:
         """The state is the solution of the step; `before`: the unknowns of the step before."""
-        increment = self.state.unknown.x.array - before
-        if self._numbers["time"] == step.time:  # solved once more: a coupling that iterates
-            self._increment.values[0][:] += increment
+        numbers, increment = self._numbers, self.state.unknown.x.array - before
+        if numbers["time"] == step.time:  # solved once more: a coupling that iterates
+            self._increments.values[0][:] += increment
             return
-        self._increment.push(increment)
-        for name, value in {"time": step.time, "duration": step.duration}.items():
-            self._numbers[name] = value
+        if not self._goes_on(step):
+            self._increments.forget()
+        self._increments.push(increment)
+        for age in reversed(range(1, ORDER + FITTED)):
+            numbers[f"duration_{age}"] = numbers[f"duration_{age - 1}"]
+        numbers["duration_0"], numbers["time"] = step.duration, step.time
         for name, rate in step.rates.items():
-            self._numbers[f"rate_{name}"] = rate
+            numbers[f"rate_{name}"] = rate
+
+    def _goes_on(self, step: LoadStep) -> bool:
+        """Whether the rates are those of the last step."""
+        rates = ((rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items())
+        return all(abs(rate - last) <= SAME_RATE * max(abs(rate), abs(last)) for rate, last in rates)
+
+    def _weights(self, increments: list[Array]) -> Array:
+        """By least squares, of the last increments from those before them."""
+        rows = np.array([increment[: self.state.number_of_owned_unknowns] for increment in increments])
+        products = over_ranks(self.state.comm, rows @ rows.T, MPI.SUM)
+        matrix, right = np.zeros((ORDER, ORDER)), np.zeros(ORDER)
+        for k in range(FITTED):
+            matrix += products[k + 1 : k + 1 + ORDER, k + 1 : k + 1 + ORDER]
+            right += products[k + 1 : k + 1 + ORDER, k]
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=INDEPENDENT)[0], dtype=np.float64)
 
 
 class Traits(NamedTuple):

@@ -1293,8 +1293,8 @@ class Solver(Table):
         "(docs/speed_and_accuracy.md).",
     )
     predictor: Annotated[str, OneOf(("none", "autoregressive"), (), NO_PREDICTOR)] = "autoregressive"
-    """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' one
-    increment further, as large as the last one at the same speed. The solutions are the same to the tolerance."""
+    """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' at what
+    the last increments let expect. The solutions are the same to the tolerance."""
     absolute_tolerance: Annotated[float, FORCE] = Field(default=0.0, ge=0)
     """A force: a step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|."""
     relative_tolerance: float = Field(default=1e-10, ge=0, lt=1)

@@ -27,20 +27,23 @@ def simulation() -> Any:
         yield found
 
 
-def test_a_step_begins_as_fast_as_the_last_one_went_on(simulation: Simulation) -> None:
+def test_a_trend_and_a_swing_are_both_continued_whatever_the_steps(simulation: Simulation) -> None:
+    """A trend, and what alternates from step to step as a staggered pass does, each at the speed of its step."""
     state = simulation.state
-    predictor, unknown, increment = Predictor(state), state.unknown.x.array, np.empty(0)
+    predictor, unknown, rng = Predictor(state), state.unknown.x.array, np.random.default_rng(1)
+    trend, swing = 1e-3 * rng.standard_normal((2, len(unknown)))
     assert predictor.expected(LoadStep(1.0, 1.0, RATES)) is None
-    for time, duration in ((1.0, 1.0), (1.5, 0.5)):
-        before, increment = unknown.copy(), np.random.default_rng(1).standard_normal(len(unknown))
+    time, free = 0.0, np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
+    for number, duration in enumerate(rng.uniform(0.5, 2.0, 8)):
+        time += duration
+        step, before = LoadStep(time, duration, RATES), unknown.copy()
+        found, increment = predictor.expected(step), duration * (0.9**number * trend + (-0.8) ** number * swing)
         unknown[:] += increment
-        predictor.solved(LoadStep(time, duration, RATES), before)
-    found = predictor.expected(LoadStep(3.0, 1.5, RATES))
+        predictor.solved(step, before)
     assert found is not None
-    free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
-    np.testing.assert_allclose((found - unknown)[free], 3.0 * increment[free], rtol=1e-12)
+    np.testing.assert_allclose((found - before)[free], increment[free], rtol=0, atol=1e-12)
     assert np.all(found[~free] == 0.0)  # what supports prescribe
-    assert predictor.expected(LoadStep(3.0, 1.5, {"force": 2.1})) is None
+    assert predictor.expected(LoadStep(time + 1.0, 1.0, {"force": 2.1})) is None
 
 
 def iterations(folder: Path) -> int:
@@ -58,7 +61,7 @@ def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Pa
     found, expected = Recording(predicted).history, Recording(plain).history
     for name in ("mean_stretch", "stored_energy", "max_chain_extension", "remodeling_power"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-8, err_msg=name)
-    assert iterations(predicted) <= 0.95 * iterations(plain)
+    assert iterations(predicted) <= 0.9 * iterations(plain)
 
 
 def nearly_straight(predictor: Predictor, step: LoadStep) -> np.ndarray | None:
