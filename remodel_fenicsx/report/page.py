@@ -9,7 +9,7 @@ import os
 import re
 import shlex
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
@@ -24,7 +24,7 @@ from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.shape import Column, columns_of_region
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.model.axes import moved_axes
+from remodel_fenicsx.model.axes import GROWTH, moved_axes
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -151,7 +151,8 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 
 CELL = ("cell_dimensions", *AXIS_FIELDS)
 NAMES = ("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_extension", *CELL)
-OF_WALLS = ("cauchy_stress", *DIRECTION_FIELDS)
+MADE = ("content", GROWTH)
+OF_WALLS = ("cauchy_stress", *DIRECTION_FIELDS, *MADE)
 
 
 @dataclass(frozen=True)
@@ -166,12 +167,13 @@ class ShownBody:
     extension: NDArray[np.float32] | None
     edges: NDArray[np.float32] | None
     wall_stress: Places | None
+    made: Places | None  # content and growth
     is_deformed: bool
 
     @classmethod
     def of(cls, whole: WholeBody, times: Places) -> ShownBody:
         """What a run has recorded at these times."""
-        shown = ("position", "angle", "extension", "edges", "wall_stress")
+        shown = ("position", "angle", "extension", "edges", "wall_stress", "made")
         names = (*NAMES, *(OF_WALLS if whole.recording.scene.geometry.is_a("Walled") else ()))
         rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in shown}
         volume, is_deformed = _volumes(whole.points[whole.elements]), True
@@ -221,20 +223,27 @@ def _of_elements(fields: dict[str, Places]) -> dict[str, Places]:
 
 
 def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> dict[str, Places]:
-    """Mean stress around, along and across the wall in each layer, (layers, 3); nothing without a wall or fields."""
+    """Means in each layer, as far as they were recorded: of stress around, along and across the wall, of `MADE`."""
+
+    def means(values: list[Places]) -> Places:
+        """(layers, values)."""
+        sums = [np.bincount(whole.layer, weights=volume * part) for part in (*values, np.ones_like(volume))]
+        return np.stack(sums[:-1], axis=1) / sums[-1][:, None]
+
+    unknown = np.full(len(volume), np.nan)
+    made = [fields.get(name, unknown) for name in MADE]
+    found = {"made": means(made)} if set(MADE) & set(fields) else {}
     shape = whole.recording.scene.geometry
     recorded = DIRECTION_FIELDS if shape.constant_fields else ()  # where axes are no function of the place
     if not set(fields) >= {*TENSOR_FIELDS, *recorded}:
-        return {}
+        return found
     if recorded:
         axes = np.stack([fields[name] for name in recorded], axis=1)
     else:
         axes = shape.axes_at(whole.points[whole.elements].mean(axis=1))
     F, stress = (fields[name].reshape(-1, 3, 3) for name in TENSOR_FIELDS)
     moved = moved_axes(axes, F)
-    components = volume[:, None] * np.einsum("nki,nij,nkj->nk", moved, stress, moved)
-    sums = [np.bincount(whole.layer, weights=part) for part in (*components.T, volume)]
-    return {"wall_stress": np.stack(sums[:3], axis=1) / sums[3][:, None]}
+    return found | {"wall_stress": means([*np.einsum("nki,nij,nkj->kn", moved, stress, moved)])}
 
 
 def _volumes(corners: Places) -> Places:
@@ -432,21 +441,41 @@ def stress(run: ReportedRun) -> Card | None:
     body, history = run.body, run.recording.history
     if body is None or body.wall_stress is None or len(body.whole.depth) < 2:
         return None
-    through, start, end = run.recording.scene.geometry.depth_in_words
-    unit = unit_of(run.recording.scene, "stress")
+    through, unit = run.recording.scene.geometry.depth_in_words[0], unit_of(run.recording.scene, "stress")
     laplace: Any = np.full(len(body.times), np.nan)
     if {"pressure", "inner_radius", "outer_radius"} <= set(history):
         inner, outer = history["inner_radius"], history["outer_radius"]
         laplace = np.interp(body.times, history["time"], history["pressure"] * inner / (outer - inner))
-    data = {"layers": [[[_finite(value) for value in layer] for layer in layers] for layers in body.wall_stress],
-            "laplace": [_finite(value) for value in laplace], "depth": body.whole.depth.tolist(),
-            "through": f"{through} (0 {start}, 1 {end})"}  # fmt: skip
+    data = _by_layer(run, body, body.wall_stress, ("around", "along", "across"))
+    data |= {"level": [_finite(value) for value in laplace]}
     legend = "Means of layers, in axes that move with the wall."
     legend += " Dashed: p r_i / h, by the law of Laplace the mean around." if np.isfinite(laplace).any() else ""
     html = section(
         f"Cauchy stress {through}", f'<div id="stress" class="stack"></div><p class="note">{legend}</p>', "half", unit
     )
     return Card("stress", html, data)
+
+
+def content(run: ReportedRun) -> Card | None:
+    """Content and growth of the collagen through the wall, where they were recorded."""
+    body = run.body
+    if body is None or body.made is None or len(body.whole.depth) < 2:
+        return None
+    known: Any = np.isfinite(body.made).all(axis=(0, 1))
+    names = [words(name) for name, is_known in zip(MADE, known, strict=True) if is_known]
+    title = f"{' and '.join(names).capitalize()} {run.recording.scene.geometry.depth_in_words[0]}"
+    legend = '<p class="note">Means of layers, over those at the start: amount of the collagen, volume of the wall.</p>'
+    html = section(title, f'<div id="content" class="stack"></div>{legend}', "half")
+    return Card("content", html, _by_layer(run, body, body.made[..., known], names))
+
+
+def _by_layer(run: ReportedRun, body: ShownBody, values: Places, names: Sequence[str]) -> dict[str, Any]:
+    """What a drawing over the depth needs of values (times, layers, names)."""
+    through, start, end = run.recording.scene.geometry.depth_in_words
+    return {
+        "layers": [[[_finite(value) for value in layer] for layer in layers] for layers in values], "names": names,
+        "depth": body.whole.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "level": [],
+    }  # fmt: skip
 
 
 # ---------------------------------------------------------------- curves
@@ -583,7 +612,7 @@ def versions(run: ReportedRun) -> Card:
     return Card("versions", folded("Versions and licences", table(rows) + note + licences))
 
 
-PAGE_PARTS: list[Part] = [head, tiles, view, angles, curves, stress, facts, warnings, scene, versions]
+PAGE_PARTS: list[Part] = [head, tiles, view, angles, curves, stress, content, facts, warnings, scene, versions]
 """In the order of the page."""
 
 
@@ -597,7 +626,7 @@ def cards(run: ReportedRun) -> list[Card]:
 
 REPORT = "report.html"
 PAGE_SIZE = 20.0  # MB that a page should have at most
-SCRIPTS = ("data.js", "body.js", "angles.js", "stress.js", "curves.js", "page.js")
+SCRIPTS = ("data.js", "body.js", "angles.js", "through_the_wall.js", "curves.js", "page.js")
 STYLES = ("report.bundle.css", "page.css")
 GENERATOR_TAG = b'name="generator" content="remodel_fenicsx'  # what bears it may be made anew
 LARGEST_PAGE = 10**9  # bytes

@@ -122,7 +122,10 @@ def test_walls_rest_where_an_independent_program_says(case: Any) -> None:
 def test_thick_walls_too(case: Any) -> None:
     """The paper's radii and pressure; half-way is a line between two of eight elements, in one of which angles jump."""
     finer = at_rest(case, 4.8, geometry={"outer_radius": 3.0}).with_values({"mesh.refinement": 1 + (case[0] == 0.0)})
-    row, expected = last_row(finer), THICK_RESTS[case]
+    columns = [*finer.output.columns, "axial_force"]
+    row, expected = last_row(finer.with_values({"output.columns": columns})), THICK_RESTS[case]
+    if case[0]:  # growth turns a pull along the axis into a thrust
+        assert row["axial_force"] == pytest.approx({1.0: 13.0, 1.5: -27.0}[case[3]], abs=1.0)
     if not case[0]:
         assert row[ANGLES[1]] == pytest.approx(expected.angles[1], abs=0.5)
     compare(row, expected, *["angles"] * (not case[0]))
@@ -362,6 +365,13 @@ def test_a_folder_of_an_earlier_version_goes_on_as_it_was(tmp_path: Path) -> Non
 
 
 # ---------------------------------------------------------------- what is said
+def test_a_vessel_that_grows_pushes_along_its_axis(caplog: pytest.LogCaptureFixture) -> None:
+    """A long tube is said to buckle while it thickens."""
+    rows_of(wall(0.5, 160.0, None, geometry={"length": 9.0}))
+    (line,) = (record.message for record in caplog.records if record.levelname == "WARNING")
+    assert "the whole body would buckle: its thrust along z" in line
+
+
 def test_tissue_that_is_lost_is_refused() -> None:
     """All of a wall is collagen, which goes where nothing pulls."""
     slack = {"turnover": {"time": 1.0, "deposition_stretch": 1.3}, "loads": ramped(4.0, pressure=0.01, elongation=0.0)}

@@ -76,7 +76,9 @@ def test_stresses_through_the_wall_are_those_of_the_columns(kinematics: str, tmp
         "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "output.columns": [*names, "inner_radius", "outer_radius"],
     }  # fmt: skip
     folder = run_scene(preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes), tmp_path / "run")
-    found, history = Decoded.of(folder).data["parts"]["stress"], Recording(folder).history
+    parts, history = Decoded.of(folder).data["parts"], Recording(folder).history
+    found = parts["stress"]
+    assert "content" not in parts
     layers = np.array(found["layers"])
     assert layers.shape == (4, 8, 3) and found["through"] == "through the wall (0 inside, 1 outside)"
     for component, name in enumerate(("hoop", "axial", "radial")):
@@ -84,7 +86,22 @@ def test_stresses_through_the_wall_are_those_of_the_columns(kinematics: str, tmp
             column = history[f"{name}_stress_{where}"]
             np.testing.assert_allclose(layers[:, layer, component], column, rtol=0.02, atol=0.001 * layers.max())
     inner, outer = (history[f"{face}_radius"][-1] for face in ("inner", "outer"))
-    assert found["laplace"][-1] == pytest.approx(2.0 * inner / (outer - inner), rel=1e-6)
+    assert found["level"][-1] == pytest.approx(2.0 * inner / (outer - inner), rel=1e-6)
+
+
+def test_content_and_growth_through_the_wall(tmp_path: Path) -> None:
+    """The mean over the layers by volume is the column's."""
+    changes = {
+        "cells.initial": "isotropic", "model.kinematics": "radial", "loads.pressure.value": 4.8, "time.end": 20.0,
+        "remodeling.turnover": {"time": 5.0, "volume": 0.5}, "time.step": 2.0, "output.columns": ["content", "growth"],
+    }  # fmt: skip
+    folder = run_scene(preset_scene("consistent", "tube").with_values(changes), tmp_path / "run")
+    found, history = Decoded.of(folder).data["parts"]["content"], Recording(folder).history
+    areas, layers = np.diff(np.linspace(1.0, 3.0, len(found["depth"]) + 1) ** 2), np.array(found["layers"])
+    assert found["names"] == ["content", "growth"] and history["growth"][-1] < 0.98
+    for number, name in enumerate(found["names"]):
+        means = np.average(layers[:, :, number], axis=1, weights=areas)
+        np.testing.assert_allclose(means, history[name], rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["artery", "tendon", "cube", "tetrahedra", "quadratic"])
