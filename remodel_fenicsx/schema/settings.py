@@ -669,9 +669,8 @@ _start: Any = {  # `from` is a word of Python
         Field(
             default=0.0,
             json_schema_extra={"allowed": "a finite number of at least 0, or 'rest'"},
-            description="Time from which what is made takes room; a step ends there. 0: always. With time.end = "
-            "'equilibrium' it is 'rest': the path waits under the loads that are held before their last change until "
-            "the tissue rests, and room is made from there on.",
+            description="Time from which turnover adds volume; a step ends there. 0: always. 'rest', with time.end = "
+            "'equilibrium': once the tissue rests under the loads before their last change.",
         ),
     )
 }
@@ -694,7 +693,7 @@ class Turnover(_WithStart):  # type: ignore[misc]
     """What amount and natural length follow. 'cauchy': the stress that a chain makes. 'tension': its force, as in
     version 0.3.0."""
     volume: float = Field(default=0.3, ge=0, le=1)
-    """Share phi of the wall that collagen is at the start, or at `from`: what is made takes room. 0: it does not."""
+    """Share phi of the wall that collagen is at the start, or at `from`: what is made adds volume. 0: it does not."""
     growth: Literal["normal"] = "normal"
     """Where the room is made: across the wall."""
 
