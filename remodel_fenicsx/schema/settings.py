@@ -370,7 +370,8 @@ class Natural(Table):
         default=(), json_schema_extra={"allowed": "a list of tables, each [[natural.layers]]"}
     )
     """Parts of the wall that were stretched before they were joined, a table `[[natural.layers]]` each. A tube of such
-    layers is closed so that it is in equilibrium without loads. A body of your own moves when it is let go."""
+    layers is closed so that it is in equilibrium without loads. A body of your own
+    deforms at the start, until its layers balance."""
 
     cells: Literal["as-given", "equilibrium"] = AS_GIVEN
     """Cells of a tube whose geometry is the loaded one (geometry.is). 'as-given': those of [cells]. 'equilibrium':
@@ -491,7 +492,7 @@ class Cells(Table):
     seed: int = Field(default=1, ge=0)
     """Seed of the random cells. The same seed and mesh give the same cells on any number of ranks."""
     antithetic: bool = False
-    """Random cells: seeds 1 to 3, 4 to 6 and so on have the same draws, with l_1, l_2 and l_3 in turn. Means over whole
+    """Random cells: seeds 1 to 3 share one draw, with l_1, l_2 and l_3 in turn, and so do 4 to 6. Means over whole
     threes scatter less."""
     end_to_end_length: float = Field(default=1.0, gt=0)
     """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It stays in the repulsive
