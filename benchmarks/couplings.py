@@ -31,7 +31,7 @@ from tests.runs import made
 
 PAGE = DOCS / "laws_and_couplings.md"
 ARTERY = Path(__file__).parents[1] / "demos" / "artery.toml"
-END, STEPS = 40.0, (5.0, 2.5, 1.25, 0.625)
+STEPS = (5.0, 2.5, 1.25, 0.625)
 TUBE = Tube(inner_radius=1.0, outer_radius=3.0, length=0.5)
 FINEST = 0.15625  # of the limits
 PRINTED = {"remodeling.law": "explicit", "remodeling.frame": "material"}

@@ -18,7 +18,6 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser.add_argument("--family", action="append", default=[], metavar="NAME", help="only cases of this family")
     parser.add_argument("--only", action="append", default=[], metavar="TEXT", help="only cases whose key contains it")
     parser.add_argument("--reduced", action="store_true", help="only the cases of the test")
-    parser.add_argument("--list", action="store_true", help="print the cases, run nothing")
     parser.add_argument(
         "--report", action="store_true", help="write table and picture of docs/what_may_go_wrong.md, run nothing"
     )
@@ -26,9 +25,6 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     if options.report:
         return report.write(options.results, all_cases(), running.source_of())
     cases = chosen(options, parser)
-    if options.list:
-        print("\n".join(f"{case.key}\n    {case.command}" for case in cases.values()))
-        return 0
     source = running.source_of()
     file = running.file_of(options, source)
     done = {} if options.again else measured(file, source, cases, options.limit)

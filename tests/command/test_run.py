@@ -221,13 +221,6 @@ def test_a_folder_below_a_file_is_exit_code_2(tmp_path: Path, ranks: int) -> Non
     assert done.stderr.count("\n") == 1 or ranks == 2
 
 
-def test_a_default_folder_that_cannot_be_made_is_exit_code_5(tmp_path: Path) -> None:
-    (tmp_path / "results").symlink_to(tmp_path / "a disk that is not mounted")
-    done = run("run", demo("cube"), cwd=tmp_path)
-    assert done.returncode == 5
-    assert "cannot write the results" in done.stderr and done.stderr.count("\n") == 1
-
-
 # ---------------------------------------------------------------- failures and signals
 
 
@@ -335,8 +328,6 @@ def test_a_bad_scene_is_one_line_exit_code_2_and_nothing_written(
 ) -> None:
     setting, beginning = line.split(" | ")
     monkeypatch.chdir(tmp_path)
-    if setting == "time.step=0.4":
-        setting = "time.step=0.6"  # 150 is a multiple of it, the kink at 25 is not
     assert refused("run", demo("artery"), "--set", setting).startswith(beginning)
     assert list(tmp_path.iterdir()) == []
 

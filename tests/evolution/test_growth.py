@@ -143,26 +143,6 @@ def test_the_wall_in_three_dimensions_rests_there_too(volume: float, kinematics:
     compare(row, RESTS[case], *["angles"] * whole)
 
 
-@pytest.mark.slow
-def test_a_wall_from_a_file_rests_there_too(tmp_path: Path) -> None:
-    """It grows along the radial axis that is found in it."""
-    case = 0.3, 1.0, 1.1, 1.0
-
-    def thinner(places: Any) -> Any:
-        """Radii of 1 and 1.3 from 1 and 2, and a tenth of the length."""
-        radius = np.linalg.norm(places[:, :2], axis=1, keepdims=True)
-        return places * np.hstack([np.tile((0.7 + 0.3 * radius) / radius, 2), np.full_like(radius, 0.1)])
-
-    file = write_tube(tmp_path / "ring.msh", degree=2, counts=(8, 3, 1), moved=thinner)
-    changes = {"preset": None, "material.repulsion": "log", "remodeling.law": "tensor"}
-    body = {"geometry": {"shape": "mesh", "file": str(file)}, "cells.axes": "local", "model.kinematics": "full"}
-    columns = {"output.columns": ["content", "natural_length", "growth"], "remodeling.coupling": "extrapolated"}
-    row, expected = last_row(at_rest(case).with_values(changes | body | columns)), RESTS[case]
-    assert row["content"] == pytest.approx(expected.content, rel=0.01)
-    assert row["natural_length"] == pytest.approx(expected.natural_length, rel=0.01)
-    assert row["growth"] == pytest.approx(1 + 0.3 * (expected.content - 1), rel=0.01)
-
-
 @pytest.mark.parametrize("volume", LOCAL)
 def test_content_and_hoop_stress_through_the_wall(volume: float) -> None:
     """Continued to the faces; growth makes the stress uniform."""

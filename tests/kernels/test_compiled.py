@@ -10,10 +10,6 @@ from remodel_fenicsx.kernels import CompiledPointKernels, PointKernels
 from remodel_fenicsx.model import energy, spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.tensors import passes_through_zero
-from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.system.environment import KERNELS
-from tests.parts import tube
-from tests.runs import simulated
 
 COUNT = 203  # no multiple of the eight that are done at once
 
@@ -162,22 +158,6 @@ def test_stretches_and_structure(kernels: PointKernels) -> None:
     np.testing.assert_array_equal(kernels.squared_length(F, cell), squared)
     wanted = structure_tensor(*cell[:2])
     np.testing.assert_allclose(kernels.structure_tensor(*cell[:2]), wanted, rtol=0, atol=1e-15)
-
-
-# ---------------------------------------------------------------- a whole pass
-@pytest.mark.parametrize(
-    "changes", [{}, {"remodeling.frame": "material"}, {"cells.initial": "isotropic", "remodeling.law": "relaxation"}]
-)
-def test_passes_of_a_tube(changes: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Random cells; the other frame; cells that are all alike, so that nothing but rounding tells some axes apart."""
-    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length": 2.0, "time.end": 6.0} | changes)
-    found = []
-    for where in ("C", "numpy"):
-        monkeypatch.setenv(KERNELS, where)
-        with simulated(scene, tube(length=2.0, divisions=(8, 2, 1), comm=MPI.COMM_SELF)) as (simulation, rows):
-            found.append((simulation.cells.structure_tensor(), [row["remodeling_power"] for row in rows]))
-    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found[1][1], found[0][1], rtol=1e-9)
 
 
 # ---------------------------------------------------------------- at the edges of what they decide

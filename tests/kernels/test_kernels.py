@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 jit.LIBRARY_FLAGS += ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 files = ["tests/kernels/test_compiled.py", "tests/kernels/test_compiled_tensor.py"]
-sys.exit(pytest.main(["-q", "-s", "-p", "no:cacheprovider", "-x", *files, "-k", "not tube"]))
+sys.exit(pytest.main(["-q", "-s", "-p", "no:cacheprovider", "-x", *files]))
 """
 
 
@@ -84,14 +85,24 @@ def test_a_change_of_any_file_or_number_is_another_library(tmp_path: Path, monke
 
 
 # ---------------------------------------------------------------- numpy in their place
+RANDOM = {"model.kinematics": "full", "cells.initial": "random", "geometry.length": 1.0}
 TENSOR = {"remodeling.law": "tensor", "material.repulsion": "log", "remodeling.frame": "material"}
 
 
-@pytest.mark.parametrize("changes", [{}, *(TENSOR | {"remodeling.coupling": c} for c in ("extrapolated", "implicit"))])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"remodeling.law": "relaxation"},
+        RANDOM,
+        RANDOM | {"remodeling.frame": "material"},
+        *(TENSOR | {"remodeling.coupling": coupling} for coupling in ("extrapolated", "implicit")),
+    ],
+)
 def test_numpy_does_the_same_and_no_c_runs(
-    changes: dict[str, str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A radial artery, which says what computes."""
+    """A radial artery, which says what computes, and random cells; all alike, rounding alone tells some axes apart."""
     values = {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 2.0} | changes
     scene, found = preset_scene("kuhl-holzapfel-2007", "tube").with_values(values), []
     for where in ("C", "numpy"):
@@ -104,7 +115,8 @@ def test_numpy_does_the_same_and_no_c_runs(
             wanted = kernels.CompiledPointKernels if where == "C" else kernels.PointKernels
             assert type(simulation.cells.kernels) is wanted
             found.append(structure_tensor(*simulation.cells.point_cells[:2]))
-    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-12)
+    accuracy = 1e-9 if RANDOM.items() <= changes.items() else 1e-12
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=accuracy)
     assert caplog.text.count(f"{KERNELS}=numpy") == 1
 
 

@@ -10,7 +10,6 @@ import json
 import os
 import shutil
 import signal
-import stat
 import subprocess
 import sys
 import tempfile
@@ -574,28 +573,5 @@ def test_container_is_the_last_way(clone):
     assert clone.engine_calls()[-1][:2] == ["docker", "run"]
 
 
-def test_scripts_can_be_run():
-    for name in ("with-fenicsx", "tests/run", "tests/container/run", "bin/remodel-fenicsx", ".ci/run"):
-        assert (PROJECT / name).stat().st_mode & stat.S_IXUSR, name
-
-
 def test_a_temporary_folder_that_is_none_is_said(ready):
     one_line(ready.run("true", environment={"TMPDIR": "/etc/passwd"}), "TMPDIR=/etc/passwd: is no folder")
-
-
-@pytest.mark.skipif(os.getuid() != 0, reason="only root builds the image")
-@pytest.mark.parametrize(("engine", "words"), [
-    ("docker", "echo 27.5"), ("podman", "true"), ("buildah", "true"),
-    ("docker", "echo no daemon >&2; exit 1"), ("podman", "exit 125"), ("nothing", ""),
-])  # fmt: skip
-def test_a_client_alone_builds_no_image(engine, words, tmp_path):
-    """What .ci/run asks before it builds the image."""
-    for name in ("bash", "dirname", "env", "id", "readlink", "unshare"):
-        (tmp_path / name).symlink_to(str(shutil.which(name)))
-    (tmp_path / engine).write_text(f"#!/bin/sh\n{words}\n")
-    (tmp_path / engine).chmod(0o755)
-    command = [str(PROJECT / "tests" / "container" / "run"), "--possible"]
-    done = subprocess.run(command, env={"PATH": str(tmp_path)}, capture_output=True, text=True)
-    possible = engine != "nothing" and "exit" not in words
-    assert done.returncode == (0 if possible else 5)
-    assert done.stderr == ("" if possible else "neither buildah, nor an engine that answers to podman or docker\n")

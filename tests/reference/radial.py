@@ -17,7 +17,7 @@ quadratic elements, three Gauss points, tangents by complex steps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,7 @@ class RadialHistory:
 
     Attributes
     ----------
-    times, pressures, axial_stretches, inner_radii, outer_radii : (steps,)
+    times, pressures, inner_radii, outer_radii : (steps,)
         One entry per solved step, the first at t = step.
     nodes : (2 elements + 1,)
         Reference radii R of the nodes.
@@ -65,15 +65,10 @@ class RadialHistory:
     dimensions : (steps + 1, points, 3)
         Cell dimensions by direction: [k] are those with which step k was solved (row k of a run's history), [k + 1]
         those after its remodeling pass; [-1] is the end.
-    ranks : (steps + 1, points, 3)
-        Direction that has rank 0, 1, 2 (descending eigenvalue of the driver), in the same order of time.
-    newton_iterations, substeps : int
-        Sums over the run; substeps counts the parts of steps that had to be divided.
     """
 
     times: Array
     pressures: Array
-    axial_stretches: Array
     inner_radii: Array
     outer_radii: Array
     nodes: Array
@@ -83,21 +78,11 @@ class RadialHistory:
     stretches: Array
     cauchy: Array
     dimensions: Array
-    ranks: Array
-    newton_iterations: int = 0
-    substeps: int = 0
 
     def fibre_angle(self, row: int = -1) -> Array:
         """Return atan(l_z / l_t) at the Gauss points, degrees from circumferential to axial; row as in `dimensions`."""
         chain = self.dimensions[row]
         return np.degrees(np.arctan2(chain[:, AXIAL], chain[:, CIRCUMFERENTIAL]))
-
-    def fibre_angle_at(self, radius: float, row: int = -1) -> float:
-        """Return the fibre angle at a reference radius, linear between (and beyond the last two) Gauss points."""
-        angle = self.fibre_angle(row)
-        i = int(np.clip(np.searchsorted(self.points, radius) - 1, 0, len(self.points) - 2))
-        share = (radius - self.points[i]) / (self.points[i + 1] - self.points[i])
-        return float(angle[i] + share * (angle[i + 1] - angle[i]))
 
     def mean_fibre_angle(self, inside: float, outside: float, row: int = -1) -> float:
         """Return the volume mean of the fibre angle over the Gauss points with inside < R < outside."""
@@ -141,8 +126,6 @@ class Tube:
     outer_radius: float
     elements: int
     material: RadialMaterial
-    newton_iterations: int = field(default=0, init=False)
-    substeps: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         n = self.elements
@@ -204,7 +187,6 @@ class Tube:
         for _ in range(30):
             residual = self.residual(radii, squares, pressure, axial)
             step = solve_banded((2, 2), self.tangent(radii, squares, pressure, axial), -residual)
-            self.newton_iterations += 1
             while not self.admissible(self.stretches(radii + step, axial), squares):
                 step = step / 2
                 if np.max(np.abs(step)) < 1e-12:
@@ -233,7 +215,6 @@ class Tube:
                 found = self.newton(radii, squares, pressure, axial)
                 if found is not None:
                     radii, done, part = found, share, 2 * part
-                    self.substeps += 1
                 else:
                     part /= 2
                     if part < 1e-6:
@@ -369,7 +350,6 @@ def solve_radial(
     radii = tube.nodes.copy()
     state: tuple[Array, float, float] = (start**2, 0.0, 1.0)
     dimensions: list[Array] = [start.copy()]
-    all_ranks: list[Array] = [ranks]
     solved: list[tuple[Array, Array, Array]] = []
     times = step * np.arange(1, number_of_steps + 1)
     factors = np.minimum(times / ramp_time, 1.0)
@@ -394,13 +374,11 @@ def solve_radial(
         by_direction = np.empty_like(ranked)
         np.put_along_axis(by_direction, ranks, ranked, axis=1)
         dimensions.append(by_direction)
-        all_ranks.append(ranks)
         solved.append((radii, stretches, stresses))
     all_radii, all_stretches, all_stresses = (np.array(column) for column in zip(*solved))
     return RadialHistory(
         times,
         pressure * factors,
-        1 + stretch * factors,
         all_radii[:, 0],
         all_radii[:, -1],
         tube.nodes,
@@ -410,7 +388,4 @@ def solve_radial(
         all_stretches,
         all_stresses,
         np.array(dimensions),
-        np.array(all_ranks),
-        tube.newton_iterations,
-        tube.substeps,
     )

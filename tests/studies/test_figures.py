@@ -183,14 +183,3 @@ def test_the_verification_page_is_what_its_data_says(make_verification: Any) -> 
     assert {f"figures/{name}.png" for name in figures.FIGURES} < set(shown)
     for name in shown:
         assert 5_000 < (DOCS / name).stat().st_size < 300_000
-
-
-def test_the_verification_page_shows_the_proof(make_verification: Any) -> None:
-    """What is promised in words holds in the tables."""
-    kept = DOCS / "figures"
-    cases, drivers = (make_verification.rows_of(kept / f"comparison-{name}.csv") for name in ("cases", "drivers"))
-    assert {(row["stretch"], row["pressure"]) for row in cases} == set(figures.LOAD_CASES)
-    assert {row["driver"] for row in drivers} == {"cauchy", "pk2", "finger"}
-    assert all(row["radii_percent"] < 0.2 for row in [*cases, *drivers])
-    explicit = [*cases, *(row for row in drivers if row["law"] == "explicit")]
-    assert all(row["angle_mean"] < 1.0 and row["angle_outside"] < 1.0 for row in explicit)
