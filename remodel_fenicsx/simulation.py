@@ -182,6 +182,8 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
         for name in TURNED_OVER:
             quadrature.values(getattr(tissue, name), ())[:] = in_files(fibres, name, quadrature, domain)
     at_once, solver, settings = scene.time.is_equilibrium, scene.solver, scene.remodeling
+    if solver.predictor == "with-tolerance" and scene.time.tolerance is None and not at_once:
+        solver = solver.model_copy(update={"predictor": "none"})
     if at_once and scene.has_random_cells and scene.jumps_by_rank:  # no step is short enough, and passes swing
         settings = settings.model_copy(update={"coupling": "relaxed"})
     first, *more = (partial(values_of_loads, case.loads) for case in scene.each_case())

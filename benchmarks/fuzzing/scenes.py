@@ -256,7 +256,7 @@ def has_free_length(scene: Values) -> bool:
 def _solver(random: Random, scene: Values) -> Values:
     solver: Values = {
         "method": random.choices(("auto", "direct", "lagged", "iterative"), (3, 3, 1, 1))[0],
-        "predictor": random.choice(("none", "autoregressive")),
+        "predictor": random.choice(("none", "autoregressive", "with-tolerance")),
         "relative_tolerance": random.choice((1e-10, 1e-10, 1e-10, 1e-9, 1e-8, 1e-6)),
     }
     if solver["method"] == "iterative" and has_free_length(scene):

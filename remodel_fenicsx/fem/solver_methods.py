@@ -104,7 +104,6 @@ SOLVER_METHODS = {
     ),
 }
 
-NO_PREDICTOR = {"with-tolerance": "was removed; take 'autoregressive' or 'none'"}
 REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"}
 """Methods of earlier versions, and what to take in their place."""
 

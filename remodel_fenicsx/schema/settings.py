@@ -25,7 +25,6 @@ from remodel_fenicsx.fem.solver_methods import (
     AUTO,
     LARGE,
     LARGE_ON_RANKS,
-    NO_PREDICTOR,
     REMOVED,
     SMALL_BODY,
     SMALL_REDUCTION,
@@ -1292,9 +1291,10 @@ class Solver(Table):
         f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} "
         "(docs/speed_and_accuracy.md).",
     )
-    predictor: Annotated[str, OneOf(("none", "autoregressive"), (), NO_PREDICTOR)] = "autoregressive"
-    """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' at what
-    the last increments let expect. The solutions are the same to the tolerance."""
+    predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
+    """Where Newton's method starts a step: 'none' at the displacement of the step before, 'autoregressive' at what the
+    last increments let expect, 'with-tolerance' so where steps are chosen (time.tolerance) alone. The solutions are
+    the same to the tolerance."""
     absolute_tolerance: Annotated[float, FORCE] = Field(default=0.0, ge=0)
     """A force: a step is solved when |R| <= absolute_tolerance + relative_tolerance |nodal forces|."""
     relative_tolerance: float = Field(default=1e-10, ge=0, lt=1)
