@@ -23,8 +23,7 @@ from remodel_fenicsx.scene.scene import Mesh, Scene, Solver
 from remodel_fenicsx.schema.settings import Cells, Material, Remodeling
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution
-from remodel_fenicsx.state import State
-from remodel_fenicsx.state import UnitCells
+from remodel_fenicsx.state import State, UnitCells
 
 MATERIAL = Material()
 TIGHT = Solver(absolute_tolerance=1e-11, relative_tolerance=1e-13)

@@ -18,9 +18,8 @@ import pytest
 
 from remodel_fenicsx import Recording
 from remodel_fenicsx.results import checkpoint
-from remodel_fenicsx.results.run_folder import History
 from remodel_fenicsx.results.recording import read_history
-from remodel_fenicsx.results.run_folder import FolderTaken
+from remodel_fenicsx.results.run_folder import FolderTaken, History
 from remodel_fenicsx.results.vtkhdf import PatientFile, TransientGrid
 from remodel_fenicsx.running import resume, run
 from tests.forks import forked

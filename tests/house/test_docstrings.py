@@ -6,11 +6,9 @@ one child.
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import doctest
 import inspect
-import pkgutil
 import re
 from collections.abc import Iterator
 from functools import cached_property
@@ -24,7 +22,6 @@ from remodel_fenicsx import extend, parts
 from remodel_fenicsx.schema.tables import Table
 from tests.forks import forked
 
-ROOT = Path(__file__).parents[2]
 MODULES = (remodel_fenicsx, parts, extend)
 PUBLIC = {name: getattr(module, name) for module in MODULES for name in module.__all__ if not name.startswith("__")}
 DESCRIBED = {name: value for name, value in PUBLIC.items() if inspect.isclass(value) or inspect.isfunction(value)}
@@ -102,31 +99,6 @@ def test_a_module_says_what_its_constants_are(module: Any) -> None:
     constants = {name for name in module.__all__ if name not in DESCRIBED}
     assert entries(sections(module.__doc__).get("Attributes", "")) == constants
     assert ">>> " in module.__doc__
-
-
-def documented_at_length() -> Iterator[str]:
-    """Functions and classes of the package whose docstrings have several lines, as module.name."""
-    for path in sorted((ROOT / "remodel_fenicsx").rglob("*.py")):
-        module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and "\n" in (ast.get_docstring(node) or ""):
-                yield f"{module}.{node.name}"
-
-
-def is_table(name: str) -> bool:
-    """Whether it is a class of keys: their reference shows its docstring."""
-    return name.rpartition(".")[2][0].isupper() and issubclass(pkgutil.resolve_name(name), Table)
-
-
-def test_what_is_private_has_one_line() -> None:
-    """Public are the names of the interface with their members and bases, and the tables of a scene."""
-    named = {(value.__module__, value.__name__) for value in DESCRIBED.values()}
-    kinds = [base for value in DESCRIBED.values() if inspect.isclass(value) for base in value.__mro__]
-    named |= {(kind.__module__, kind.__name__) for kind in kinds}
-    named |= {(each.__module__, each.__name__) for kind in kinds for _, each in members(kind)}
-    found = [name for name in documented_at_length() if tuple(name.rsplit(".", 1)) not in named]
-    found = [name for name in found if not is_table(name)]
-    assert not found
 
 
 def run_examples() -> None:

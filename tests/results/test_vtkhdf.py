@@ -1,9 +1,11 @@
-"""VTKHDF files: what VTK's own reader finds in them, also after a crash."""
+"""VTKHDF files: what VTK's own reader finds in them, also after a crash, a full disk or Ctrl-C."""
 
 from __future__ import annotations
 
+import errno
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -185,6 +187,29 @@ def test_nothing_is_overwritten(tmp_path):
     with pytest.raises(FileExistsError, match="File exists"):  # and not that it is a link
         TransientGrid(path, CUBE, VTK_CUBE, 12)
     assert path.read_text() == "mine"
+
+
+def test_a_full_disk_raises_and_keeps_what_was_published(tmp_path):
+    # a limit on the size of files stands for the full disk: the same error from the same system call
+    path = tmp_path / "f.vtkhdf"
+    field = np.random.default_rng(5).random((4, 8, 3)).astype(np.float32)
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    grid = TransientGrid(path, CUBE, VTK_CUBE, 12)
+    grid.append(0.0, {"u": field[0]})
+    grid.publish()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, old[1]))
+    try:
+        for k in (1, 2):  # an error again as long as there is no room
+            with pytest.raises(OSError) as full:
+                grid.append(k, {"u": field[k]})
+            assert full.value.errno == errno.EFBIG
+        with pytest.raises(OSError):
+            grid.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    grid.close()
+    assert np.array_equal(raw_series(path, "u", 8), field[:1])
+    assert [found.name for found in tmp_path.iterdir()] == ["f.vtkhdf"]
 
 
 @pytest.mark.parametrize("steps", [1, 64])  # the index of HDF5 grows a level at 64 chunks

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 import remodel_fenicsx
+from docs.making import verification
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import page
 from tests.conftest import Refused
@@ -169,16 +170,10 @@ def test_all_numbers_are_those_of_the_page(tmp_path: Path, monkeypatch: pytest.M
 # ---------------------------------------------------------------- docs/verification.md
 
 
-@pytest.fixture(scope="module")
-def make_verification() -> Any:
-    """The program that makes the page, as a module."""
-    return importlib.import_module("docs.making.verification")
-
-
-def test_the_verification_page_is_what_its_data_says(make_verification: Any) -> None:
+def test_the_verification_page_is_what_its_data_says() -> None:
     """Whoever draws anew and forgets the page, or edits it by hand, is told: run docs/make verification."""
     text = (DOCS / "verification.md").read_text(encoding="utf-8")
-    assert make_verification.page() == text  # every number again, from the tables beside the pictures
+    assert verification.page() == text  # every number again, from the tables beside the pictures
     shown = re.findall(r"!\[.*\]\((.*)\)", text)
     assert {f"figures/{name}.png" for name in figures.FIGURES} < set(shown)
     for name in shown:

@@ -14,8 +14,7 @@ import pytest
 
 from remodel_fenicsx import Scene, SceneError, cli, preset_scene, read_scene
 from remodel_fenicsx.schema.settings import STRESS_UNITS
-from remodel_fenicsx.studies.fit import Problem, fit, minimised
-from remodel_fenicsx.studies.fit import read_measurements
+from remodel_fenicsx.studies.fit import Problem, fit, minimised, read_measurements
 from tests.conftest import Refused
 from tests.runs import rows_of
 from tests.tables import rows

@@ -78,12 +78,6 @@ def test_a_table_of_this_model_gives_its_numbers_back(tmp_path: Path, capsys: py
         assert "along x" in misfit and ("along y" in misfit) is across
 
 
-def test_stiff_exponents_are_no_trouble(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of an adventitia of papers."""
-    tables, _ = printed(["--k1", "996", "--k2", "524", "--kappa", "0.226", "--c", "7.64", "--up-to", "1.1"], capsys)
-    assert tables["material"]["contour_length"] > 1.0
-
-
 @pytest.mark.parametrize(("arguments", "line"), [
     (["--k1", "1", "--k2", "1"], "needs --k1, --k2 and --c above 0 and --up-to from 1 to 3, or --table"),
     ([*PAPER, "--kappa", "0.4"], "--kappa 0.4: must be from 0 to 1/3"),
