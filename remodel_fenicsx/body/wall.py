@@ -229,7 +229,7 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ..
         Column(
             f"{name}_stress_{where}",
             "stress",
-            f"mean Cauchy stress {direction} the deformed wall, over the elements of `fibre_angle_{where}`; that at a face differs",
+            f"mean Cauchy stress {direction} the deformed wall, over the elements of `fibre_angle_{where}`",
             partial(_stress, mean, component),
         )
         for name, (direction, component) in STRESSES.items()

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from remodel_fenicsx import cli
+from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 
 (SUBPARSERS,) = [action for action in cli.parser()._actions if isinstance(action, argparse._SubParsersAction)]
 COMMANDS: dict[str, argparse.ArgumentParser] = {
@@ -42,6 +43,11 @@ def test_the_help_of_a_command_has_examples_that_it_takes(name: str, capsys: pyt
         assert words[0] == name and cli.parser().parse_args(words).command == name
     for action in COMMANDS[name]._actions:
         assert action.help and (action.dest == "help" or action.help[0].isupper() and action.help.endswith((".", ").")))
+
+
+def test_the_help_names_what_there_is_without_loading_it() -> None:
+    assert set(PRESETS) <= set(re.findall(r"[\w-]+[\w]", COMMANDS["new"].format_help()))
+    assert set(PROFILES) <= set(re.findall(r"\w+", COMMANDS["run"].format_help()))
 
 
 @pytest.mark.parametrize("name", COMMANDS)
