@@ -155,7 +155,7 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monke
 
 @pytest.mark.slow
 def test_all_numbers_are_those_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To what rounding makes: with S, an inner radius larger by 1e-13 turns fibres by up to 0.07 degrees on the way."""
+    """To what another machine rounds: of angles in elements that hardly decide."""
     assert draw(monkeypatch, "-o", tmp_path, "--runs", tmp_path / "runs") == 0
     tables = [path for name in figures.FIGURES for path in (DOCS / "figures").glob(f"{name}[.-]*csv")]
     assert len(tables) == 14
@@ -164,8 +164,7 @@ def test_all_numbers_are_those_of_the_page(tmp_path: Path, monkeypatch: pytest.M
         assert list(found) == list(kept)
         for column, values in kept.items():
             if values.dtype.kind == "f":
-                near = 0.1 if re.fullmatch("fibre_angle.*_pk2", column) else 0.01
-                np.testing.assert_allclose(found[column], values, rtol=1e-4, atol=near, err_msg=f"{path} {column}")
+                np.testing.assert_allclose(found[column], values, rtol=1e-4, atol=0.01, err_msg=f"{path} {column}")
 
 
 # ---------------------------------------------------------------- docs/verification.md
