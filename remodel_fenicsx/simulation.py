@@ -14,7 +14,7 @@ from dolfinx.fem import Function
 from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.loading import Loading, LoadValues
+from remodel_fenicsx.body.loading import Loading, LoadValues, values_of_loads
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.evolution.coupling import Maker
@@ -244,11 +244,6 @@ def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
         quadrature.values(kinematics.gradient, (3, 3))[:] = values
     simulation.scene = scene
     return True
-
-
-def values_of_loads(loads: Mapping[str, Any], time: float) -> LoadValues:
-    """Magnitude of every load at a time."""
-    return {name: load.value * load.factor(time) for name, load in loads.items()}
 
 
 # ---------------------------------------------------------------- parts, in their order

@@ -21,6 +21,11 @@ Array = NDArray[np.float64]
 LoadValues = dict[str, float]
 
 
+def values_of_loads(loads: Mapping[str, Any], time: float) -> LoadValues:
+    """Magnitude of every load of a scene at a time."""
+    return {name: load.value * load.factor(time) for name, load in loads.items()}
+
+
 class Loading:
     """What holds and drives a body: boundary conditions, external forces, and their magnitudes by name.
 

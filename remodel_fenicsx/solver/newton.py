@@ -26,7 +26,7 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.linear import EveryTangent
-from remodel_fenicsx.state import State, stress_rounding
+from remodel_fenicsx.state import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
 
@@ -238,22 +238,6 @@ def failure_text(reason: int, iterations: int, extension: Extension) -> str:
     return SNES_REASONS.get(reason, f"SNES stopped with reason {reason}")
 
 
-class LoadPhase:
-    """Tells whether the loads are held: those of this step are those of the step before."""
-
-    def __init__(self, state: State):
-        self._state, self._step = state, state.number
-        self._before: dict[str, float] = {}
-        self._now = dict(state.loading.values)
-
-    def held(self) -> bool:
-        """Whether they are, in the step under way."""
-        if self._step != self._state.number:
-            self._before, self._step = self._now, self._state.number
-        self._now = dict(self._state.loading.values)
-        return self._now == self._before
-
-
 class GuardedNewton:
     """Solves an equilibrium from the present unknowns; use `close` when it is needed no more."""
 
@@ -267,14 +251,10 @@ class GuardedNewton:
         self.convergence = Convergence(equilibrium, settings)
         self._present = _Solve(self._values.copy())
         self._options_checked = False
-        self._phase = LoadPhase(equilibrium.state)
-        self._make_solver(self._chosen(held=False))
-
-    def _chosen(self, held: bool) -> str:
-        """The method for loads that change, or are held."""
-        kinematics, unknowns, ranks = self.equilibrium.state.kinematics, self._x.getSize(), self.equilibrium.comm.size
-        narrow = not kinematics.three_dimensional
-        return chosen(self.settings.method, unknowns, ranks, narrow, kinematics.suits_multigrid, held)
+        kinematics, unknowns, ranks = equilibrium.state.kinematics, self._x.getSize(), equilibrium.comm.size
+        traits = settings.method, unknowns, ranks, not kinematics.three_dimensional, kinematics.suits_multigrid
+        self._methods = {held: chosen(*traits, held) for held in (False, True)}  # for loads that change, or are held
+        self._make_solver(self._methods[False])
 
     def _make_solver(self, method: str) -> None:
         """PETSc's objects of a method."""
@@ -301,7 +281,7 @@ class GuardedNewton:
 
     def _suit_phase(self) -> None:
         """Take the method for this step, where loads that are held have one of their own."""
-        method = self._chosen(self._phase.held())
+        method = self._methods[self.equilibrium.state.loads_are_held]
         if method == self.method:
             return
         if self.equilibrium.comm.rank == 0:

@@ -15,7 +15,7 @@ from remodel_fenicsx.fem import solver_methods as methods
 from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear, newton
-from remodel_fenicsx.solver.newton import Limits, LoadPhase
+from remodel_fenicsx.solver.newton import Limits
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants
 from remodel_fenicsx.watch.warnings import VolumeResponse
 from tests import parts
@@ -264,17 +264,16 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
     assert not lagged.given_up
 
 
-@pytest.mark.parametrize("method", ["auto", "lagged"])
-def test_loads_are_held_from_the_second_step_of_equal_loads_on(method: str) -> None:
-    """A second solve of a step is no step of its own."""
-    with made(preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.method": method})) as simulation:
+def test_loads_are_held_from_the_second_step_of_equal_loads_on() -> None:
+    """A part of a step is no step of its own."""
+    with made(preset_scene("kuhl-holzapfel-2007", "cube")) as simulation:
         state, held = simulation.state, []
-        phase = LoadPhase(state)
-        for number, force in enumerate((1.0, 2.0, 2.0, 2.0, 3.0)):
-            state.number = number
-            state.loading.set({"force": force})
-            held += [phase.held(), phase.held()]
-        assert held == [False, False, False, False, True, True, True, True, False, False]
+        for number, force in enumerate((1.0, 2.0, 2.0, 2.0, 3.0), start=1):
+            for part in (0.5, 1.0):
+                state.loading.set({"force": part * force})
+            held.append(state.loads_are_held)
+            state.reach(float(number), number)
+        assert held == [False, False, True, True, False]
 
 
 def test_the_method_may_be_another_one_where_loads_are_held(
