@@ -235,11 +235,10 @@ log = logging.getLogger(__name__)
 AIM = 0.85  # share of the tolerance that another length aims at
 KEPT, WORTHWHILE = 0.9, 1.5  # best lengths over the present one between which steps stay as they are
 LENGTHENING, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two steps
+HALVED = 0.5  # what is left, at most, of a step that is taken back once more: its error hardly falls
 STRETCHED = 1.05  # so much longer steps are allowed to be where they are one fewer to a stop
 SMALLEST = 2.0**-12  # of the first step: shorter ones are not tried where steps cannot be solved
 FASTEST = 360.0  # degrees by which chains turn, at most, while cells remodel or loads go from one corner to the next
-FALLS, LONGER = 0.8, 2.0  # an error within this share of that of so much a longer step does not come from the step
-SHORT = 0.3  # of such a time: longer steps may have an error that has saturated
 IN_VAIN = 20  # steps above the tolerance in such a time that shorter ones would not help, until longer ones go on
 NEAR_TOLERANCE = 4.0  # tolerances: below such an error shorter steps are tried again
 FAILED_STEPS = 3  # steps in a row that could not be solved, each a quarter of the one before
@@ -292,7 +291,8 @@ class StepControl:
             except StepTooLongError as rejected:
                 log.debug("time %g: %s, taken back", time, rejected)
                 self._rejected.append(rejected)
-                duration = max(self._best(rejected.error, rejected.duration, LENGTHENING), self._shortest())
+                most = 1.0 if len(self._rejected) == 1 else HALVED
+                duration = max(self._best(rejected.error, rejected.duration, most), self._shortest())
             except StepFailure as failure:
                 failures += 1
                 duration = (time - self.state.time) / 4
@@ -312,10 +312,9 @@ class StepControl:
         """Accept a step and choose the next one, or raise."""
         error, duration = self.error.measure(step).controlled / self.tolerance, step.time - self.state.time
         numbers, shortest, goes_on = self._numbers, self._shortest(), self._numbers["in_vain"] > IN_VAIN
-        longer = self._longer_with_the_same(error, duration)
-        if error > 1 and not (goes_on or longer or duration <= (1 + 1e-9) * STRETCHED * shortest):
+        if error > 1 and not (goes_on or duration <= (1 + 1e-9) * STRETCHED * shortest):
             raise StepTooLongError(step, duration, error)
-        wanted = longer or self._next(error, duration)
+        wanted = self._next(error, duration)
         goes_on = self._count(error, duration)
         if step.time_error > self.tolerance and error > 1 and numbers["said"] < 1 + goes_on:
             numbers["said"] = 1.0 + goes_on
@@ -340,13 +339,6 @@ class StepControl:
         return present if KEPT * present <= best < WORTHWHILE * present else best
 
     # ------------------------------------------------------------ steps in vain
-    def _longer_with_the_same(self, error: float, duration: float) -> float:
-        """Length of a much longer attempt that was refused for about the same error: not for its length. 0: none."""
-        if error <= 1 or duration > SHORT * self._fastest_time():
-            return 0.0
-        same = [refused.duration for refused in self._rejected if FALLS < error / refused.error < 1 / FALLS]
-        return max((length for length in same if length >= LONGER * duration), default=0.0)
-
     def _count(self, error: float, duration: float) -> bool:
         """Steps above the tolerance that could not be made shorter: whether they are so many that longer ones go on."""
         numbers, faded = self._numbers, math.exp(-duration / self._fastest_time())

@@ -211,7 +211,7 @@ def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytes
     lengths = [0.2, 0.4, float(np.sqrt(0.8))]
     steps, _ = marched(tube("staggered", 10.0, **{"cells.initial": lengths, "time.tolerance": 0.5}))
     errors = [step.time_error for step in steps]
-    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 110
+    assert errors[0] > 10.0 and np.median(errors) < 0.5 and len(steps) < 120
     assert sum("does not fall to time.tolerance" in record.message for record in caplog.records) == 1
 
 
