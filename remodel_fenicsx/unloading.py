@@ -17,6 +17,7 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
+from scipy.optimize import NoConvergence, broyden1
 from ufl.algorithms.map_integrands import map_integrands
 
 from remodel_fenicsx.body.domain import dof_of_node
@@ -145,7 +146,7 @@ def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
 Array = NDArray[np.float64]
 Said = Callable[[str], object]
 
-LOADED_AGAIN = 1e-9  # of the largest length: how far the loaded numbers may be from those of the scene
+LOADED_AGAIN = 1e-9  # relative: how far the loaded numbers may be from those of the scene
 MOST_LOADINGS = 30  # runs for one share of the loads
 LOAD_STEPS = 10  # of a run to the end of the ramps
 # cells that stay; what says how to remodel goes with a law
@@ -158,31 +159,28 @@ PASSIVE: dict[str, Any] = {
 def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
     """By Broyden's method, from inverse elastostatics."""
     shape: Any = scene.geometry
-    names = sorted((n for n in scene.regions if scene.regions[n].outer_radius), key=lambda n: _outer(scene, n))
-    inside = [_outer(scene, name) for name in names if _outer(scene, name) < shape.outer_radius]
+    inside = [radius for radius in _outer_radii(scene).values() if radius < shape.outer_radius]
     given = np.array([shape.inner_radius, *inside, shape.outer_radius, shape.length])
     runs, found = 0, given
 
     def find(share: float, correction: Any) -> Any:
         """How far logarithms are from what inverse elastostatics says, from how far they were; the numbers too."""
-        nonlocal runs, found
         first: Any = np.log(_inverse(scene, given, share))
-        numbers, slope, words = first + correction, np.eye(len(given)), ""
-        step = before = np.zeros_like(numbers)
-        for _ in range(MOST_LOADINGS):
-            runs += 1
+
+        words, how = "", {"alpha": 1.0, "line_search": None, "maxiter": MOST_LOADINGS, "f_tol": LOADED_AGAIN}
+
+        def error(numbers: Any) -> Any:
+            nonlocal runs, found, words
+            runs, found = runs + 1, np.exp(numbers)
             said(f"run {runs}{words}, {100 * share:g} % of the loads")
-            found = np.exp(numbers)
-            loaded = _loaded(scene, comm, found, share)
-            if np.abs(given - loaded).max() <= LOADED_AGAIN * given.max():
-                return numbers - first
-            error = np.log(given / loaded)
-            if step.any():  # Broyden's good update of the inverse derivative
-                change = slope @ (before - error)
-                slope = slope + np.outer(step - change, step @ slope) / (step @ change)
-            step, before = slope @ error, error
-            numbers, words = numbers + step, f", off by {np.abs(error).max():.0e} before"
-        raise ArithmeticError(f"off by {np.abs(error).max():.2g} after {MOST_LOADINGS} runs")
+            missed = np.log(given / _loaded(scene, comm, found, share))
+            words = f", off by {np.abs(missed).max():.0e} before"
+            return missed
+
+        try:
+            return broyden1(error, first + correction, **how) - first
+        except NoConvergence as failure:
+            raise ArithmeticError(f"not found in {MOST_LOADINGS} runs{words}") from failure
 
     in_shares(find, np.zeros(len(given)))
     unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
@@ -190,9 +188,10 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
     return _with_numbers(scene, found)
 
 
-def _outer(scene: Scene, name: str) -> float:
-    outer: Any = scene.regions[name].outer_radius
-    return float(outer)
+def _outer_radii(scene: Scene) -> dict[str, float]:
+    """Of the regions that say one, from the lumen outwards."""
+    said = {name: region.outer_radius for name, region in scene.regions.items() if region.outer_radius is not None}
+    return dict(sorted(said.items(), key=lambda item: item[1]))
 
 
 def _inverse(scene: Scene, given: Array, share: float) -> Array:
@@ -239,8 +238,7 @@ def _with_numbers(scene: Scene, numbers: Array) -> Scene:
     changes: dict[str, Any] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
     changes |= {"geometry.inner_radius": float(numbers[0]), "geometry.outer_radius": float(numbers[-2])}
     changes |= {"geometry.length": float(numbers[-1])}
-    said = [name for name in scene.regions if scene.regions[name].outer_radius is not None]
-    for name, radius in zip(sorted(said, key=lambda n: _outer(scene, n)), numbers[1:-1], strict=False):
+    for name, radius in zip(_outer_radii(scene), numbers[1:-1], strict=False):
         changes[f"regions.{name}.outer_radius"] = float(radius)
     return scene.with_values(changes)
 

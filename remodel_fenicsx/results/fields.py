@@ -9,21 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
+from remodel_fenicsx.results.columns import Measurement, Observer
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, NO_PRESTRETCH, REGION, UNLOADED
 from remodel_fenicsx.schema import SAME_TIME, same_time
-from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.system.files import ClosedAtEnd
 
 Array = NDArray[np.float64]
@@ -55,79 +53,40 @@ class ElementFields:
     """Element means for pictures."""
 
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
-        self.shape, self.state, self.names = shape, stepper.state, tuple(names)
-        self.quadrature = self.state.cells.quadrature
-        self.turnover = stepper.turnover
+        self.observer, self.turnover, self.names = Observer(shape, stepper, ()), stepper.turnover, tuple(names)
         self.tissue, self._parameters = stepper.tissue, stepper.coupling.equilibrium.parameters
-        state = self.state
-        F = state.kinematics.deformation_gradient(state.unknown)
-        tensors = [F]
-        remodeling = stepper.remodeling if stepper.remodeling.law.remodels else None
-        self._stresses: PointStresses | None = None
-        if "cauchy_stress" in self.names:
-            self._stresses = PointStresses(state, self.tissue) if remodeling is None else remodeling.stresses
-        if self._stresses is not None:
-            tensors.append(self._stresses.ufl.cauchy)
-        stacked = ufl.as_vector([t[i, j] for t in tensors for i in range(3) for j in range(3)])
-        self._shared = remodeling if remodeling is not None and remodeling.stacked == stacked else None
-        self._state = None if self._shared else jit.expression(stacked, self.quadrature.points)
 
     def __call__(self) -> dict[str, Array]:
         """By name, one row per local element."""
-        values = self._values()
-        state, local, mean = self.state, self.state.cells.local_axes, self.quadrature.element_mean
-        cells, F = state.cells, values[..., :9].reshape(*values.shape[:2], 3, 3)
-        axes, mean_cells = cells.axis_values, cache(self.mean_cells)
-
-        def angle(axes: Array, local: Array) -> Array:
-            found = self.shape.fibre_angle(cells.dimension_values, axes, local)
-            return self.quadrature.element_mean_of_known(self._parameters.where_chains(found))
-
-        def mean_axis(i: int) -> Array:
-            return np.asarray(mean_cells()[1][:, i])
-
-        def mean_number(number: Any) -> Array:
-            return mean(self.quadrature.values(number, ()))
-
-        def extension() -> Array:
-            gradient = state.elastic(F).reshape(-1, 3, 3)
-            squared = cells.kernels.squared_length(gradient, cells.point_cells).reshape(F.shape[:2])
-            return np.asarray(np.max(np.sqrt(squared) / self._parameters.locking_length(), axis=1))
-
+        state, measured = self.observer.state, Measurement(self.observer, None)  # type: ignore[arg-type]
+        quadrature, mean_cells = measured.quadrature, cache(self.mean_cells)
+        mean, mean_of_known = quadrature.element_mean, quadrature.element_mean_of_known
         makers: dict[str, Callable[[], Array]] = {
-            "deformation_gradient": lambda: mean(values[..., :9]),
-            "cauchy_stress": lambda: mean(values[..., 9:18]),
+            "deformation_gradient": lambda: mean(measured.F).reshape(-1, 9),
+            "cauchy_stress": lambda: mean(measured.stress).reshape(-1, 9),
             "cell_dimensions": lambda: mean_cells()[0],
-            "fibre_angle": lambda: angle(axes, local.axes),
-            UNLOADED: lambda: angle(state.elastic_axes(axes), local.axes),
-            "fibre_angle_deformed": lambda: angle(state.elastic_axes(axes, F), local.deformed(F)),
-            "chain_extension": extension,
-            REGION: lambda: state.loading.domain.element_region.astype(np.float64),
+            "fibre_angle": lambda: mean_of_known(measured.fibre_angle),
+            UNLOADED: lambda: mean_of_known(measured.fibre_angle_unloaded),
+            "fibre_angle_deformed": lambda: mean_of_known(measured.fibre_angle_deformed),
+            "chain_extension": lambda: measured.chain_extension.max(axis=1),
+            REGION: lambda: measured.domain.element_region.astype(np.float64),
         }
-        makers |= {name: partial(mean_axis, i) for i, name in enumerate(AXIS_FIELDS)}
+        makers |= {name: partial(lambda i: mean_cells()[1][:, i], i) for i, name in enumerate(AXIS_FIELDS)}
         G = state.natural_gradient
         if G is not None:
             makers[NATURAL_GRADIENT] = lambda: mean(G).reshape(-1, 9)
         if state.kinematics.grows:
             makers[GROWTH] = lambda: mean(self.turnover.growth.ratio)
-        turned = {name: getattr(self.tissue, name) for name in TURNED_OVER}
-        makers |= {name: partial(mean_number, number) for name, number in turned.items() if number is not None}
+        for name in TURNED_OVER:
+            if (number := getattr(self.tissue, name)) is not None:
+                makers[name] = partial(lambda one: mean(quadrature.values(one, ())), number)
         return {name: makers[name]() for name in OF_ELEMENTS if name in self.names and name in makers}
-
-    def _values(self) -> Array:
-        """F, and Cauchy stress where it is wanted, row by row, (elements, points, 9 or 18)."""
-        if self._shared is not None:  # the pass will ask for the same
-            return self._shared.stacked_values()
-        if self._stresses is not None:
-            self._stresses.refresh()
-        return self.quadrature.evaluate(self._state, (9 if self._stresses is None else 18,))
 
     def mean_cells(self) -> tuple[Array, Array]:
         """Lengths (elements, 3) and axes as rows (elements, 3, 3) of the mean structure tensor, longest first."""
-        cells = self.state.cells
-        squared, axes = cells.kernels.principal(
-            self.quadrature.element_mean(cells.structure_tensor()), cells.axis_values[:, 0]
-        )
+        cells = self.observer.state.cells
+        means = cells.quadrature.element_mean(cells.structure_tensor())
+        squared, axes = cells.kernels.principal(means, cells.axis_values[:, 0])
         chains = self._parameters.has_chains()[:, :1]  # of regions: all points of an element, or none
         return np.sqrt(np.maximum(squared, 0.0)) * chains, axes
 

@@ -12,7 +12,6 @@ import io
 import os
 import shutil
 import signal
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, part_of
+from remodel_fenicsx.system.interrupts import handled
 
 if TYPE_CHECKING:
     import h5py
@@ -51,16 +51,11 @@ _COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "s
 @contextmanager
 def signals_held_back() -> Iterator[None]:
     """Let Python's signal handlers run after the block: an exception below HDF5 would crash the process."""
-    numbers = signal.valid_signals() if threading.current_thread() is threading.main_thread() else ()
-    handlers = {int(number): handler for number in numbers if callable(handler := signal.getsignal(number))}
     caught: list[int] = []
     try:
-        for number in handlers:
-            signal.signal(number, lambda number, _: caught.append(number))
-        yield
+        with handled(lambda number, _: caught.append(number), signal.valid_signals(), callable):
+            yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
         for number in caught:
             signal.raise_signal(number)
 

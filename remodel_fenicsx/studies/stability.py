@@ -48,11 +48,14 @@ ENDS = {"reversing": SLEPc.EPS.Which.SMALLEST_REAL, "growing": SLEPc.EPS.Which.L
 
 @dataclass(frozen=True)
 class PassMode:
-    """A change of the cells that a pass multiplies by a factor."""
+    """A change of the cells that a pass multiplies by a factor; NaN where none was found."""
 
     factor: float
     place: tuple[float, float, float]
     volume_share: float
+
+
+NOT_FOUND = PassMode(np.nan, (np.nan, np.nan, np.nan), np.nan)
 
 
 class LinearPass:
@@ -66,7 +69,8 @@ class LinearPass:
         cells = self.state.cells.point_cells
         self.cells = cells.copy()
         self.size = np.sum(self.cells.dimensions**2, axis=1)
-        self._weights = np.sqrt(self.quadrature.owned(self.quadrature.volumes).reshape(-1))
+        # the square of a vector, nine numbers a point, is the integral of |dA|^2
+        self._weights = np.sqrt(self.quadrature.owned(self.quadrature.volumes).reshape(-1, 1, 1))
         self.owned = self._weights.size
         vector = self.state.unknown.x.petsc_vec
         self._forces, self._answer, self._x = (vector.duplicate() for _ in range(3))
@@ -142,12 +146,12 @@ class LinearPass:
 
     def mult(self, matrix: Any, x: Any, y: Any) -> None:
         """The map as a matrix of PETSc: y = A x."""
-        y.array[:] = self.vector(self(self.tensors(x.array_r)))
+        y.array[:] = (self(self._tensors(x.array_r)) * self._weights).ravel()
 
     # ------------------------------------------------------------ its eigenvalues
-    def extreme(self, end: str) -> PassMode | None:
+    def extreme(self, end: str) -> PassMode:
         """The mode with the most negative factor ("reversing") or with the largest ("growing"), where it converges."""
-        rows = 6 * self.owned
+        rows = 9 * self.owned
         total = self.equilibrium.comm.allreduce(rows, MPI.SUM)
         operator = PETSc.Mat().createPython(((rows, total), (rows, total)), self, self.equilibrium.comm)
         operator.setUp()
@@ -159,18 +163,19 @@ class LinearPass:
         solver.setTolerances(FACTOR_ERROR, RESTARTS)
         solver.setConvergenceTest(SLEPc.EPS.Conv.ABS)
         start = operator.createVecRight()
-        start.array[:] = np.random.default_rng(1).standard_normal(rows)
+        random = np.random.default_rng(1).standard_normal((self.owned, 3, 3))
+        start.array[:] = (random + np.swapaxes(random, 1, 2)).ravel()  # A is symmetric, and so is what a pass makes
         solver.setInitialSpace(start)
         solver.solve()
-        found = None
+        found = NOT_FOUND
         if solver.getConverged():
-            found = self._mode(float(np.real(solver.getEigenpair(0, start))), self.tensors(start.array_r))
+            found = self._mode(float(np.real(solver.getEigenpair(0, start))), self._tensors(start.array_r))
         for thing in (solver, operator, start):
             thing.destroy()
         return found
 
     def _mode(self, factor: float, change: Array) -> PassMode:
-        comm, volumes = self.equilibrium.comm, self._weights**2
+        comm, volumes = self.equilibrium.comm, self._weights.ravel() ** 2
         square = np.sum(change**2, axis=(1, 2))
         first, second, whole = (
             float(comm.allreduce(np.sum(volumes * values))) for values in (square, square**2, np.ones(self.owned))
@@ -178,32 +183,18 @@ class LinearPass:
         place = self.quadrature.place_of_largest(square.reshape(-1, self.quadrature.shape[1]))
         return PassMode(factor, place, first**2 / second / whole)
 
-    # ------------------------------------------------------------ tensors as vectors
-    def tensors(self, vector: Array) -> Array:
-        """Changes of A (points, 3, 3) of a vector of six numbers a point, whose square is the integral of |dA|^2."""
-        six = vector.reshape(-1, 6) / self._weights[:, None]
-        found = np.zeros((len(six), 3, 3))
-        for index in range(3):
-            found[:, index, index] = six[:, index]
-        for index, (i, j) in enumerate(SHEAR_PLANES, start=3):
-            found[:, i, j] = found[:, j, i] = six[:, index] / np.sqrt(2)
-        return found
-
-    def vector(self, tensors: Array) -> Array:
-        """The inverse of `tensors`."""
-        diagonal = [tensors[:, i, i] for i in range(3)]
-        others = [np.sqrt(2) * tensors[:, i, j] for i, j in SHEAR_PLANES]
-        six: Array = np.stack(diagonal + others, axis=1) * self._weights[:, None]
-        return six.reshape(-1)
+    def _tensors(self, vector: Array) -> Array:
+        """Changes of A (points, 3, 3) of a vector."""
+        return np.asarray(vector.reshape(-1, 3, 3) / self._weights)
 
 
 @dataclass(frozen=True)
 class Amplification:
-    """The extreme modes of a step's pass; None for one that was not found."""
+    """The extreme modes of a step's pass."""
 
     time: float
-    reversing: PassMode | None
-    growing: PassMode | None
+    reversing: PassMode
+    growing: PassMode
 
 
 class AmplificationWatcher(Watcher):
@@ -219,7 +210,7 @@ class AmplificationWatcher(Watcher):
             return
         with closing(LinearPass(self.stepper, step.time, step.work.residual)) as linear:
             modes = [linear.extreme(end) for end in ENDS]
-            if None in modes and linear.equilibrium.comm.rank == 0:
+            if NOT_FOUND in modes and linear.equilibrium.comm.rank == 0:
                 words = f"not found to {FACTOR_ERROR:g} after {RESTARTS} restarts"
                 log.warning("time %g: a factor of the pass was %s", step.time, words)
         self.found.append(Amplification(step.time, *modes))
@@ -227,8 +218,8 @@ class AmplificationWatcher(Watcher):
     def committed(self, step: Step) -> None:
         """Say it."""
         if self.chosen(step):
-            found = _factor(self.found[-1].reversing)
-            log.info("time %g: a pass multiplies the worst small change by %.3g", step.time, found)
+            factor = self.found[-1].reversing.factor
+            log.info("time %g: a pass multiplies the worst small change by %.3g", step.time, factor)
 
     def undone(self, step: Step) -> None:
         """What was found of the step goes."""
@@ -284,21 +275,17 @@ def unseen_by(scene: Scene) -> str:
 
 def as_table(watcher: AmplificationWatcher, share: float) -> Table:
     """Columns of stability.csv, one row per time that was analysed; NaN where a mode was not found."""
-    table: Table = {"time": [found.time for found in watcher.found]}
     reversing = [found.reversing for found in watcher.found]
-    factors = np.array([_factor(mode) for mode in reversing])
-    table["factor"] = list(factors)
-    table["factor_of_coupling"] = list(1 - share * (1 - factors))
-    table["stable_share"] = list(np.minimum(1.0, 2 / (1 - np.minimum(factors, 0.0))))
-    for index, name in enumerate("xyz"):
-        table[name] = [np.nan if mode is None else mode.place[index] for mode in reversing]
-    table["volume_share"] = [np.nan if mode is None else mode.volume_share for mode in reversing]
-    table["growing_factor"] = [_factor(found.growing) for found in watcher.found]
-    return table
-
-
-def _factor(mode: PassMode | None) -> float:
-    return np.nan if mode is None else mode.factor
+    factors, places = np.array([mode.factor for mode in reversing]), np.array([mode.place for mode in reversing])
+    return {
+        "time": [found.time for found in watcher.found],
+        "factor": list(factors),
+        "factor_of_coupling": list(1 - share * (1 - factors)),
+        "stable_share": list(np.minimum(1.0, 2 / (1 - np.minimum(factors, 0.0)))),
+        **dict(zip("xyz", map(list, places.T), strict=True)),
+        "volume_share": [mode.volume_share for mode in reversing],
+        "growing_factor": [found.growing.factor for found in watcher.found],
+    }
 
 
 # ---------------------------------------------------------------- the answer

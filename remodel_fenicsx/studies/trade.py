@@ -82,11 +82,6 @@ class Setting:
         return self.scene.model.kinematics, self.scene.remodeling.coupling
 
     @property
-    def is_reduced(self) -> bool:
-        """Whether a part stands for the body."""
-        return KINEMATICS[self.scene.model.kinematics].reduced
-
-    @property
     def expected_seconds(self) -> float:
         """Of one of its runs, roughly."""
         time, is_exact = self.scene.time, self.scene.remodeling.coupling == EXACT
@@ -352,8 +347,8 @@ def _on_the_mean(results: Sequence[Result]) -> list[Result]:
 
 def _fineness(result: Result) -> tuple[float, ...]:
     """Smaller is finer: the size of elements over their degree, and the step."""
-    _, refinement, degree = result.setting.mesh
-    return (result.setting.step or np.inf) / (refinement * degree**2), not result.setting.is_reduced
+    kinematics, refinement, degree = result.setting.mesh
+    return _step(result) / (refinement * degree**2), not KINEMATICS[kinematics].reduced
 
 
 class _Sweep(NamedTuple):
@@ -368,7 +363,8 @@ class _Sweep(NamedTuple):
 def _time_sweep(results: Sequence[Result]) -> _Sweep:
     """Of halved steps on one mesh, the finest that may tell an order."""
     found = _swept(results, lambda r: (r.setting.mesh[1] * r.setting.mesh[2] ** 2, r.setting.mesh), _step)
-    words = f"steps {', '.join(f'{_step(r):g}' for r in found)} on {_mesh_in_words(found)}"
+    meshes = [f"refinement {r.setting.mesh[1]}, degree {r.setting.mesh[2]}" for r in found]
+    words = f"steps {', '.join(f'{_step(r):g}' for r in found)} on {''.join(meshes[-1:])}"
     return _Sweep("time", found, words, _step)
 
 
@@ -395,18 +391,12 @@ def _swept(results: Sequence[Result], group: Callable[[Result], Any], size: Call
 
 def _halved(by_size: dict[float, Result]) -> list[Result]:
     """The longest chain of sizes that are each half of the one before, the finest last."""
-    chains = []
-    for size in by_size:
-        chain = [size]
-        while (finer := next((s for s in by_size if same_time(2 * s, chain[-1])), None)) is not None:
-            chain.append(finer)
-        chains.append(chain)
-    longest = max(chains, key=lambda chain: (len(chain), -chain[-1]), default=[])
-    return [by_size[size] for size in longest]
 
+    def chain(size: float) -> list[float]:
+        coarser = next((s for s in by_size if same_time(s, 2 * size)), None)
+        return [size] if coarser is None else [*chain(coarser), size]
 
-def _mesh_in_words(found: Sequence[Result]) -> str:
-    return f"refinement {found[-1].setting.mesh[1]}, degree {found[-1].setting.mesh[2]}" if found else "no mesh"
+    return [by_size[size] for size in max(map(chain, sorted(by_size)), key=len)]
 
 
 def _in_words(sweep: _Sweep, found: SweepLimit) -> str:
@@ -456,10 +446,6 @@ class _TradeStudy(Study):
         self._results: dict[str, Result] = {}
         self._pace: dict[tuple[str, str], float] = {}  # seconds over those expected, by kinematics and coupling
 
-    def runs_of(self, setting: Setting) -> list[Run]:
-        """One for each seed."""
-        return [run for run in self.runs if self._setting_of[run.name] is setting]
-
     @property
     def results(self) -> list[Result]:
         """Of the settings all of whose runs have reached the end, the cheapest expected first."""
@@ -482,24 +468,19 @@ class _TradeStudy(Study):
             notes = [*notes, f"left out, over the budget: {', '.join(setting.name for setting in self.left)}"]
         return Trade(self.scene, rows, notes, self.failed)
 
-    def _expected(self, setting: Setting) -> float:
-        """Seconds of one of its runs, by what others have taken."""
-        return self._pace.get(setting.way, 1.0) * setting.expected_seconds
-
     def fits(self, run: Run) -> bool:
-        """Whether a run that begins now would end in time."""
-        return clock.monotonic() + self._expected(self._setting_of[run.name]) < self.deadline
+        """Whether a run that begins now would end in time, by what others have taken."""
+        setting = self._setting_of[run.name]
+        return clock.monotonic() + self._pace.get(setting.way, 1.0) * setting.expected_seconds < self.deadline
 
     def learn(self) -> None:
-        """Read what is new."""
-        for setting in self.settings:
+        """Read what is new, and how long it took."""
+        for setting in (one for one in self.settings if one.name not in self._results):
+            runs = [run for run in self.runs if self._setting_of[run.name] is setting]
             with suppress(RecordingError):  # one that is damaged will be among those that have failed
-                if setting.name not in self._results and all(run.is_complete() for run in self.runs_of(setting)):
-                    self._learn_from(setting)
-
-    def _learn_from(self, setting: Setting) -> None:
-        result = self._results[setting.name] = read(setting, self.runs_of(setting), self.times)
-        self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
+                if all(run.is_complete() for run in runs):
+                    result = self._results[setting.name] = read(setting, runs, self.times)
+                    self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
 
 
 def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Result:

@@ -13,10 +13,11 @@ import sys
 import threading
 import time as clock
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import FrameType, TracebackType
+from typing import Any
 
 from remodel_fenicsx.errors import PAUSED, RemodelError
 from remodel_fenicsx.system.files import typed
@@ -102,6 +103,20 @@ def _is_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
+@contextmanager
+def handled(
+    handler: Callable[[int, FrameType | None], object], numbers: Iterable[int], where: Callable[[Any], bool]
+) -> Iterator[None]:
+    """Within, a function gets these signals, where who has got them so far is one of those that are asked for."""
+    chosen = [number for number in numbers if where(signal.getsignal(number))] if _is_main_thread() else []
+    before = {number: signal.signal(number, handler) for number in chosen}
+    try:
+        yield
+    finally:
+        for number, one in before.items():
+            signal.signal(number, one)
+
+
 # ---------------------------------------------------------------- ranks
 
 
@@ -147,19 +162,10 @@ def _print_and_abort(kind: type[BaseException], error: BaseException, trace: Tra
 # ---------------------------------------------------------------- before there is anything to keep
 
 
-@contextmanager
-def ending_at_once() -> Iterator[None]:
+def ending_at_once() -> AbstractContextManager[None]:
     """Within, a signal ends the process with one line and its exit code, wherever no `StopRequest` waits for it."""
-    before: dict[int, object] = {}
-    if _is_main_thread():
-        for number in (*SIGNALS, PAUSE):
-            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-                before[number] = signal.signal(number, _end)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
+    nobody = (signal.SIG_DFL, signal.default_int_handler)
+    return handled(_end, (*SIGNALS, PAUSE), lambda handler: handler in nobody)
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -180,12 +186,10 @@ class StopRequest:
         self.number = 0
         self.pause = False
         self.raises = False
-        self._previous: dict[int, object] = {}
+        self._handled = handled(self._remember, (*SIGNALS, PAUSE), lambda handler: handler != signal.SIG_IGN)
 
     def __enter__(self) -> StopRequest:
-        for number in (*SIGNALS, PAUSE) if _is_main_thread() else ():
-            if signal.getsignal(number) != signal.SIG_IGN:
-                self._previous[number] = signal.signal(number, self._remember)
+        self._handled.__enter__()
         self.pause = any(request.pause for request in _requests)
         _requests.append(self)
         return self
@@ -203,8 +207,7 @@ class StopRequest:
 
     def __exit__(self, *error: object) -> None:
         _requests.remove(self)
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._handled.__exit__(None, None, None)
 
 
 _requests: list[StopRequest] = []  # those that are waiting for signals; the last one gets them
@@ -219,20 +222,13 @@ def stopping_at_once() -> Iterator[None]:
     request = _requests[-1]
     before, request.raises = request.raises, True
     try:
-        _check(request)
-        yield
-        _check(request)
-    except Interrupted:
-        raise
+        if not request.number:
+            yield
     except Exception as error:
-        if request.number:
-            raise Interrupted(request.number, on_all_ranks=False) from error
-        raise
+        if isinstance(error, Interrupted) or not request.number:
+            raise
     finally:
         request.raises = before
-
-
-def _check(request: StopRequest) -> None:
     if request.number:
         raise Interrupted(request.number, on_all_ranks=False)
 
