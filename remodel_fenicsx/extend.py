@@ -98,7 +98,6 @@ from remodel_fenicsx.model.axes import AXES as AXES, LocalAxes as LocalAxes
 from remodel_fenicsx.model.spectral import PAIRINGS as PAIRINGS, principal as principal
 from remodel_fenicsx.model.tensors import linear_map as linear_map, ln as ln
 from remodel_fenicsx.schema.settings import COUPLINGS as COUPLINGS, CouplingKind as CouplingKind
-from remodel_fenicsx.schema.tables import markdown_reference as markdown_reference
 from remodel_fenicsx.schema.units import (
     AREA as AREA,
     FORCE as FORCE,
@@ -116,6 +115,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.evolution.coupling import Coupling as Coupling, Staggered as Staggered, Traits as Traits
     from remodel_fenicsx.fem.jit import form as form
     from remodel_fenicsx.results.columns import Measurement as Measurement
+    from remodel_fenicsx.scene.reference import markdown_reference as markdown_reference
     from remodel_fenicsx.solver.linear import EveryTangent as EveryTangent
     from remodel_fenicsx.watch.warnings import WarnsOnce as WarnsOnce
 
@@ -125,6 +125,7 @@ _LATE = {
     "Measurement": "results.columns",
     "WarnsOnce": "watch.warnings",
     "form": "fem.jit",
+    "markdown_reference": "scene.reference",
 }
 __getattr__ = on_demand(__name__, _LATE)
 if not TYPE_CHECKING:  # type checkers go by the imports

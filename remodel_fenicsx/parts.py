@@ -13,16 +13,14 @@ Examples
 
 from typing import TYPE_CHECKING
 
-from remodel_fenicsx.body import (
-    Cube as Cube,
-    GeometryError as GeometryError,
-    Sheet as Sheet,
-    Tendon as Tendon,
-    Tube as Tube,
-)
-from remodel_fenicsx.body.shape import columns_of as columns_of
+from remodel_fenicsx.body.cube import Cube as Cube
 from remodel_fenicsx.body.domain import Domain as Domain
+from remodel_fenicsx.body.gmsh_model import GeometryError as GeometryError
 from remodel_fenicsx.body.loading import Loading as Loading
+from remodel_fenicsx.body.shape import columns_of as columns_of
+from remodel_fenicsx.body.sheet import Sheet as Sheet
+from remodel_fenicsx.body.tendon import Tendon as Tendon
+from remodel_fenicsx.body.tube import Tube as Tube
 from remodel_fenicsx.evolution.stepper import Step as Step, Stepper as Stepper, Watcher as Watcher, times as times
 from remodel_fenicsx.fem.kinematics import FullKinematics as FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature as Quadrature

@@ -13,13 +13,13 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-import remodel_fenicsx.body  # noqa: F401
+import remodel_fenicsx.body.tube
 from remodel_fenicsx import cli
 
 
 def main(folder: Path) -> None:
     """All of them; what they do not say goes to the streams that this process had at first."""
-    sys.modules["remodel_fenicsx.body.tube"].PAPER = (8, 4, 1)  # type: ignore[attr-defined]
+    remodel_fenicsx.body.tube.PAPER = (8, 4, 1)
     codes, own = {}, [os.dup(1), os.dup(2)]
     for name, words in json.loads((folder / "commands.json").read_text()).items():
         for number, ending in ((1, "out"), (2, "err")):

@@ -26,7 +26,7 @@ from typing import Any
 from remodel_fenicsx.system.children import SERVE
 
 # before a program: a mesh of few elements for every tube
-COARSE = "import sys, remodel_fenicsx.body; sys.modules['remodel_fenicsx.body.tube'].PAPER = (8, 4, 1)\n"
+COARSE = "from remodel_fenicsx.body import tube; tube.PAPER = (8, 4, 1)\n"
 
 
 class Forks:
@@ -138,7 +138,7 @@ class ForkedChild:
 # ---------------------------------------------------------------- the process itself
 def four_layers(words: list[str]) -> int:
     """remodel-fenicsx with another mesh of the tube: around, through, along."""
-    sys.modules["remodel_fenicsx.body.tube"].PAPER = (8, 4, 1)  # type: ignore[attr-defined]
+    importlib.import_module("remodel_fenicsx.body.tube").PAPER = (8, 4, 1)
     return remodel_fenicsx(words)
 
 
@@ -225,7 +225,14 @@ def serve() -> None:
 
 
 if __name__ == "__main__":
-    for module in ("gmsh", "h5py", "remodel_fenicsx.body.domain", "remodel_fenicsx.running", "tests.run_case"):
+    for module in (
+        "gmsh",
+        "h5py",
+        "remodel_fenicsx.body.tube",
+        "remodel_fenicsx.body.domain",
+        "remodel_fenicsx.running",
+        "tests.run_case",
+    ):
         importlib.import_module(module)
     what_is_imported_stays()
     gc.freeze()  # children share what is there: no collection goes through it

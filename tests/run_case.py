@@ -13,6 +13,7 @@ import sys
 import numpy as np
 from mpi4py import MPI
 
+from remodel_fenicsx.body import tendon
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests.parts import tube
@@ -24,7 +25,7 @@ def main(out: str, request: dict) -> None:
     domain = None
     body = scene.geometry
     if body.shape == "tendon":
-        sys.modules["remodel_fenicsx.body.tendon"].ALONG = (request["divisions"] or [10])[-1]  # type: ignore
+        tendon.ALONG = (request["divisions"] or [10])[-1]
     elif request["divisions"]:
         domain = tube(
             body.inner_radius, body.outer_radius, body.length, scene.mesh.degree, divisions=request["divisions"]

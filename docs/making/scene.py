@@ -10,7 +10,8 @@ from docs.making.pages import filled, lines
 from remodel_fenicsx.extend import SHAPES, Dimension, markdown_reference
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES, RANDOM_CELLS
-from remodel_fenicsx.schema.tables import paragraphs, shown
+from remodel_fenicsx.scene.reference import paragraphs
+from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.schema.units import keys_with_units
 
 

@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-from remodel_fenicsx.body.cube import Cube
-from remodel_fenicsx.body.gmsh_model import GeometryError
-from remodel_fenicsx.body.mesh_body import MeshBody
+from collections import UserDict
+from typing import TYPE_CHECKING, Any
+
+from remodel_fenicsx._lazy import on_demand, resolved
 from remodel_fenicsx.body.shape import LoadKind, Shape
-from remodel_fenicsx.body.sheet import Sheet
-from remodel_fenicsx.body.solid import Solid
-from remodel_fenicsx.body.tendon import Tendon
-from remodel_fenicsx.body.tube import Tube
 
-__all__ = [
-    "SHAPES",
-    "Cube",
-    "GeometryError",
-    "LoadKind",
-    "MeshBody",
-    "Shape",
-    "Sheet",
-    "Solid",
-    "Tendon",
-    "Tube",
-]
+if TYPE_CHECKING:
+    from remodel_fenicsx.body.cube import Cube
+    from remodel_fenicsx.body.tendon import Tendon
+    from remodel_fenicsx.body.tube import Tube
 
-SHAPES: dict[str, type[Shape]] = {
-    "cube": Cube,
-    "tendon": Tendon,
-    "tube": Tube,
-    "sheet": Sheet,
-    "mesh": MeshBody,
-    "solid": Solid,
-}
+__all__ = ["SHAPES", "Cube", "LoadKind", "Shape", "Tendon", "Tube"]
+
+
+class _Shapes(UserDict[str, Any]):
+    """By name, classes or their dotted names: one that no scene asks for is not imported."""
+
+    def __getitem__(self, name: str) -> Any:
+        return resolved(super().__getitem__(name))
+
+
+SHAPES = _Shapes(
+    {
+        "cube": "remodel_fenicsx.body.cube:Cube",
+        "tendon": "remodel_fenicsx.body.tendon:Tendon",
+        "tube": "remodel_fenicsx.body.tube:Tube",
+        "sheet": "remodel_fenicsx.body.sheet:Sheet",
+        "mesh": "remodel_fenicsx.body.mesh_body:MeshBody",
+        "solid": "remodel_fenicsx.body.mesh_body:Solid",
+    }
+)
 """The shapes that a scene may name; a script adds its own."""
+
+__getattr__ = on_demand(__name__, {"Cube": "body.cube", "Tendon": "body.tendon", "Tube": "body.tube"})

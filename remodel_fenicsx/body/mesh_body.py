@@ -1,15 +1,17 @@
-"""A body of one's own: the mesh of a file, with named faces."""
+"""Bodies of one's own: the mesh of a file with named faces, of a vessel or of anything without a lumen."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeGuard
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
@@ -19,6 +21,7 @@ from remodel_fenicsx.body.mesh_file import (
     ENDINGS,
     SURFACES,
     TAGS,
+    Array,
     Block,
     MeshFile,
     MeshFileError,
@@ -26,16 +29,20 @@ from remodel_fenicsx.body.mesh_file import (
     distinct,
     read_mesh,
 )
-from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions
-from remodel_fenicsx.body.wall import WalledMesh
-from remodel_fenicsx.schema.settings import LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
+from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
+from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_columns, stress_columns
+from remodel_fenicsx.model.axes import LocalAxes
+from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, STRESS
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
+    from remodel_fenicsx.fem.quadrature import Quadrature
 
 log = logging.getLogger(__name__)
 
@@ -72,40 +79,38 @@ def _faces(value: Any) -> Any:
     return found
 
 
-def _is_mesh(value: Any) -> TypeGuard[str]:
-    return isinstance(value, str) and "\x00" not in value and Path(value).suffix.lower() in ENDINGS
+def _files(value: Any) -> list[str]:
+    """Paths of a mesh and of its surfaces, of one or a list; nothing where they are none."""
+    files = list(value) if isinstance(value, (list, tuple)) else [value]
+    kinds = [ENDINGS, *[SURFACES] * len(files[1:])]
+    return files if files and all(map(_ends_with, files, kinds)) else []
 
 
-def _is_surface(value: Any) -> TypeGuard[str]:
-    return isinstance(value, str) and "\x00" not in value and Path(value).suffix.lower() in SURFACES
-
-
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, (list, tuple)) else [value]
+def _ends_with(file: Any, endings: Collection[str]) -> bool:
+    return isinstance(file, str) and "\x00" not in file and Path(file).suffix.lower() in endings
 
 
 def _file(value: Any) -> Any:
-    mesh, *surfaces = _listed(value) or [None]
-    if not _is_mesh(mesh):
-        raise fault(f"must be the path of a mesh ({', '.join(ENDINGS)}), relative to the scene's folder")
-    if not all(map(_is_surface, surfaces)):
-        raise fault(f"what follows the mesh must be paths of its surfaces ({', '.join(SURFACES)})")
-    return tuple([mesh, *surfaces]) if surfaces else mesh
+    files = _files(value)
+    if not files:
+        mesh, surfaces = ", ".join(ENDINGS), ", ".join(SURFACES)
+        raise fault(
+            f"must be the path of a mesh ({mesh}), relative to the scene's folder; in a list, what follows the mesh "
+            f"must be paths of its surfaces ({surfaces})"
+        )
+    return tuple(files) if files[1:] else files[0]
 
 
 def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
     """The keys with surfaces that faces give as files, inner = { file = "lumen.vtp" }, after the mesh."""
-    faces = geometry.get("faces")
-    entries = faces.items() if isinstance(faces, Mapping) else ()
-    own = {face: one["file"] for face, one in entries if isinstance(one, Mapping) and _is_surface(one.get("file"))}
+    faces, file = geometry.get("faces"), geometry.get("file")
+    entries = dict(faces) if isinstance(faces, Mapping) else {}
+    own: dict[Any, Any] = {face: one.get("file") for face, one in entries.items() if isinstance(one, Mapping)}
+    own = {face: surface for face, surface in own.items() if _ends_with(surface, SURFACES)}
     if not own:
         return dict(geometry)
-    names = {face: Path(file).stem for face, file in own.items()}
-    return {
-        **geometry,
-        "file": [*dict.fromkeys([*_listed(geometry.get("file")), *own.values()])],
-        "faces": {**dict(entries), **names},
-    }
+    files = dict.fromkeys([*(file if isinstance(file, (list, tuple)) else [file]), *own.values()])
+    return {**geometry, "file": [*files], "faces": entries | {face: Path(one).stem for face, one in own.items()}}
 
 
 def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], there: set[int]) -> list[int]:
@@ -194,21 +199,17 @@ class FileBody(WithRegions, FromFile):
     def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """The keys as they were read, with the place of the file."""
         found = _together(geometry)
-        files = _listed(found.get("file"))
-        if not _is_mesh(files[0] if files else None) or not all(map(_is_surface, files[1:])):
-            return found
-        places = [str(folder.absolute() / file) for file in files]
-        return {**found, "file": places if places[1:] else places[0]}
+        places = [str(folder.absolute() / file) for file in _files(found.get("file"))]
+        return found | ({"file": places} if places else {})
 
     @classmethod
     def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
         """Element and degree of the file, where the scene does not say them."""
-        mesh, files = own.get("mesh", {}), _listed(_together(own["geometry"]).get("file"))
-        said = isinstance(mesh, Mapping) and "element" in mesh and "degree" in mesh
-        if said or not files or not _is_mesh(files[0]) or not all(map(_is_surface, files[1:])):
+        mesh, files = own.get("mesh", {}), _files(_together(own["geometry"]).get("file"))
+        if not files or (isinstance(mesh, Mapping) and "element" in mesh and "degree" in mesh):
             return cls.defaults
+        tags, (file, *surfaces) = own["geometry"].get("tags"), map(Path, files)
         try:
-            tags, (file, *surfaces) = own["geometry"].get("tags"), map(Path, files)
             found = read_mesh(file, tags if isinstance(tags, str) else None, surfaces)
         except MeshFileError as error:
             raise fault(str(error), "geometry.file", file.name) from None
@@ -223,7 +224,7 @@ class FileBody(WithRegions, FromFile):
 
     @property
     def _name(self) -> str:
-        return Path(_listed(self.file)[0]).name
+        return Path(_files(self.file)[0]).name
 
     @property
     def number_of_elements(self) -> int:  # type: ignore[override]
@@ -281,7 +282,7 @@ class FileBody(WithRegions, FromFile):
 
     def _read(self) -> MeshFile:
         try:
-            mesh, *surfaces = map(Path, _listed(self.file))
+            mesh, *surfaces = map(Path, _files(self.file))
             file = read_mesh(mesh, self.tags, surfaces)
         except MeshFileError as error:
             raise self._fault(str(error)) from None
@@ -417,6 +418,74 @@ class FileBody(WithRegions, FromFile):
                 loading.add_follower_pressure(name, on.face)
 
 
+NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
+
+
+def _angle_at(face: str) -> AngleOf:
+    """Mean angle over the elements that have a facet on a face."""
+
+    def elements(m: Any) -> NDArray[np.bool_]:
+        from remodel_fenicsx.body.axes import facets_of
+        from remodel_fenicsx.body.domain import cells_of
+
+        found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
+        found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
+        return found
+
+    def value(m: Any, angle: Array) -> float:
+        chosen = m.tool(("elements at", face), lambda: elements(m))
+        return float(m.quadrature.mean_of_known(angle, chosen))
+
+    return value
+
+
+def _middle_angle(m: Any, angle: Array) -> float:
+    """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
+
+    def elements() -> NDArray[np.bool_]:
+        from remodel_fenicsx.fem.compat import geometry_dofmap
+
+        depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+        low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
+        return np.asarray((low <= 0.5) & (high >= 0.5), dtype=np.bool_)
+
+    return float(m.quadrature.mean_of_known(angle, m.tool("middle elements", elements)))
+
+
+MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
+    "inner": ("with a facet on the inner face", _angle_at("inner")),
+    "middle": ("half-way through the wall", _middle_angle),
+    "outer": ("with a facet on the outer face", _angle_at("outer")),
+}
+
+
+class WalledMesh(Walled):
+    """A body with a wall whose local axes are found on its mesh.
+
+    Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
+    """
+
+    columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
+    columns_on_request: ClassVar[tuple[Column, ...]] = (
+        *itertools.chain.from_iterable(angle_columns(MEANS_ON_A_MESH, name) for name in CONFIGURATIONS),
+        *stress_columns(MEANS_ON_A_MESH),
+        *Walled.columns_on_request,
+    )
+    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
+    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
+    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
+
+    def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
+        """Found on the mesh by a few linear solves. Collective."""
+        from remodel_fenicsx.body.axes import found_axes
+
+        return found_axes(domain, quadrature)
+
+    def depth(self, coordinates: Array) -> Array:
+        """No function of the place: where it was not recorded all is one layer."""
+        return np.zeros(coordinates.shape[:-1])
+
+
 class MeshBody(WalledMesh, Unloads, FileBody):
     """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
 
@@ -476,6 +545,40 @@ class MeshBody(WalledMesh, Unloads, FileBody):
     def supports_of(self, supports: Mapping[str, Support]) -> dict[str, Support]:
         """Inlet and outlet are guided."""
         return {"inlet": Support(), "outlet": Support()} | dict(supports)
+
+
+class Solid(FileBody):
+    """A body of your own from a mesh file, without a lumen: a gel between posts, a patch, a tendon of any shape.
+
+    Its faces have any names; each that is held has a table `[supports.NAME]`. Directions are those of x, y and z.
+    """
+
+    loads: ClassVar[dict[str, LoadKind]] = {}
+    columns: ClassVar[tuple[Column, ...]] = (
+        Column(
+            "fibre_angle",
+            "degrees",
+            "angle between chains and the axis `geometry.axis` in the reference body, mean over the volume",
+            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
+        ),
+        Column("volume", "length^3", "deformed volume", lambda m: m.quadrature.integral(np.linalg.det(m.F))),
+    )
+    columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
+    angle_in_words: ClassVar[tuple[str, str]] = ("along the axis", "across")
+    depth_in_words: ClassVar[tuple[str, str, str]] = ("in the body", "", "")
+
+    shape: Literal["solid"] = Field(default="solid", description="Which body it is.")
+    axis: Literal["x", "y", "z"] = Field(default="x", description="The axis to which fibre angles are measured.")
+
+    def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
+        """To `axis`."""
+        return angle_to_axis(dimensions, axes, np.eye(3)["xyz".index(self.axis)])
+
+    def depth(self, coordinates: Any) -> Any:
+        """The body is one layer."""
+        return np.zeros(coordinates.shape[:-1])
+
+    station = depth
 
 
 # ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh

@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.mesh_faces import add_support, warn_of_twist
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.body.shape import Array, Column, End, LoadKind, check_lengths
 from remodel_fenicsx.body.wall import (
@@ -361,6 +360,8 @@ class Tube(RoundWall):
     ) -> None:
         """Springs of what surrounds it."""
         for face, support in supports.items():
+            from remodel_fenicsx.body.mesh_faces import add_support, warn_of_twist  # which few tubes need
+
             add_support(loading, face, support, modulus, None)
             if loading.kinematics.moves_rigidly:
                 warn_of_twist(face, support, loading.domain.comm)

@@ -17,12 +17,11 @@ from remodel_fenicsx.body.shape import Column, Shape, Unloads, WithRegions
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, Natural, Region
+from remodel_fenicsx.schema.settings import Natural, Region
 from remodel_fenicsx.schema.tables import fault, shown
 
 if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
-    from remodel_fenicsx.fem.quadrature import Quadrature
 
 
 # ---------------------------------------------------------------- layers of a round wall
@@ -154,7 +153,6 @@ def gradient(stretches: Array, axes: Array) -> Array:
 # What is measured in it, and its local axes on any mesh.
 
 AngleOf = Callable[[Any, Array], float]  # of a measurement and angles at its points
-NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
 ANGLE_IN = "mean reference fibre angle (0 circumferential, 90 axial) of the chains in the wall, in the elements"
 
 
@@ -163,37 +161,6 @@ CONFIGURATIONS = {
     "deformed": "in the deformed body, in local axes that move with it",
 }
 """Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
-
-
-def _angle_at(face: str) -> AngleOf:
-    """Mean angle over the elements that have a facet on a face."""
-
-    def elements(m: Any) -> NDArray[np.bool_]:
-        from remodel_fenicsx.body.axes import facets_of
-        from remodel_fenicsx.body.domain import cells_of
-
-        found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
-        found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
-        return found
-
-    def value(m: Any, angle: Array) -> float:
-        chosen = m.tool(("elements at", face), lambda: elements(m))
-        return float(m.quadrature.mean_of_known(angle, chosen))
-
-    return value
-
-
-def _middle_angle(m: Any, angle: Array) -> float:
-    """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
-
-    def elements() -> NDArray[np.bool_]:
-        from remodel_fenicsx.fem.compat import geometry_dofmap
-
-        depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
-        low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
-        return np.asarray((low <= 0.5) & (high >= 0.5), dtype=np.bool_)
-
-    return float(m.quadrature.mean_of_known(angle, m.tool("middle elements", elements)))
 
 
 def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str = "") -> tuple[Column, ...]:
@@ -298,37 +265,3 @@ class RoundWall(Walled, WithRegions, Unloads):
     def fills(self, regions: Collection[str]) -> bool:
         """The outermost ends at the outer radius."""
         return bool(regions)
-
-
-MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
-    "inner": ("with a facet on the inner face", _angle_at("inner")),
-    "middle": ("half-way through the wall", _middle_angle),
-    "outer": ("with a facet on the outer face", _angle_at("outer")),
-}
-
-
-class WalledMesh(Walled):
-    """A body with a wall whose local axes are found on its mesh.
-
-    Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
-    """
-
-    columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
-        *itertools.chain.from_iterable(angle_columns(MEANS_ON_A_MESH, name) for name in CONFIGURATIONS),
-        *stress_columns(MEANS_ON_A_MESH),
-        *Walled.columns_on_request,
-    )
-    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
-    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
-    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
-
-    def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
-        """Found on the mesh by a few linear solves. Collective."""
-        from remodel_fenicsx.body.axes import found_axes
-
-        return found_axes(domain, quadrature)
-
-    def depth(self, coordinates: Array) -> Array:
-        """No function of the place: where it was not recorded all is one layer."""
-        return np.zeros(coordinates.shape[:-1])

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Column, Shape, columns_of
 from remodel_fenicsx.body.domain import Domain
-from remodel_fenicsx.body.mesh_faces import NOT_AROUND, cap_volume, of_parts
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks
@@ -369,6 +368,8 @@ class _LumenVolume:
 
     def __call__(self) -> float:
         """Of the present displacement. Collective."""
+        from remodel_fenicsx.body.mesh_faces import cap_volume
+
         volume = float(np.real(dolfinx.fem.assemble_scalar(self._form)))
         displacement = self._state.gathered_displacement()
         if displacement is not None and self._nodes is not None:
@@ -381,6 +382,8 @@ class _SupportForce:
     """What springs do in a shift along the normal, or what is out of balance at nodes that are held."""
 
     def __init__(self, equilibrium: Equilibrium, face: str):
+        from remodel_fenicsx.body.mesh_faces import NOT_AROUND, of_parts
+
         self._equilibrium, state = equilibrium, equilibrium.state
         self._unknown, loading = state.unknown, state.loading
         domain: Any = loading.domain  # a `MeshDomain`

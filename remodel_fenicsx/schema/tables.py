@@ -13,7 +13,6 @@ import itertools
 import math
 import re
 import sys
-import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import NoneType
@@ -30,12 +29,11 @@ from pydantic import (
     create_model,
 )
 from pydantic.fields import FieldInfo
-from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticUndefined, core_schema
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from remodel_fenicsx.errors import RemodelError, printable, shortened
 
 LONGEST_VALUE = 60  # characters of a value in an error
-PAGE_WIDTH = 98  # characters of a line of a page
 # annotation of a tuple: what is a list in TOML becomes one
 IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
@@ -491,75 +489,3 @@ def description(table: type[BaseModel], name: str) -> str:
 def meaning(table: type[BaseModel]) -> str:
     """What a reader of scenes is told of a table: its docstring up to what scripts need."""
     return re.split(r"\n\nIts keyword arguments |\n\n\w+\n---", inspect.cleandoc(table.__doc__ or ""))[0]
-
-
-def markdown_reference(table: type[BaseModel]) -> str:
-    """The keys of a table and of the tables in it as Markdown, as docs/scene.md has them.
-
-    Parameters
-    ----------
-    table
-        The class of the table, `Scene` or one of a script's own.
-
-    Returns
-    -------
-    str
-        One section for each table: its keys with default, what is allowed, and description.
-
-    Examples
-    --------
-    >>> from remodel_fenicsx import Scene
-    >>> from remodel_fenicsx.extend import markdown_reference
-    >>> print(markdown_reference(Scene).splitlines()[0])
-    ## Top of the file
-    """
-    told: dict[str, dict[str, str]] = {}
-    return "\n".join(_section(key, variant, inner, told.setdefault(key, {})) for key, variant, inner in sections(table))
-
-
-def _section(key: str, variant: str, table: type[BaseModel], told: dict[str, str]) -> str:
-    """`told`: rows of other variants of the table, with the variant; they are named only."""
-    name = f"[[{key[:-2]}]]" if key.endswith("[]") else f"[{key}]"
-    title = f"## `{name}`" + (f" of shape `{variant!r}`" if variant else "") if key else "## Top of the file"
-    fields = {name: field for name, field in table.model_fields.items() if choices(field) != [variant]}  # in the title
-    texts = {name: text for name in fields if (text := description(table, name))}
-    rows = {
-        name: " | ".join([f"| `{name}`", _default(fields[name]), _allowed_in_words(fields[name]), _cell(text)])
-        for name, text in texts.items()
-    }
-    elsewhere: dict[str, list[str]] = {}
-    for name, row in rows.items():
-        if (as_key := re.match(r"As `([\w.]+)\.\w+`, for this region", texts[name])) is not None:
-            elsewhere.setdefault(f"as in `[{as_key[1]}]`, else those of the whole body", []).append(f"`{name}`")
-        elif variant and row in told:
-            elsewhere.setdefault(f"as of shape `{told[row]!r}`", []).append(f"`{name}`")
-    told |= {row: variant for row in rows.values() if row not in told}
-    left_out = {name for names in elsewhere.values() for name in names}
-    shown_rows = [f"{row} |" for name, row in rows.items() if f"`{name}`" not in left_out]
-    also = [f"Keys {where}: {', '.join(names)}." for where, names in elsewhere.items()]
-    head = ["| key | default | allowed | meaning |", "|---|---|---|---|"] if shown_rows else []
-    said = "\n\n".join([meaning(table), *also])
-    return "\n".join([title, "", *paragraphs(said), "", *head, *shown_rows, *([""] if shown_rows else [])])
-
-
-def paragraphs(text: str) -> list[str]:
-    """The lines of a text, filled to the width of a Markdown page."""
-    filled = (textwrap.wrap(part, PAGE_WIDTH, break_on_hyphens=False) for part in text.split("\n\n"))
-    return "\n\n".join(map("\n".join, filled)).split("\n")
-
-
-def _allowed_in_words(field: FieldInfo) -> str:
-    """What a field allows, without what stands once above all tables."""
-    words = re.sub(r"^(must be|allowed is|allowed are) ", "", allowed(field))
-    return _cell(words.replace("a finite number", "a number").replace("greater than", "above"))
-
-
-def _cell(text: str) -> str:
-    """Text for a cell of a Markdown table, where a bar would end the cell."""
-    return text.replace("|", r"\|")
-
-
-def _default(field: FieldInfo) -> str:
-    if field.default is PydanticUndefined:
-        return "required" if field.default_factory is None else "empty"
-    return "none" if field.default is None else f"`{shown(field.default)}`"

@@ -148,7 +148,7 @@ def test_what_is_no_list_of_a_mesh_and_surfaces_is_refused(tmp_path: Path) -> No
         ({"file": []}, "geometry.file = \\[\\]: must be the path of a mesh"),
         (
             {"file": [files["volume"], files["msh"]]},
-            "geometry.file = .*: what follows the mesh must be paths of its su",
+            "geometry.file = .*what follows the mesh must be paths of its su",
         ),
         (
             {"file": [files["volume"], files["inner"], str(twice)]},

@@ -16,7 +16,7 @@ from remodel_fenicsx import Recording, Scene, SceneError, run
 from remodel_fenicsx.body import SHAPES, LoadKind, Tube
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.tube import whole_tube
-from remodel_fenicsx.body.wall import WalledMesh
+from remodel_fenicsx.body.mesh_body import WalledMesh
 from remodel_fenicsx.results.whole_body import WholeBody
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS
 from remodel_fenicsx.simulation import Simulation
