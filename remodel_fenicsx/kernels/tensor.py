@@ -29,8 +29,8 @@ Flags = NDArray[np.bool_]
 NUMBERS = {
     **{name.upper(): i for i, name in enumerate(PARAMETERS)},
     "PARAMETERS": len(PARAMETERS),
-    "ITERATIONS": local_problem.ITERATIONS,
-    "HALVINGS": local_problem.HALVINGS,
+    "ITERATIONS": local_problem.LOCAL_ITERATIONS,
+    "HALVINGS": local_problem.LOCAL_HALVINGS,
     "TOLERANCE": local_problem.TOLERANCE,
     "CLOSE": tensors.CLOSE_EIGENVALUES,
     "COMPRESSION": tensor_law.COMPRESSION,

@@ -14,7 +14,7 @@ Newton's method solves it (`LocalProblem.solve`). A change of F at a solution, w
 which is not symmetric (`LocalProblem.tangent`; docs/theory.md, "Implicit coupling"). Where the parts come from:
 
     F -> C, U, R               `Strain`, with the eigenbasis of C, in which all that follows is written
-    y -> A, A_y                `Cells`
+    y -> A, A_y                `LocalCells`
     C, y -> S, S_C, S_y        `stress`: matrix, chains, and one of the repulsions; with turnover, whose content and
                                natural length at the end of a step are functions of r(C, y)
     C, S -> D, D_S, D_C        `Driver.derivatives`
@@ -46,8 +46,8 @@ Flags = NDArray[np.bool_]
 AGREE = 1e-7
 """Relative difference of two principal values below which nothing is known about a turn in their plane."""
 TOLERANCE = 1e-12  # of D, where Newton's method stops: what is left is below any residual that a body is solved to
-ITERATIONS = 25  # of it; near a solution it takes 3 to 5
-HALVINGS = 12  # of one of its steps, where it would lead to r >= L
+LOCAL_ITERATIONS = 25  # of it; near a solution it takes 3 to 5
+LOCAL_HALVINGS = 12  # of one of its steps, where it would lead to r >= L
 PARTS = 8  # of a step where it does not find the end at once, each twice as long as what is before it
 IDENTITY = np.eye(6)
 NOT_TURNED_OVER = TurnedOver(1.0, 1.0, 0.0, 0.0)
@@ -119,7 +119,7 @@ def _dyads_of_columns(left: Array, right: Array, i: Any, j: Any) -> Array:
 # ---------------------------------------------------------------- cells
 
 
-class Cells(NamedTuple):
+class LocalCells(NamedTuple):
     """Cells of n points in the eigenbasis of C: A (n, 3, 3), and of laws by rank the lengths and axes that make it.
 
     The numbers y are A itself; or the three dl, and three turns w_ij (`tensors.PAIRS`), dn_i = w n_j, dn_j = -w n_i.
@@ -129,7 +129,7 @@ class Cells(NamedTuple):
     cell: UnitCell | None = None
 
     @classmethod
-    def of(cls, cell: UnitCell) -> Cells:
+    def of(cls, cell: UnitCell) -> LocalCells:
         """From lengths and axes."""
         return cls(structure_tensor(cell.dimensions, cell.axes), cell)
 
@@ -162,7 +162,7 @@ class Terms(NamedTuple):
     by_strain: Any
 
 
-def log_terms(squared: Array, cells: Cells, r0: Array, derivatives: bool) -> Terms:
+def log_terms(squared: Array, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = A : ln C."""
     A, quotients = cells.structure, tensors.first_divided_differences(squared)
     if not derivatives:
@@ -171,7 +171,7 @@ def log_terms(squared: Array, cells: Cells, r0: Array, derivatives: bool) -> Ter
     return Terms(quotients * A, by_cells, tensors.second_derivative(squared, A))
 
 
-def length_terms(squared: Array, cells: Cells, r0: Array, derivatives: bool) -> Terms:
+def length_terms(squared: Array, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = r0^2 ln(A : C / r0^2)."""
     A, scale = cells.structure, r0[:, None, None] ** 2
     length = np.einsum("nii,ni->n", A, squared)[:, None, None]  # r^2
@@ -186,7 +186,7 @@ def length_terms(squared: Array, cells: Cells, r0: Array, derivatives: bool) -> 
     )
 
 
-def axes_terms(squared: Array, cells: Cells, r0: Array, derivatives: bool) -> Terms:
+def axes_terms(squared: Array, cells: LocalCells, r0: Array, derivatives: bool) -> Terms:
     """Of M = sum_I l_I^2 ln(n_I . C n_I); for cells with axes."""
     assert cells.cell is not None
     lengths, axes, _ = cells.cell
@@ -219,7 +219,7 @@ class Stress(NamedTuple):
     by_strain: Any = None
 
 
-def stress(tissue: Tissue, strain: Strain, cells: Cells, derivatives: bool, step: StepOfCells) -> Stress:
+def stress(tissue: Tissue, strain: Strain, cells: LocalCells, derivatives: bool, step: StepOfCells) -> Stress:
     """S of points whose parameters are arrays (n,)."""
     chain, L, A = tissue.chain, tissue.contour_length, cells.structure
     matrix: Any = tissue.matrix
@@ -290,7 +290,7 @@ class StepOfCells(NamedTuple):
 class Response(NamedTuple):
     """Cells in the eigenbasis of C, and the derivatives of their numbers y by X and by U, (n, 6, 6)."""
 
-    cells: Cells
+    cells: LocalCells
     by_tensor: Any = None
     by_stretch: Any = None
 
@@ -299,7 +299,7 @@ def tensor_response(step: StepOfCells, strain: Strain, tensor: Array, derivative
     """A = A_old + w (r0^2 E - A_old), w = 1 - exp(-kappa s dt): `tensor_law` and its derivative."""
     r0, z = np.asarray(step.drive.end_to_end_length), step.kappa_dt
     towards, old = tensor_law.target(tensor, step.drive.floor), strain.inside(step.structure)
-    cells = Cells(tensor_law.follow(old, towards, r0, z))
+    cells = LocalCells(tensor_law.follow(old, towards, r0, z))
     if not derivatives:
         return Response(cells)
     by_direction, by_share = tensor_law.target_derivatives(tensor, step.drive.floor)
@@ -315,7 +315,7 @@ def ranked_response(step: StepOfCells, strain: Strain, tensor: Array, derivative
     assert step.law.dimensions is not None
     old = UnitCell(step.cells.dimensions, step.cells.axes @ strain.basis)
     found = by_rank(step.law.dimensions, old, _drive(step, strain, tensor, old), step.time_old, step.time_new)
-    cells = Cells.of(found.cells)
+    cells = LocalCells.of(found.cells)
     if not derivatives:
         return Response(cells)
     by_tensor: Array = np.zeros((len(tensor), 6, 6))
@@ -424,7 +424,7 @@ class Trial(NamedTuple):
     """A driving tensor D (n, 3, 3) in the eigenbasis of C, with the cells and the stress that it makes."""
 
     tensor: Array
-    cells: Cells
+    cells: LocalCells
     stress: Stress
     missing: Array
     converged: Flags
@@ -513,7 +513,7 @@ class LocalProblem:
         return self.step.drive.driver.derivatives
 
     def _tensor_of(self, strain: Strain, cells: UnitCell) -> Array:
-        inside = Cells.of(UnitCell(cells.dimensions, cells.axes @ strain.basis))
+        inside = LocalCells.of(UnitCell(cells.dimensions, cells.axes @ strain.basis))
         return self._driving(strain, stress(self.tissue, strain, inside, False, self.step).value)
 
     def _respond(self, strain: Strain, tensor: Array, derivatives: bool) -> Response:
@@ -544,7 +544,7 @@ class LocalProblem:
     # ------------------------------------------------------------ Newton's method
     def _iterate(self, strain: Strain, trial: Trial) -> None:
         """Newton's method where there is no solution yet."""
-        for _ in range(ITERATIONS):
+        for _ in range(LOCAL_ITERATIONS):
             unsolved = np.flatnonzero(~trial.converged)
             if not unsolved.size:
                 return
@@ -560,7 +560,7 @@ class LocalProblem:
         size = np.maximum(size, np.linalg.norm(missing, axis=1))
         change = np.minimum(1.0, size / np.where(length > 0, length, 1.0))[:, None, None] * change
         best = self._trial(strain, trial.tensor + change)
-        for _ in range(HALVINGS):
+        for _ in range(LOCAL_HALVINGS):
             lost = np.flatnonzero(~(best.stress.extension < 1.0))
             if not lost.size:
                 break

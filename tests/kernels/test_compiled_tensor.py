@@ -93,7 +93,7 @@ def test_solution_and_tangent(kernels: TensorKernels, name: str, driver: str) ->
 def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch) -> None:
     """kappa dt = 10: where Newton's method does not find the end of the step, it is followed; r >= L has none."""
     # where there is none all are spent, in every part of the step
-    monkeypatch.setattr(local_problem, "ITERATIONS", 10)
+    monkeypatch.setattr(local_problem, "LOCAL_ITERATIONS", 10)
     rng = np.random.default_rng(8)
     R = Rotation.random(COUNT, random_state=rng).as_matrix()
     F = np.swapaxes(R, 1, 2) @ ((1 + rng.uniform(-0.2, 0.3, (COUNT, 3)))[:, :, None] * R)

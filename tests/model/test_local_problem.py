@@ -237,7 +237,7 @@ def test_points_without_a_solution_have_the_tangent_of_their_cells(monkeypatch: 
     some, F = points("explicit", "axes", "cauchy", "material", 10), deformations(10, rng)
     H, G = rng.standard_normal((2, 10, 3, 3))
     with monkeypatch.context() as none:
-        none.setattr(local_problem, "ITERATIONS", 0)
+        none.setattr(local_problem, "LOCAL_ITERATIONS", 0)
         found = some.solve(F, G @ np.swapaxes(G, 1, 2))
     assert not found.converged.any() and found.cells is not None
     tangent = some.tangent(found)
@@ -251,7 +251,7 @@ def test_points_without_a_solution_have_the_tangent_of_their_cells(monkeypatch: 
 def stress_with(some: local_problem.LocalProblem, F: Array, cells: UnitCell) -> Array:
     """P with these cells."""
     strain = local_problem.Strain.of(F)
-    inside = local_problem.Cells.of(UnitCell(cells.dimensions, cells.axes @ strain.basis))
+    inside = local_problem.LocalCells.of(UnitCell(cells.dimensions, cells.axes @ strain.basis))
     return F @ strain.outside(local_problem.stress(some.tissue, strain, inside, False, some.step).value)
 
 
