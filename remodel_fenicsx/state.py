@@ -59,9 +59,9 @@ class CellField:
         return UnitCell(self.dimensions, self.axes)
 
     def set(self, dimensions: Array, axes: Array) -> None:
-        """Replace all dimensions (elements, points, 3) and axes (elements, points, 3, 3)."""
-        self.dimension_values[:] = dimensions
-        self.axis_values[:] = axes
+        """Replace all dimensions and axes: by element and point, or of all points in one row."""
+        self.point_cells.dimensions[:] = dimensions.reshape(-1, 3)
+        self.point_cells.axes[:] = axes.reshape(-1, 3, 3)
 
     def equals(self, other: CellField) -> bool:
         """Whether all values of this rank are the same numbers."""

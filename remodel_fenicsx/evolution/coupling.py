@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
+TARGET = np.dtype([("direction", float, (3, 3)), ("share", float), ("time", float)])  # what is kept of one
 NEVER = -1.0  # time of a target that there has not been
 COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
 
@@ -236,8 +237,18 @@ class Staggered:
         StepFailure
             If no admissible equilibrium is found.
         """
-        if self.turnover is not None and not self.traits.accumulates:
-            self.turnover.lag(time)
+        if self.turnover is not None:
+            self.turnover.lag(time)  # the rates of the row, like its cells, are those of the step before
+        return self.balanced(time, loads)
+
+    def balanced(self, time: float, loads: LoadValues) -> Work:
+        """Equilibrium with what has remodeled.
+
+        Parameters
+        ----------
+        time, loads
+            As of `solve`.
+        """
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
         step = LoadStep.between(self.state.time, old_loads, time, loads)
         if not self._solved_as_expected(step, loads, work):
@@ -378,9 +389,15 @@ class Extrapolated(Staggered):
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         super().__init__(state, tissue, remodeling, settings)
-        self._targets = state.cells.quadrature.function("targets", (2, 11))  # the last first: E, s, its time
-        self._values[..., 10] = NEVER
-        state.remember(self._targets)
+        size = TARGET.itemsize // 8
+        targets = state.cells.quadrature.function("targets", (2, size))
+        memory = state.cells.quadrature.values(targets, (2, size)).reshape(-1, 2, size)
+        # of all points in one row, the function's own memory: the last target, and the one before
+        self._newest: Any
+        self._older: Any
+        self._newest, self._older = np.moveaxis(memory.view(TARGET)[..., 0], 1, 0)
+        self._newest["time"] = self._older["time"] = NEVER
+        state.remember(targets)
         self._power = 0.0
         self._start: UnitCell  # the cells at the start of the step
         self._found: Target  # of the solved state
@@ -391,35 +408,24 @@ class Extrapolated(Staggered):
     def better(self) -> UnitCell:
         """The cells that the targets at both ends give together; where a point begins, the target of its end."""
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
-        mean = self._known(1).towards(self._found, weight).where(self._begins, self._found)
+        mean = known(self._older).towards(self._found, weight).where(self._begins, self._found)
         return self.remodeling.followed(mean, self._duration, self._start)
-
-    @property
-    def _values(self) -> Array:
-        return self.state.cells.quadrature.values(self._targets, (2, 11))
-
-    def _known(self, age: int) -> Target:
-        """The last target (0) or the one before (1) of all points in one row; zero where there was none."""
-        values = self._values.reshape(-1, 2, 11)[:, age]
-        return Target(values[:, :9].reshape(-1, 3, 3), values[:, 9])
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """New cells, and equilibrium at `time` with them."""
         cells = self.state.cells
-        self._start = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
-        expected = self._extrapolated(time)
+        self._start, expected = cells.point_cells.copy(), self._extrapolated(time)
         self._follow(expected, time)
         if self.turnover is not None:
             self.turnover.extrapolate(time)
-        work = super().solve(time, loads)
+        work = self.balanced(time, loads)
         self._found = self.remodeling.target(self.residual)
-        self._begins = (self._known(0).share < COUNTS) & (self._found.share >= COUNTS)
+        self._begins = (self._newest["share"] < COUNTS) & (self._found.share >= COUNTS)
         if not self._anywhere(self._begins):
             return work
-        shape = cells.quadrature.shape
-        cells.set(self._start.dimensions.reshape(*shape, 3), self._start.axes.reshape(*shape, 3, 3))
+        cells.set(*self._start[:2])
         self._follow(expected.where(self._begins, self._found), time)
-        again = super().solve(time, loads)
+        again = self.balanced(time, loads)
         self._found = self.remodeling.target(self.residual)
         again.substeps += work.substeps - 1
         again.count(work)
@@ -427,26 +433,20 @@ class Extrapolated(Staggered):
 
     def remodel(self, time: float) -> float:
         """Remember the target of the solved state; the cells are those of the row."""
-        target, values = self._found, self._values
         self._duration = time - self.state.time
-        values[:, :, 1] = values[:, :, 0]
-        values[:, :, 1, 10][self._begins.reshape(values.shape[:2])] = NEVER  # its step had the target of its end
-        values[:, :, 0, :9] = target.direction.reshape(*values.shape[:2], 9)
-        values[:, :, 0, 9] = target.share.reshape(values.shape[:2])
-        values[:, :, 0, 10] = time
+        self._older[:] = self._newest
+        self._older["time"][self._begins] = NEVER  # its step had the target of its end
+        self._newest["direction"], self._newest["share"], self._newest["time"] = *self._found, time
         if self.turnover is not None:
             self.turnover.complete(time)
         return self._power
 
     def _extrapolated(self, time: float) -> Target:
-        return self._known(0).towards(self._known(1), -self._back(time))
-
-    def _back(self, time: float) -> Array:
-        """Minus the weight of the target before in the extrapolated one, (n,)."""
-        times = self._values.reshape(-1, 2, 11)[:, :, 10]
-        back, known = np.zeros(len(times)), times[:, 1] != NEVER
-        back[known] = (time - times[known, 0]) / 2 / (times[known, 0] - times[known, 1])
-        return back
+        """The target at the middle of the step."""
+        last, before = self._newest["time"], self._older["time"]
+        back, apart = np.zeros_like(last), before != NEVER
+        back[apart] = (time - last[apart]) / 2 / (last[apart] - before[apart])
+        return known(self._newest).towards(known(self._older), -back)
 
     def _follow(self, target: Target, time: float) -> None:
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
@@ -457,7 +457,7 @@ class Extrapolated(Staggered):
         asked = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(asked.dimensions).all(axis=-1)
         if lost.any():
-            asked = self.remodeling.followed(target.where(lost, self._known(0)), duration)
+            asked = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
         points = self._anywhere(lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
@@ -467,6 +467,11 @@ class Extrapolated(Staggered):
         """How many there are on all ranks."""
         quadrature = self.state.cells.quadrature
         return int(self.state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
+
+
+def known(records: Any) -> Target:
+    """The target that records of `TARGET` hold; zero where there was none."""
+    return Target(records["direction"], records["share"])
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]

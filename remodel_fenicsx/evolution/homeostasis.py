@@ -9,7 +9,7 @@ once").
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.solver.continuation import Work
-from remodel_fenicsx.solver.newton import SolveFailure
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.system import NOTICE
 
@@ -55,9 +55,11 @@ LONGEST_HOLD = 100.0  # times 1/kappa under held loads after which cells that do
 class Limit(Implicit):
     """A step over a time without end, in one piece or not at all."""
 
-    def _solve(self, time: float, loads: LoadValues, work: Work, answering: bool) -> None:
-        self.state.loading.set(loads)
-        work.add(self.newton.solve())
+    def _go(
+        self, time: float, stage: str, set_fraction: Callable[[float], None], newton: GuardedNewton, work: Work
+    ) -> None:
+        set_fraction(1.0)
+        work.add(newton.solve())
         work.substeps += 1
 
 

@@ -1,8 +1,15 @@
-"""Cells at the end of a step belong to the stress of its end (docs/theory.md, Implicit coupling)."""
+"""The coupling "implicit": cells at the end of a step belong to the stress of its end (docs/theory.md).
+
+At each point `model.local_problem` makes cells, stress and consistent tangent of F (`ImplicitCells`). They enter the
+equilibrium as values at the points (`ImplicitEquilibrium`), which Newton's method solves (`ImplicitNewton`). `Implicit`
+is the step.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -12,16 +19,15 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Traits
+from remodel_fenicsx.evolution.coupling import Traits, between
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import Remembered, over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
-from remodel_fenicsx.kernels.tensor import condensed_points, tensor_kernels
-from remodel_fenicsx.model import implicit as condensed
+from remodel_fenicsx.kernels.tensor import problem_of, tensor_kernels
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.implicit import StepOfCells
 from remodel_fenicsx.model.laws import relaxed
+from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, StepOfCells
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
 from remodel_fenicsx.model.tensors import det
 from remodel_fenicsx.schema.settings import Solver
@@ -30,241 +36,271 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
 from remodel_fenicsx.solver.newton import Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.state import State, at_points
 
-
-# ---------------------------------------------------------------- cells that answer within a solve
-# Equilibrium with stress and consistent tangent as values at the points.
-
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+RESIDUAL = "residual of the last step"
 BEFORE_REFUSAL = 5  # Newton iterations after which states are refused where some point has no cells
-PASSES = 8  # with frozen cells, before a second try
-ROOM_PASSES, ROOM_ACCURACY = 30, 1e-8  # a tenth to a thirtieth of the change of J_g is left by each; of J_g
+PASSES = 8  # before a second try
 SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
+ROOM_PASSES, ROOM_ACCURACY = 30, 1e-8  # a tenth to a thirtieth of the change of J_g is left by each; of J_g
+MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with its parts; then it is refused
 
 
-class AnsweringCells:
+class ImplicitCells:
     """The cells at the end of a step as a function of the unknowns, at all points of this rank in one row."""
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass):
         self.state, self.tissue, self.remodeling = state, tissue, remodeling
         self.quadrature = state.cells.quadrature
-        self.stress = self.quadrature.function("answering_stress", (3, 3))
-        self.tangent = self.quadrature.function("answering_tangent", (9, 9))
-        self.frozen: UnitCell | None = None
-        self._growth = None if remodeling.turnover is None else remodeling.turnover.growth
+        self.stress = self.quadrature.function("implicit_stress", (3, 3))
+        self.tangent = self.quadrature.function("implicit_tangent", (9, 9))
         self._kernels = tensor_kernels(state.comm) if remodeling.law.target is not None else None
-        self._points: condensed.CondensedPoints
-        self._found: condensed.LocalSolution
-        self._gradient: Array | None = None  # F of what was found
-        self._tangent_is_there = False
-        self._start: Array
-        self.accepted: Array
+        F = state.kinematics.elastic_gradient(state.unknown)
+        self._solutions: Remembered[LocalSolution] = Remembered(None, F)
+        self._tangents: Remembered[None] = Remembered(None, F)
+        self._problem: LocalProblem
+        self._accepted: Array  # D of the last solved state
+        self._guess: Array  # D from which cells are looked for
         self._iterations = 0
 
     # ------------------------------------------------------------ a step
     def begin(self, time: float, residual: float) -> None:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
-        drive, cells = self.remodeling.drive(residual), self.state.cells.point_cells
-        old = UnitCell(cells.dimensions.copy(), cells.axes.copy())
-        given = self.remodeling.settings.turnover
-        rule = given.rule if given.is_on else None
-        step = StepOfCells(self.remodeling.law, drive, old, structure_tensor(*old[:2]), self.state.time, time, rule)
-        self._points = condensed_points(self._kernels, at_points(self.tissue, self.quadrature), step)
-        self.accepted = self._points.with_cells(drive.deformation_gradient, old).driving_tensor
-        self.release()
+        old, given = self.state.cells.point_cells.copy(), self.remodeling.settings.turnover
+        step = StepOfCells(
+            self.remodeling.law,
+            self.remodeling.drive(residual),
+            old,
+            structure_tensor(*old[:2]),
+            self.state.time,
+            time,
+            given.rule if given.is_on else None,
+        )
+        self._problem = problem_of(self._kernels, at_points(self.tissue, self.quadrature), step)
+        self._accepted = self.tensor_of_state()
+        self.restart()
 
     def set_time(self, time: float) -> None:
         """Another end of the step, which starts with the same cells."""
-        self._points = replace(self._points, step=self._points.step._replace(time_new=time))
-        self.release()
+        self._problem = replace(self._problem, step=self.step._replace(time_new=time))
+        self.restart()
 
-    def release(self) -> None:
-        """All cells answer again, from the driving tensor of the last accepted state."""
-        self._start, self._gradient, self._iterations = self.accepted, None, 0
-
-    def freeze(self, cells: UnitCell | None = None) -> None:
-        """No cells answer: these stay, or those at the start of the step."""
-        self.frozen, self._gradient = cells or self._points.step.cells, None
-
-    def follow(self, factor: float) -> None:
-        """Frozen cells make a share of a pass with the present stress: towards what it asks for at the step's end."""
-        assert self.frozen is not None
-        self.update()
-        cells = self._points.unit_cells(self._points.passed(self._found))
-        self.freeze(relaxed(self.frozen, cells, factor))
-
-    @property
-    def room(self) -> Array | None:
-        """J_g at all points, where tissue grows."""
-        return None if self._growth is None else self._growth.ratio
-
-    @room.setter
-    def room(self, ratio: Array | None) -> None:
-        if self._growth is not None and ratio is not None:
-            self._growth.set(ratio)
-
-    def make_room(self) -> float:
-        """Take J_g from the content of the last update: by how much it changes, over itself."""
-        if self._growth is None:
-            return 0.0
-        self.update()
-        assert self.turnover is not None
-        before = self._growth.ratio
-        self._growth.follow(np.exp(self.turnover[0]).reshape(before.shape))
-        return self.quadrature.maximum(np.abs(self._growth.ratio / before - 1.0))
+    def restart(self, guess: Array | None = None) -> None:
+        """Cells are looked for from a D, or from that of the last accepted state."""
+        self._guess, self._iterations = self._accepted if guess is None else guess, 0
+        self._solutions.forget()
 
     def accept(self) -> None:
         """The present state is a solved one."""
-        self.update()
-        self.accepted = self._found.driving_tensor
+        self._accepted = self.solution().driving_tensor
+
+    def tensor_of_state(self) -> Array:
+        """D of the present cells, were they to stay."""
+        return self._problem.tensor_of(self.state.elastic_gradient(), self.state.cells.point_cells)
 
     @property
     def step(self) -> StepOfCells:
         """The one that has begun."""
-        return self._points.step
+        return self._problem.step
 
-    @property
-    def asked(self) -> UnitCell:
-        """The cells of the last update."""
-        return self._points.unit_cells(self._found)
+    # ------------------------------------------------------------ at the present unknowns
+    def solution(self) -> LocalSolution:
+        """Of all points; their stress goes into the form."""
+        return self._solutions(self._solved)
 
-    @property
+    def update_tangent(self) -> None:
+        """The tangent goes into the form; the next cells are looked for from here."""
+        found = self.solution()
+        self._tangents(lambda: self._differentiated(found))
+
+    def _solved(self) -> LocalSolution:
+        F = self.state.elastic_gradient()
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            found = self._problem.solve(np.where((det(F) > 0)[:, None, None], F, np.eye(3)), self._guess)
+        stress = found.first_piola_kirchhoff.reshape(*self.quadrature.shape, 3, 3)
+        self.quadrature.values(self.stress, (3, 3))[:] = stress
+        self._tangents.forget()
+        return found
+
+    def _differentiated(self, found: LocalSolution) -> None:
+        self._iterations, self._guess = self._iterations + 1, found.driving_tensor
+        values = self._problem.tangent(found).reshape(*self.quadrature.shape, 9, 9)
+        self.quadrature.values(self.tangent, (9, 9))[:] = values
+
+    def unit_cells(self) -> UnitCell:
+        """Those that belong to the present unknowns."""
+        return self._problem.unit_cells(self.solution())
+
     def turnover(self) -> Array | None:
-        """ln m and ln rho (2, n) of the last update, where they change."""
-        return None if self._found.turnover is None else self._found.turnover.T
+        """ln m and ln rho (2, n), where they change."""
+        turnover = self.solution().turnover
+        return None if turnover is None else turnover.T
+
+    def make_room(self) -> float:
+        """Let J_g follow the content, where tissue grows: by how much it changes, over itself."""
+        turnover = self.turnover()
+        if turnover is None or self.remodeling.turnover.growth is None:
+            return 0.0
+        growth = self.remodeling.turnover.growth
+        before = growth.ratio
+        growth.follow(np.exp(turnover[0]).reshape(before.shape))
+        return self.quadrature.maximum(np.abs(growth.ratio / before - 1.0))
 
     def complete(self) -> bool:
-        """Whether at all points, of all ranks, cells belong to the stress of the present unknowns."""
-        self.update()
-        return not self._anywhere(~self._found.converged)
+        """Whether at all points, of all ranks, cells belong to the stress."""
+        return not self._anywhere(~self.solution().converged)
+
+    def squared_lengths(self) -> Array:
+        """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
+        squared = np.where(self._refused(), np.inf, self.solution().squared_lengths)
+        return squared.reshape(self.quadrature.shape)
+
+    def unsolved(self, locking_length: Array) -> bool:
+        """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
+        return self._anywhere(self._refused() & (self.solution().squared_lengths < locking_length.reshape(-1) ** 2))
+
+    def _refused(self) -> Flags:
+        """Points without a solution, after so many iterations that none is expected."""
+        return ~self.solution().converged & (self._iterations > BEFORE_REFUSAL)
 
     def _anywhere(self, points: Flags) -> bool:
         owned = self.quadrature.owned(points.reshape(self.quadrature.shape))
         return bool(self.state.comm.allreduce(int(owned.any())))
 
-    # ------------------------------------------------------------ values
-    def update(self, tangent: bool = False) -> None:
-        """Stress, and tangent on request, of the present unknowns."""
-        F = self.state.elastic_gradient()
-        if self._gradient is None or not np.array_equal(F, self._gradient):
-            self._found = self._solved(F)
-            self._gradient, self._tangent_is_there = F, False
-            stress = self._found.first_piola_kirchhoff.reshape(*self.quadrature.shape, 3, 3)
-            self.quadrature.values(self.stress, (3, 3))[:] = stress
-        if tangent and not self._tangent_is_there:
-            self._iterations += 1
-            self._start = self._found.driving_tensor
-            derivative = self._points.tangent if self.frozen is None else self._points.frozen_tangent
-            values = derivative(self._found).reshape(*self.quadrature.shape, 9, 9)
-            self.quadrature.values(self.tangent, (9, 9))[:] = values
-            self._tangent_is_there = True
 
-    def _solved(self, F: Array) -> condensed.LocalSolution:
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            F = np.where((det(F) > 0)[:, None, None], F, np.eye(3))
-            if self.frozen is not None:
-                return self._points.with_cells(F, self.frozen)
-            return self._points.solve(F, self._start)
+class ImplicitEquilibrium(Equilibrium):
+    """Equilibrium whose stress and tangent are those of `ImplicitCells`."""
 
-    def squared_lengths(self) -> Array:
-        """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
-        self.update()
-        squared = np.where(self._refused, np.inf, self._found.squared_lengths)
-        return squared.reshape(self.quadrature.shape)
-
-    @property
-    def _refused(self) -> Flags:
-        """Points without a solution, after so many iterations that none is expected."""
-        return ~self._found.converged & (self._iterations > BEFORE_REFUSAL)
-
-    def unsolved(self, locking_length: Array) -> bool:
-        """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
-        self.update()
-        return self._anywhere(self._refused & (self._found.squared_lengths < locking_length.reshape(-1) ** 2))
-
-
-class AnsweringEquilibrium(Equilibrium):
-    """Equilibrium whose stress and tangent come from `AnsweringCells`."""
-
-    def __init__(self, state: State, tissue: Tissue, answering: AnsweringCells):
-        self.answering = answering
+    def __init__(self, state: State, tissue: Tissue, cells: ImplicitCells):
+        self.cells = cells
         super().__init__(state, tissue)
+        self.pointwise = None  # what UFL leaves out is in the stress
 
     def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
         """Virtual work of P, and with it dP/dF."""
-        u, weight, dx = (
-            self.state.unknown,
-            self.state.kinematics.stress_free_weight(self.quadrature.mesh),
-            self.quadrature.dx,
-        )
+        u, weighted = self.state.unknown, self.state.kinematics.stress_free_weight(self.quadrature.mesh)
+        dx = self.quadrature.dx
         variation, increment = (ufl.derivative(F, u, function) for function in (test, trial))
         row, column = (ufl.as_vector([F_[i, j] for i in range(3) for j in range(3)]) for F_ in (variation, increment))
-        internal = ufl.inner(self.answering.stress, variation) * weight * dx
-        return [internal], [ufl.inner(ufl.dot(self.answering.tangent, column), row) * weight * dx]
+        internal = ufl.inner(self.cells.stress, variation) * weighted * dx
+        return [internal], [ufl.inner(ufl.dot(self.cells.tangent, column), row) * weighted * dx]
 
     def look(self) -> Look:
-        """As of `Equilibrium`, which knows nothing of cells that answer: nothing is remembered."""
+        """As of `Equilibrium`, which would remember what it saw of other cells at these unknowns."""
         return self._look()
 
     def states(self) -> Array:
         """As of `Equilibrium`, with the cells that belong to the present unknowns."""
         states = super().states()
         if np.all(states[..., 1] > 0):  # for a state that is inside out no cells are looked for
-            states[..., 0] = self.answering.squared_lengths()
+            states[..., 0] = self.cells.squared_lengths()
         return states
 
     def assemble_internal(self, vector: Any) -> None:
         """Internal nodal forces of the present unknowns."""
-        self.answering.update()
+        self.cells.solution()
         super().assemble_internal(vector)
 
     def _update_tangent(self) -> None:
-        self.answering.update(tangent=True)
+        self.cells.update_tangent()
 
 
-class AnsweringNewton(GuardedNewton):
-    """Newton's method for cells that answer."""
+def newton_of_still_cells(equilibrium: Equilibrium, settings: Solver) -> GuardedNewton:
+    """For cells that stay as they are; to be closed. A matrix and factors of its own, for as long as it is needed."""
+    return GuardedNewton(equilibrium, settings, robust=settings.method == AUTO)
 
-    def __init__(self, equilibrium: AnsweringEquilibrium, settings: Solver):
-        # cells that answer make steps far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
+
+class ImplicitNewton(GuardedNewton):
+    """Newton's method for unknowns that their cells follow."""
+
+    def __init__(self, equilibrium: ImplicitEquilibrium, still: Equilibrium, settings: Solver):
+        # steps are far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
         super().__init__(equilibrium, settings, robust=settings.method == AUTO)
-        self.answering = equilibrium.answering
+        self.cells, self.state, self.still = equilibrium.cells, equilibrium.state, still
         self._patient = False  # whether shorter steps are looked for where cells have no solution
 
     def solve(self, origin: Array | None = None) -> Solution:
         """As of `GuardedNewton`, or from where passes lead, or at last with shorter steps."""
         # Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
-        # equilibrium to which passes with frozen cells come: it often is near.
-        start, accepted = self.unknown.x.array.copy(), self.answering.accepted
+        # equilibrium to which passes lead: it often is near.
         try:
             return self._solved(origin)
         except SolveFailure as failure:
-            if self.answering.frozen is not None:
-                raise
             work = failure
-        for again in (self._solved_after_passes, self._solved_patiently):
+        for again in (self._after_passes, self._patiently):
             try:
-                solution = again(work)
+                with self.state.transaction():
+                    solution = again(work)
                 solution.count(work)
                 return solution
             except SolveFailure as failure:
                 if failure is not work:
                     failure.count(work)
                     work = failure
-                self.unknown.x.array[:], self.answering.accepted = start, accepted
         raise work
 
-    def _solved_after_passes(self, work: SolveFailure) -> Solution:
+    def _solved(self, origin: Array | None = None, guess: Array | None = None) -> Solution:
+        self.cells.restart(guess)
+        spent = Counted()
+        try:
+            with self.state.transaction():
+                for _ in range(ROOM_PASSES):  # an element's points share room: it is no function of one point's F
+                    solution = super().solve(origin)
+                    solution.count(spent)
+                    spent, origin = solution, None
+                    if self.cells.make_room() <= ROOM_ACCURACY:
+                        break
+                else:
+                    raise SolveFailure("what is made does not find its room", 0, 0, self.equilibrium.extension())
+                if not self.cells.complete():
+                    text = "points without cells that fit their own stress"
+                    raise SolveFailure(text, 0, 0, self.equilibrium.extension())
+        except SolveFailure as failure:
+            failure.count(spent)
+            raise
+        self.cells.accept()
+        return solution
+
+    def _after_passes(self, work: SolveFailure) -> Solution:
         log.info("the step is solved once more, from where remodeling passes lead: %s", work.reason)
-        if not self._pass(work):
+        with self.state.tentative(), closing(newton_of_still_cells(self.still, self.settings)) as newton:
+            settled = self._pass(newton, work)
+            unknowns, guess = self.unknown.x.array.copy(), self.cells.tensor_of_state()
+        if not settled:
             log.info("remodeling passes do not converge")
             raise work
-        return self._solved()
+        self.unknown.x.array[:] = unknowns
+        return self._solved(guess=guess)
 
-    def _solved_patiently(self, work: SolveFailure) -> Solution:
+    def _pass(self, newton: GuardedNewton, work: SolveFailure) -> bool:
+        """Passes over the step, each with its equilibrium, up to one that changes nothing; adds what they cost."""
+        # Returns whether they come nearer to each other.
+        values, cells, step, remodeling = self.unknown.x.array, self.state.cells, self.cells.step, self.cells.remodeling
+        ways: list[float] = []  # of the unknowns, over each pass
+        part, solution = 1.0, newton.solve()
+        work.count(solution)
+        for _ in range(PASSES):
+            before, old = values.copy(), cells.point_cells.copy()
+            asked, _ = remodeling.updated_cells(step.time_old, step.time_new, solution.residual, step.cells)
+            cells.set(*relaxed(old, asked, part)[:2])
+            try:
+                solution = newton.solve()
+            except SolveFailure as failure:  # too large a change of the cells: r >= L where they are longer
+                work.count(failure)
+                cells.set(*old[:2])
+                part /= 2
+                continue
+            work.count(solution)
+            ways.append(over_ranks(newton.equilibrium.comm, np.abs(values - before).max(initial=0.0), MPI.MAX) / part)
+            if part == 1.0 and not solution.newton_iterations:
+                break
+            part = min(1.0, 2 * part)
+        return bool(ways) and ways[-1] <= SETTLES * max(ways)
+
+    def _patiently(self, work: SolveFailure) -> Solution:
         log.info("the step is solved once more, with shorter Newton steps: %s", work.reason)
         self._patient = True
         try:
@@ -272,68 +308,14 @@ class AnsweringNewton(GuardedNewton):
         finally:
             self._patient = False
 
-    def _pass(self, work: SolveFailure) -> bool:
-        """Passes with frozen cells, each with its equilibrium, up to one that changes nothing; adds what they cost."""
-        # Returns whether they come nearer to each other.
-        answering, values, share = self.answering, self.unknown.x.array, 1.0
-        ways: list[float] = []  # of the unknowns, over each pass
-        try:
-            answering.freeze()
-            work.count(self._solved())
-            for _ in range(PASSES):
-                before, frozen = values.copy(), answering.frozen
-                try:
-                    answering.follow(share)
-                    solution = self._solved()
-                except SolveFailure as failure:  # too large a change of the cells: r >= L where they are longer
-                    work.count(failure)
-                    values[:], share = before, share / 2
-                    answering.freeze(frozen)
-                    continue
-                work.count(solution)
-                way = over_ranks(self.equilibrium.comm, float(np.abs(values - before).max(initial=0.0)), MPI.MAX)
-                ways.append(way / share)
-                if share == 1.0 and not solution.newton_iterations:
-                    break
-                share = min(1.0, 2 * share)
-        finally:
-            answering.frozen = None
-        return bool(ways) and ways[-1] <= SETTLES * max(ways)
-
     def gives_up(self, trial: Look) -> bool:
         """Where cells have no solution: passes cost less than shorter steps."""
         right_way_out = trial.extension.min_jacobian > 0 and not self._patient
-        return right_way_out and self.answering.unsolved(self.equilibrium.locking_length())
-
-    def _solved(self, origin: Array | None = None) -> Solution:
-        self.answering.release()
-        start, room, spent = self.unknown.x.array.copy(), self.answering.room, Counted()
-        try:
-            for _ in range(ROOM_PASSES):  # the points of an element share it: no function of one point's deformation
-                solution = super().solve(origin)
-                solution.count(spent)
-                spent, origin = solution, None
-                if self.answering.make_room() <= ROOM_ACCURACY:
-                    break
-            else:
-                raise SolveFailure("what is made does not find its room", 0, 0, self.equilibrium.extension())
-            if not self.answering.complete():
-                text = "points without cells that fit their own stress"
-                raise SolveFailure(text, 0, 0, self.equilibrium.extension())
-        except SolveFailure as failure:
-            failure.count(spent)
-            self.unknown.x.array[:], self.answering.room = start, room
-            raise
-        self.answering.accept()
-        return solution
-
-
-RESIDUAL = "residual of the last step"
-MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with its parts; then it is refused
+        return right_way_out and self.cells.unsolved(self.equilibrium.locking_length())
 
 
 class Implicit:
-    """Newton's method on the unknowns with cells that follow at each point (`model.implicit`)."""
+    """A step in which Newton's method finds the unknowns with the cells that belong to them."""
 
     traits = Traits(order=1, accumulates=True)
 
@@ -341,29 +323,36 @@ class Implicit:
         self.state, self.remodeling, self.settings = state, remodeling, settings
         self.equilibrium: Equilibrium = Equilibrium(state, tissue)  # of solved states
         self.equilibrium.compile_energy()
-        self.answering = AnsweringCells(state, self.equilibrium.tissue, remodeling)
-        solved = AnsweringEquilibrium(state, tissue, self.answering)
-        self.newton: GuardedNewton = AnsweringNewton(solved, settings)
+        self.cells = ImplicitCells(state, self.equilibrium.tissue, remodeling)
+        implicit = ImplicitEquilibrium(state, tissue, self.cells)
+        self.newton: GuardedNewton = ImplicitNewton(implicit, self.equilibrium, settings)
         self.turnover, self._power = remodeling.turnover, 0.0
         state.numbers[RESIDUAL] = 0.0
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium at `time` with the cells that belong to it."""
-        work, start = Work(), self.state.elastic_gradient()
-        self.answering.begin(time, self.state.numbers[RESIDUAL])
+        work, state, F = Work(), self.state, self.state.elastic_gradient()
         if self.turnover is not None:
             self.turnover.begin()
-        if self.state.number == 0:
-            self._solve(time, loads, work, answering=False)
-            self.answering.begin(time, work.residual)
-        self._solve(time, loads, work, answering=True)
-        work.substeps -= int(self.state.number == 0)
-        self.state.numbers[RESIDUAL] = work.residual
+        is_first = state.number == 0
+        if is_first:  # it starts from the loaded body with its cells as they were
+            with closing(newton_of_still_cells(self.equilibrium, self.settings)) as newton:
+                self._go(time, "the change of the loads", self._loading_to(loads), newton, work)
+        self.cells.begin(time, work.residual if is_first else state.numbers[RESIDUAL])
+        start, set_loads = state.time, self._loading_to(loads)
+
+        def set_fraction(fraction: float) -> None:
+            set_loads(fraction)
+            self.cells.set_time((1.0 - fraction) * start + fraction * time)
+
+        self._go(time, "the step", set_fraction, self.newton, work)
+        work.substeps -= int(is_first)
+        state.numbers[RESIDUAL] = work.residual
         work.extension = None  # the row's is with the cells that are taken over now
-        self._power = self.remodeling.replace(self.answering.asked, start, time - self.state.time)
-        self.state.settle_cells()
+        self._power = self.remodeling.replace(self.cells.unit_cells(), F, time - start)
+        state.settle_cells()
         if self.turnover is not None:
-            self.turnover.take(self.answering.turnover)
+            self.turnover.take(self.cells.turnover())
         return work
 
     def remodel(self, time: float) -> float:
@@ -375,45 +364,36 @@ class Implicit:
     @property
     def better(self) -> UnitCell | None:
         """What the stresses at both ends of the step ask for together; eq. (11) asks for the end alone."""
-        law, step = self.remodeling.law, self.answering.step
+        law, step = self.remodeling.law, self.cells.step
         if law.of_absolute_time:
             return None
         from_start = law.update(step.cells, step.drive, step.time_old, step.time_new)
-        weight = weight_of_the_end(self.remodeling.kappa * (step.time_new - step.time_old))
-        return relaxed(from_start, self.answering.asked, weight)
+        return relaxed(from_start, self.cells.unit_cells(), weight_of_the_end(step.kappa_dt))
 
     def close(self) -> None:
         """Free PETSc's objects."""
         self.newton.close()
 
-    def _solve(self, time: float, loads: LoadValues, work: Work, answering: bool) -> None:
-        """In one piece, or in parts of time and loads."""
-        loading, answers, start = self.state.loading, self.answering, self.state.time
-        old = dict(loading.values)
+    def _loading_to(self, loads: LoadValues) -> Callable[[float], None]:
+        """Sets the loads after a fraction of their change from the present ones."""
+        loading, old = self.state.loading, dict(self.state.loading.values)
+        return lambda fraction: loading.set(between(old, loads, fraction))
 
-        def set_fraction(fraction: float) -> None:
-            loading.set({name: old[name] + fraction * (loads[name] - old[name]) for name in loads})
-            # nothing remodels where cells do not answer: the first step starts from the loaded body as it was
-            answers.set_time(start + (fraction * (time - start) if answering else 0.0))
-
-        if not answering:
-            answers.freeze()
-        before, stage = self.state.unknown.x.array.copy(), "the step" if answering else "the change of the loads"
+    def _go(
+        self, time: float, stage: str, set_fraction: Callable[[float], None], newton: GuardedNewton, work: Work
+    ) -> None:
+        """Solve after a change, in one piece or in parts."""
         most = MOST_SOLVES * self.settings.maximum_iterations + work.newton_iterations
-        halvings = self.settings.maximum_halvings
-        change = Change(time, stage, set_fraction, self.newton, halvings, most_iterations=most)
+        change = Change(time, stage, set_fraction, newton, self.settings.maximum_halvings, most_iterations=most)
+        before = self.state.unknown.x.array.copy()
         try:
             set_fraction(1.0)
-            loading.set(loads)
-            work.add(self.newton.solve())
+            work.add(newton.solve())
             work.substeps += 1
             if change.look_back(before, work):
-                work.add(self.newton.solve())  # the cells that answer the unknowns: there is nothing else to do
+                work.add(newton.solve())  # the cells that belong to the unknowns: there is nothing else to do
         except SolveFailure as failure:
             work.add(failure)
             log.info("solving in parts: %s", failure.reason)
             change.advance(work, failure)
-            loading.set(loads)
             log.info("time %g solved in %d parts", time, work.substeps)
-        finally:
-            answers.frozen = None

@@ -20,8 +20,8 @@ room                kernels.PointKernels.room
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
-solve               model.implicit.CondensedPoints.solve
-tangent             model.implicit.CondensedPoints.tangent
+solve               model.local_problem.LocalProblem.solve
+tangent             model.local_problem.LocalProblem.tangent
 factor_new          kernels.SingleFactor
 factor_renew        kernels.SingleFactor.renew
 factor_solve        kernels.SingleFactor.solve

@@ -94,7 +94,7 @@ void log_derivatives(int64_t n, const double *C, const double *A, double *first,
 
 typedef struct {               /* in the eigenbasis of C */
     tensor F, basis, old;      /* F and the basis in the global one; A at the start of the step */
-    double c[3], u[3], J, parameter[PARAMETERS], floor, solved, rate;
+    double c[3], u[3], J, parameter[PARAMETERS], floor, solved, kappa_dt;
     int driver, repulsion;
 } point;
 
@@ -106,7 +106,7 @@ typedef struct {
 } state;
 
 static void prepare(point *p, int64_t n, int64_t at, const double *F, const double *old, const double *parameters,
-                    double floor, double solved, const double *rate, int driver, int repulsion)
+                    double floor, double solved, const double *kappa_dt, int driver, int repulsion)
 {
     tensor C, global;
     memcpy(p->F, F + 9 * at, sizeof(tensor)), memcpy(global, old + 9 * at, sizeof(tensor));
@@ -116,7 +116,7 @@ static void prepare(point *p, int64_t n, int64_t at, const double *F, const doub
     ALL(i) p->u[i] = sqrt(p->c[i]);
     p->J = p->u[0] * p->u[1] * p->u[2];
     for (int k = 0; k < PARAMETERS; ++k) p->parameter[k] = parameters[k * n + at];
-    p->floor = floor, p->solved = solved, p->rate = rate[at], p->driver = driver, p->repulsion = repulsion;
+    p->floor = floor, p->solved = solved, p->kappa_dt = kappa_dt[at], p->driver = driver, p->repulsion = repulsion;
 }
 
 /* chains.wormlike_stiffness, and its slope by r. */
@@ -127,7 +127,7 @@ static inline double stiffness(double r, double L, double *slope)
     return (1 + (2 - x) / (4 * left * left)) / L;
 }
 
-/* implicit.stress with energy.neo_hookean_derivatives; the derivatives by A and by C may be null. */
+/* local_problem.stress with energy.neo_hookean_derivatives; the derivatives by A and by C may be null. */
 static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
 {
     const double *q = p->parameter, L = q[CONTOUR_LENGTH], r0 = q[END_TO_END_LENGTH];
@@ -209,13 +209,13 @@ static void cells(point *p, state *s)
     const double squared = p->parameter[END_TO_END_LENGTH] * p->parameter[END_TO_END_LENGTH];
     eigen(s->D, s->values, s->vectors);
     s->share = weights(s->values, p->floor, s->direction);
-    const double weight = -expm1(-p->rate * s->share);
+    const double weight = -expm1(-p->kappa_dt * s->share);
     tensor direction;
     composed(s->direction, s->vectors, direction);
     ALL(i) ALL(j) s->A[i][j] = p->old[i][j] + weight * (squared * direction[i][j] - p->old[i][j]);
 }
 
-/* implicit.tensor_response with tensor_law.target_derivatives: dA/dD at a state that is there. */
+/* local_problem.tensor_response with tensor_law.target_derivatives: dA/dD at a state that is there. */
 static void cells_by_tensor(point *p, state *s, matrix result)
 {
     const double squared = p->parameter[END_TO_END_LENGTH] * p->parameter[END_TO_END_LENGTH];
@@ -239,7 +239,7 @@ static void cells_by_tensor(point *p, state *s, matrix result)
     turned(turn, by_values, result);
     const double against = COMPRESSION * negative + least * least, sum = positive + against, total = sum > 0 ? sum : 1;
     ALL(i) slope[i] = 2 * (tension[i] * against - COMPRESSION * positive * fmin(v[i], 0)) / (total * total * unit);
-    const double left = exp(-p->rate * s->share), weight = squared * -expm1(-p->rate * s->share);
+    const double left = exp(-p->kappa_dt * s->share), weight = squared * -expm1(-p->kappa_dt * s->share);
     MANDEL(a) {
         double way = 0;
         ALL(k) way += turn[a][k] * s->direction[k];
@@ -247,7 +247,7 @@ static void cells_by_tensor(point *p, state *s, matrix result)
         MANDEL(b) {
             double share = 0;
             ALL(k) share += turn[b][k] * slope[k];
-            result[a][b] = weight * result[a][b] + p->rate * left * way * share;
+            result[a][b] = weight * result[a][b] + p->kappa_dt * left * way * share;
         }
     }
 }
@@ -286,7 +286,7 @@ static void drive_by_strain(point *p, tensor S, matrix result)
     }
 }
 
-/* implicit.CondensedPoints._trial: all that D says. */
+/* local_problem.LocalProblem._trial: all that D says. */
 static void evaluate(point *p, state *s)
 {
     tensor D;
@@ -310,7 +310,7 @@ static void equation(point *p, state *s, matrix result, matrix answers, matrix d
     MANDEL(a) MANDEL(b) result[a][b] = (a == b) - by_stress(p, ROW[a], COLUMN[a]) * answers[a][b];
 }
 
-/* implicit.CondensedPoints._better: a step not longer than D, halved where it leads to r >= L. */
+/* local_problem.LocalProblem._better: a step not longer than D, halved where it leads to r >= L. */
 static void iterate(point *p, state *s)
 {
     matrix left, answers, direct;
@@ -332,16 +332,16 @@ static void iterate(point *p, state *s)
     *s = next;
 }
 
-/* implicit.CondensedPoints.solve, from start; all results in the global basis. */
+/* local_problem.LocalProblem.solve, from start; all results in the global basis. */
 void solve(int64_t n, const double *F, const double *start, const double *old, const double *parameters,
-           double floor, double solved, const double *rate, int driver, int repulsion, double *tensors, double *structure,
-           double *stresses, double *squared, uint8_t *converged)
+           double floor, double solved, const double *kappa_dt, int driver, int repulsion, double *tensors,
+           double *structure, double *stresses, double *squared, uint8_t *converged)
 {
     for (int64_t at = 0; at < n; ++at) {
         point p;
         state s;
         tensor global, P;
-        prepare(&p, n, at, F, old, parameters, floor, solved, rate, driver, repulsion);
+        prepare(&p, n, at, F, old, parameters, floor, solved, kappa_dt, driver, repulsion);
         memcpy(global, start + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);
@@ -362,7 +362,8 @@ void solve(int64_t n, const double *F, const double *start, const double *old, c
     }
 }
 
-/* implicit._first_by_gradient: dP/dF (9, 9) = dC/dF^T dS/dC dC/dF / 2, and S, with both in the eigenbasis of C. */
+/* The end of local_problem.LocalProblem.tangent: dP/dF (9, 9) = dC/dF^T dS/dC dC/dF / 2, and S, with both in the
+   eigenbasis of C. */
 static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
 {
     double carried[3][3], strain[6][9], stress[6][9];   /* F Q, dC/dF, dS/dF */
@@ -386,16 +387,16 @@ static void by_gradient(point *p, tensor S, matrix by_strain, double *result)
         }
 }
 
-/* implicit.CondensedPoints.tangent at solved points. */
+/* local_problem.LocalProblem.tangent at solved points. */
 void tangent(int64_t n, const double *F, const double *tensors, const double *old, const double *parameters,
-             double floor, double solved, const double *rate, int driver, int repulsion, double *result)
+             double floor, double solved, const double *kappa_dt, int driver, int repulsion, double *result)
 {
     for (int64_t at = 0; at < n; ++at) {
         point p;
         state s;
         tensor global;
         matrix left, answers, direct, right, change;
-        prepare(&p, n, at, F, old, parameters, floor, solved, rate, driver, repulsion);
+        prepare(&p, n, at, F, old, parameters, floor, solved, kappa_dt, driver, repulsion);
         memcpy(global, tensors + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);

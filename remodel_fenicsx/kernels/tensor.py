@@ -13,11 +13,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.kernels import Library, in_numpy
-from remodel_fenicsx.model import implicit as condensed, tensor_law, tensors
+from remodel_fenicsx.model import local_problem, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import rotated_back
 from remodel_fenicsx.model.energy import PARAMETERS, Tissue, whole_structure_tensor
-from remodel_fenicsx.model.implicit import CondensedPoints, LocalSolution, StepOfCells, at, put
+from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, StepOfCells, at, put
 from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.model.tensor_law import Target
 
@@ -29,9 +29,9 @@ Flags = NDArray[np.bool_]
 NUMBERS = {
     **{name.upper(): i for i, name in enumerate(PARAMETERS)},
     "PARAMETERS": len(PARAMETERS),
-    "ITERATIONS": condensed.LOCAL_ITERATIONS,
-    "HALVINGS": condensed.LOCAL_HALVINGS,
-    "TOLERANCE": condensed.TOLERANCE,
+    "ITERATIONS": local_problem.LOCAL_ITERATIONS,
+    "HALVINGS": local_problem.LOCAL_HALVINGS,
+    "TOLERANCE": local_problem.TOLERANCE,
     "CLOSE": tensors.CLOSE_EIGENVALUES,
     "COMPRESSION": tensor_law.COMPRESSION,
 }
@@ -72,10 +72,10 @@ def tensor_kernels(comm: MPI.Intracomm) -> TensorKernels | None:
     return None if in_numpy() else TensorKernels(comm)
 
 
-def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> CondensedPoints:
-    """Tissue and step of n points: in C, where that knows all of its parts."""
+def problem_of(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells) -> LocalProblem:
+    """Of n points: in C, where that knows all of its parts."""
     if kernels is None:
-        return CondensedPoints(tissue, step)
+        return LocalProblem(tissue, step)
     parts: dict[str, Any] = {
         "law": step.law,
         "driver": step.drive.driver,
@@ -86,9 +86,9 @@ def condensed_points(kernels: TensorKernels | None, tissue: Tissue, step: StepOf
     unknown = [name for name, part in parts.items() if kernels.call.number(getattr(part, "compiled", "")) is None]
     unknown += ["frame"] * step.is_spatial + ["turnover"] * (step.turnover is not None)
     if not unknown:
-        return CompiledPoints(tissue, step, kernels)
+        return CompiledProblem(tissue, step, kernels)
     _say_of_tensor(", ".join(unknown))
-    return CondensedPoints(tissue, step)
+    return LocalProblem(tissue, step)
 
 
 @functools.cache
@@ -97,8 +97,8 @@ def _say_of_tensor(parts: str) -> None:
 
 
 @dataclass(frozen=True)
-class CompiledPoints(CondensedPoints):
-    """As `CondensedPoints`, for the law `tensor`. Points that the kernel does not solve are solved by numpy."""
+class CompiledProblem(LocalProblem):
+    """As `LocalProblem`, for the law `tensor`. Points that the kernel does not solve are solved by numpy."""
 
     kernels: TensorKernels
 
@@ -107,24 +107,24 @@ class CompiledPoints(CondensedPoints):
         drive, tissue = self.step.drive, self.tissue
         numbers = (self.kernels.call.number(part.compiled) for part in (drive.driver, tissue.repulsion))
         parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
-        rate = np.broadcast_to(self.step.rate, len(F))
-        given = self.step.structure, parameters, drive.floor, drive.rounding, rate, *numbers
+        kappa_dt = np.broadcast_to(self.step.kappa_dt, len(F))
+        given = self.step.structure, parameters, drive.floor, drive.rounding, kappa_dt, *numbers
         self.kernels.call(name, len(F), F, tensor, *given, *results)
 
-    def solve(self, F: Array, start: Array) -> LocalSolution:
-        """As `CondensedPoints.solve`."""
+    def solve(self, F: Array, guess: Array) -> LocalSolution:
+        """As `LocalProblem.solve`."""
         tensor, structure, stress = np.empty((3, len(F), 3, 3))
         squared, converged = np.empty(len(F)), np.empty(len(F), np.bool_)
-        self._call("solve", F, start, tensor, structure, stress, squared, converged)
+        self._call("solve", F, guess, tensor, structure, stress, squared, converged)
         found, lost = LocalSolution(F, tensor, structure, stress, squared, converged), np.flatnonzero(~converged)
         if lost.size:
-            put(found, lost, self.at(lost).solve(F[lost], start[lost]))
+            put(found, lost, self.at(lost).solve(F[lost], guess[lost]))
         return found
 
     def tangent(self, found: LocalSolution) -> Array:
-        """As `CondensedPoints.tangent`."""
+        """As `LocalProblem.tangent`."""
         lost, result = ~found.converged, np.empty((len(found.gradient), 3, 3, 3, 3))
         self._call("tangent", found.gradient, found.driving_tensor, result)
         if lost.any():
-            result[lost] = self.at(lost).frozen_tangent(at(found, lost))
+            result[lost] = self.at(lost).tangent(at(found, lost))
         return result

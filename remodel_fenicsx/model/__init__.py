@@ -16,6 +16,6 @@ Remark 6  power of remodeling                                    `energy`: `Tiss
 ========= ====================================================== ================================================
 
 What the printed equations get wrong is mended where they stand, under the numbers of docs/theory.md ("erratum 1"). Not
-in the paper: the law for the structure tensor (`tensor_law`), and cells that answer within a solve (`implicit`). Tools:
-`tensors` (one name on arrays and in UFL).
+in the paper: the law for the structure tensor (`tensor_law`), and cells that belong to the stress of the same
+step (`local_problem`). Tools: `tensors` (one name on arrays and in UFL).
 """

@@ -316,11 +316,11 @@ class Repulsion(WithParameters):
     functions = ("sum", "derivatives", "terms")
 
 
-IMPLICIT = "remodel_fenicsx.model.implicit"  # which most runs do not import
+LOCAL_PROBLEM = "remodel_fenicsx.model.local_problem"  # which most runs do not import
 REPULSIONS: dict[str, Repulsion] = {
-    "axes": Repulsion(axes_sum, terms=f"{IMPLICIT}.axes_terms", sees_axes=True),
-    "log": Repulsion(log_sum, log_derivatives, terms=f"{IMPLICIT}.log_terms", compiled="LOG"),
-    "length": Repulsion(length_sum, terms=f"{IMPLICIT}.length_terms", compiled="LENGTH"),
+    "axes": Repulsion(axes_sum, terms=f"{LOCAL_PROBLEM}.axes_terms", sees_axes=True),
+    "log": Repulsion(log_sum, log_derivatives, terms=f"{LOCAL_PROBLEM}.log_terms", compiled="LOG"),
+    "length": Repulsion(length_sum, terms=f"{LOCAL_PROBLEM}.length_terms", compiled="LENGTH"),
 }
 
 

@@ -19,7 +19,7 @@ from remodel_fenicsx.model import spectral, tensor_law
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.chains import NO_PARAMETERS, NO_VALUES, Parameter
 from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
-from remodel_fenicsx.model.energy import IMPLICIT, Tissue
+from remodel_fenicsx.model.energy import LOCAL_PROBLEM, Tissue
 from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
@@ -145,7 +145,7 @@ class Law:
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
     response
         For the coupling "implicit": cells at a strain and a driving tensor with their derivatives, as
-        `model.implicit.tensor_response`; a function, or its dotted name.
+        `model.local_problem.tensor_response`; a function, or its dotted name.
     over_corrects
         Whether the coupling "staggered" may leave a symmetric solution with it.
     takes_set_points
@@ -236,7 +236,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         dimensions=function,
         keeps_symmetry=True,
         asks_kappa=True,
-        response=f"{IMPLICIT}.ranked_response",
+        response=f"{LOCAL_PROBLEM}.ranked_response",
     )
 
 
@@ -405,7 +405,7 @@ LAWS: dict[str, Law] = {
         follow=follow_tensor,
         keeps_symmetry=True,
         asks_kappa=True,
-        response=f"{IMPLICIT}.tensor_response",
+        response=f"{LOCAL_PROBLEM}.tensor_response",
         takes_set_points=True,
         compiled="TENSOR",
     ),
@@ -581,12 +581,12 @@ TURNOVER_RATES = {"cauchy": Followed(by_stress, 2), "tension": Followed(by_tensi
 
 
 class TurnedOver(NamedTuple):
-    """Content and natural length at the end of a step as functions of r at its end; arrays (n,)."""
+    """Content and natural length at the end of a step as functions of r at its end, and their slopes by ln r."""
 
-    content: Array
-    natural_length: Array
-    content_slope: Array
-    natural_length_slope: Array
+    content: Array | float
+    natural_length: Array | float
+    content_slope: Array | float
+    natural_length_slope: Array | float
 
 
 def turned_over_at_the_end(rule: TurnoverRule, tissue: Tissue, length: Array, duration: float) -> TurnedOver:

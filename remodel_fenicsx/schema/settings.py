@@ -609,7 +609,7 @@ def _missing_for_implicit(scene: Scene) -> str | None:
 
 def missing_for_steps_of_cells(scene: Scene) -> str | None:
     """What a scene lacks for cells that are unknowns of a solve, of whatever cells it starts from; None: nothing."""
-    from remodel_fenicsx.model.implicit import refused  # six modules that most runs need not load
+    from remodel_fenicsx.model.local_problem import refused  # six modules that most runs need not load
 
     material, remodeling = scene.material, scene.remodeling
     if scene.formulation != "displacement":

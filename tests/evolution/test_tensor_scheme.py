@@ -208,7 +208,7 @@ def test_the_target_of_a_first_step_is_not_extrapolated() -> None:
     simulation = short_tube(2.0, coupling="extrapolated", ramp=[[1.0, 0.0], [2.0, 0.04]])
     run(simulation)
     coupling: Any = simulation.stepper.coupling
-    share = coupling._known(0).share
+    share = coupling._newest["share"]
     some = (share > 0.01) & (share < 0.95)
     assert some.any()
     np.testing.assert_allclose(coupling._extrapolated(3.0).share[some], share[some], atol=1e-13)
@@ -231,8 +231,8 @@ def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts
     dimensions, axes = cells.dimension_values.copy(), cells.axis_values.copy()
     dimensions[0], axes[0] = [0.0, 0.0, 1.0], np.eye(3)
     cells.set(dimensions, axes)
-    along_y, along_z = np.diag([0.0, 1.0, 0.0]).ravel(), np.diag([0.0, 0.0, 1.0]).ravel()
-    coupling._values[0, :, :, :10] = np.stack([[*along_z, 1.0], [*along_y, 1.0]])
+    for targets, along in ((coupling._newest, [0.0, 0.0, 1.0]), (coupling._older, [0.0, 1.0, 0.0])):
+        targets["direction"][:points], targets["share"][:points] = np.diag(along), 1.0
     before, target = cells.structure_tensor(), coupling._extrapolated(state.time + 1.0)
     with caplog.at_level("INFO"):
         coupling._follow(target, state.time + 1.0)

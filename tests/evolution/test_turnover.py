@@ -174,8 +174,8 @@ def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces(room: Any
     with made(wall(48.0, 12.0, GROWS | room, [], coupling="implicit")) as simulation:
         list(simulation.steps())
         coupling: Any = simulation.stepper.coupling
-        assert coupling.answering.room is None or coupling.answering.room.max() > 1.2
-        coupling.answering.begin(60.0, 0.0)
+        assert simulation.stepper.turnover.growth is None or simulation.stepper.turnover.growth.ratio.max() > 1.2
+        coupling.cells.begin(60.0, 0.0)
         np.testing.assert_allclose(taylor_orders(simulation, coupling.newton.equilibrium, 1e-4), 2.0, atol=0.15)
 
 

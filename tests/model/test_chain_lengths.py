@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.kernels.tensor import TensorKernels, condensed_points
+from remodel_fenicsx.kernels.tensor import TensorKernels, problem_of
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import REPULSIONS, Tissue
-from remodel_fenicsx.model.implicit import CondensedPoints
+from remodel_fenicsx.model.local_problem import LocalProblem
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
-from tests.model.test_condensed import deformations, points, solved
+from tests.model.test_local_problem import deformations, points, solved
 from tests.tables import rows as table, values as values_of
 from tests.watch.test_over_correction import Tilt
 
@@ -128,11 +128,11 @@ def test_the_energy_has_no_length_in_it(repulsion: str) -> None:
         np.testing.assert_allclose(other, found[0], rtol=1e-12)
 
 
-def in_unit(some: CondensedPoints, unit: float) -> CondensedPoints:
+def in_unit(some: LocalProblem, unit: float) -> LocalProblem:
     """The same points with lengths of chains in another unit."""
     powers = {"network_modulus": 1 / unit, "contour_length": unit, "end_to_end_length": unit}
     step, drive = some.step, some.step.drive
-    return CondensedPoints(
+    return LocalProblem(
         some.tissue.map(lambda name, value: powers.get(name, 1.0) * value),
         step._replace(
             drive=drive._replace(
@@ -156,7 +156,7 @@ def test_cells_that_answer(law: str, repulsion: str, compiled: bool) -> None:
     kernels, answers = TensorKernels(MPI.COMM_SELF) if compiled else None, []
     for unit in (1.0, METRES, 1e6):
         scaled = in_unit(some, unit)
-        twin = condensed_points(kernels, scaled.tissue, scaled.step)
+        twin = problem_of(kernels, scaled.tissue, scaled.step)
         found = solved(twin, F)
         tangent, there = twin.tangent(found).reshape(12, 81), found.converged
         values = (found.first_piola_kirchhoff, tangent, found.structure / unit**2)
