@@ -244,7 +244,6 @@ class State:
         self.counts: dict[str, str] = {}
         # the body starts unloaded; a load that is there from t = 0 on comes with the first step
         loading.set(dict.fromkeys(loading.values, 0.0))
-        self._reached_with: dict[str, float] = {}
 
     @property
     def comm(self) -> Any:
@@ -320,12 +319,7 @@ class State:
             How many steps there have been.
         """
         for case in self.cases().values():
-            case.time, case.number, case._reached_with = time, number, dict(case.loading.values)
-
-    @property
-    def loads_are_held(self) -> bool:
-        """Whether the present loads are those of the step before; of a state that goes on from a file it is unknown."""
-        return self.loading.values == self._reached_with
+            case.time, case.number = time, number
 
     def _add(self, function: Any) -> None:
         self._functions[function.name], self._arrays[function.name] = function, function.x.array

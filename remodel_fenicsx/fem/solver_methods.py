@@ -131,7 +131,6 @@ FACTOR_OPTIONS: dict[str, Mapping[str, Any]] = {
 # unknowns, 0.6 of it at 380, 0.4 at 650 and 0.25 at 1,500 (cubes and tubes of random cells, 40 steps).
 SMALL_REDUCTION, SMALL_BODY = 2000, 200
 LARGE = 100_000  # unknowns from which on even a few factors cost more than multigrid, in time and in memory
-LARGE_ON_RANKS = 20_000  # the same on several ranks while loads change: one of them factorises for all
 WORTH_RANKS = 5_000  # unknowns below which a second rank costs more than it brings
 
 
@@ -140,11 +139,11 @@ def is_small(unknowns: int, reduced: bool) -> bool:
     return unknowns <= (SMALL_REDUCTION if reduced else SMALL_BODY)
 
 
-def chosen(method: str, unknowns: int, ranks: int, reduced: bool, multigrid: bool = True, held: bool = False) -> str:
+def chosen(method: str, unknowns: int, reduced: bool, multigrid: bool = True) -> str:
     """The method that `auto` stands for."""
     if method != AUTO:
         return method
-    if multigrid and unknowns > (LARGE if ranks == 1 or held else LARGE_ON_RANKS):
+    if multigrid and unknowns > LARGE:
         return "iterative"
     return "direct" if is_small(unknowns, reduced) else LAGGED
 

@@ -24,7 +24,6 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import (
     AUTO,
     LARGE,
-    LARGE_ON_RANKS,
     REMOVED,
     SMALL_BODY,
     SMALL_REDUCTION,
@@ -1287,8 +1286,8 @@ class Solver(Table):
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
         description=f"How the equations of each step are solved. 'auto' takes 'direct' up to {SMALL_BODY} "
-        f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} (on several "
-        f"ranks {LARGE_ON_RANKS} while loads change) 'iterative'. {meanings(SOLVER_METHODS)} "
+        f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} 'iterative'. "
+        f"{meanings(SOLVER_METHODS)} "
         "(docs/speed_and_accuracy.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"

@@ -251,16 +251,13 @@ class GuardedNewton:
         self.convergence = Convergence(equilibrium, settings)
         self._present = _Solve(self._values.copy())
         self._options_checked = False
-        kinematics, unknowns, ranks = equilibrium.state.kinematics, self._x.getSize(), equilibrium.comm.size
-        traits = settings.method, unknowns, ranks, not kinematics.three_dimensional, kinematics.suits_multigrid
-        self._methods = {held: chosen(*traits, held) for held in (False, True)}  # for loads that change, or are held
-        self._make_solver(self._methods[False])
+        self._make_solver()
 
-    def _make_solver(self, method: str) -> None:
-        """PETSc's objects of a method."""
-        equilibrium, settings, self.method = self.equilibrium, self.settings, method
-        unknowns, ranks = self._x.getSize(), equilibrium.comm.size
-        narrow = not equilibrium.state.kinematics.three_dimensional
+    def _make_solver(self) -> None:
+        """PETSc's objects of the method, which a body has for all of its steps."""
+        equilibrium, settings, kinematics = self.equilibrium, self.settings, self.equilibrium.state.kinematics
+        unknowns, ranks, narrow = self._x.getSize(), equilibrium.comm.size, not kinematics.three_dimensional
+        self.method = method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
@@ -279,33 +276,19 @@ class GuardedNewton:
         if self._robust:
             self._linear.keep_nothing()
 
-    def _suit_phase(self) -> None:
-        """Take the method for this step, where loads that are held have one of their own."""
-        method = self._methods[self.equilibrium.state.loads_are_held]
-        if method == self.method:
-            return
-        if self.equilibrium.comm.rank == 0:
-            log.info("from now on solver.method = %r", method)
-        self._close_solver()
-        self._make_solver(method)
-
     def close(self) -> None:
         """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
         if self._snes is None:
             return
-        self._close_solver()
+        self._linear.close()
+        self._snes.destroy()
+        self._options.close()
         for thing in (self._matrix, self._x, self._residual, self._external, self._trial):
             thing.destroy()
         self._snes = None
 
-    def _close_solver(self) -> None:
-        self._linear.close()
-        self._snes.destroy()
-        self._options.close()
-
     def solve(self, origin: Array | None = None) -> Solution:
         """Solve from the present unknowns; on success they are the solution."""
-        self._suit_phase()
         try:
             return self._attempt(origin, self._linear.more_iterations)
         except SolveFailure as failure:

@@ -51,17 +51,11 @@ def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]])
 # ---------------------------------------------------------------- what is chosen
 @pytest.mark.parametrize(("small", "reduced"), [(methods.SMALL_BODY, False), (methods.SMALL_REDUCTION, True)])
 def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
-    large, on_ranks = methods.LARGE, methods.LARGE_ON_RANKS
-    for unknowns, ranks, method in (
-        (small, 1, "direct"), (small + 1, 1, "lagged"), (small, 2, "direct"), (small + 1, 2, "lagged"),
-        (large, 1, "lagged"), (large + 1, 1, "iterative"), (on_ranks, 2, "lagged"), (on_ranks + 1, 2, "iterative"),
-    ):  # fmt: skip
-        held = "iterative" if unknowns > methods.LARGE else methods.chosen("auto", unknowns, 1, reduced)
-        assert methods.chosen("auto", unknowns, ranks, reduced, held=True) == held
-        assert methods.chosen("auto", unknowns, ranks, reduced) == method
-        assert all(methods.chosen(name, unknowns, ranks, reduced) == name for name in methods.SOLVER_METHODS)
-    assert methods.chosen("auto", methods.LARGE + 1, 1, reduced, multigrid=False) == "lagged"
-    assert methods.chosen("auto", methods.LARGE_ON_RANKS + 1, 2, reduced, multigrid=False) == "lagged"
+    large = methods.LARGE
+    for unknowns, method in ((small, "direct"), (small + 1, "lagged"), (large, "lagged"), (large + 1, "iterative")):
+        assert methods.chosen("auto", unknowns, reduced) == method
+        assert all(methods.chosen(name, unknowns, reduced) == name for name in methods.SOLVER_METHODS)
+    assert methods.chosen("auto", large + 1, reduced, multigrid=False) == "lagged"
 
 
 # ---------------------------------------------------------------- same states, other work
@@ -262,31 +256,6 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
         lagged._norms.clear()
     lagged.keep_nothing()
     assert not lagged.given_up
-
-
-def test_loads_are_held_from_the_second_step_of_equal_loads_on() -> None:
-    """A part of a step is no step of its own."""
-    with made(preset_scene("kuhl-holzapfel-2007", "cube")) as simulation:
-        state, held = simulation.state, []
-        for number, force in enumerate((1.0, 2.0, 2.0, 2.0, 3.0), start=1):
-            for part in (0.5, 1.0):
-                state.loading.set({"force": part * force})
-            held.append(state.loads_are_held)
-            state.reach(float(number), number)
-        assert held == [False, False, True, True, False]
-
-
-def test_the_method_may_be_another_one_where_loads_are_held(
-    direct: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """As `auto` does on several ranks above LARGE_ON_RANKS."""
-    caplog.set_level(logging.INFO)
-    monkeypatch.setattr(newton, "chosen", lambda *arguments: "lagged" if arguments[-1] else "iterative")
-    simulation, rows = simulated("auto")
-    assert_same(rows, direct)
-    assert simulation.stepper.coupling.newton.method == "lagged"
-    assert caplog.text.count("from now on solver.method = 'lagged'") == 1
-    simulation.close()
 
 
 # ---------------------------------------------------------------- fall-backs
