@@ -220,27 +220,24 @@ class ImplicitNewton(GuardedNewton):
         # steps are far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
         super().__init__(equilibrium, settings, robust=settings.method == AUTO)
         self.cells, self.state, self.still = equilibrium.cells, equilibrium.state, still
-        self._patient = False  # whether shorter steps are looked for where cells have no solution
 
     def solve(self, origin: Array | None = None) -> Solution:
-        """As of `GuardedNewton`, or from where passes lead, or at last with shorter steps."""
+        """As of `GuardedNewton`, or from where passes lead."""
         # Where Newton's method fails, or some cells have no solution at its deformations, it starts again from the
         # equilibrium to which passes lead: it often is near.
         try:
             return self._solved(origin)
         except SolveFailure as failure:
-            work = failure
-        for again in (self._after_passes, self._patiently):
+            log.info("the step is solved once more, from where remodeling passes lead: %s", failure.reason)
             try:
                 with self.state.transaction():
-                    solution = again(work)
-                solution.count(work)
-                return solution
-            except SolveFailure as failure:
-                if failure is not work:
-                    failure.count(work)
-                    work = failure
-        raise work
+                    solution = self._after_passes(failure)
+            except SolveFailure as again:
+                if again is not failure:
+                    again.count(failure)
+                raise
+            solution.count(failure)
+            return solution
 
     def _solved(self, origin: Array | None = None, guess: Array | None = None) -> Solution:
         self.cells.restart(guess)
@@ -265,7 +262,6 @@ class ImplicitNewton(GuardedNewton):
         return solution
 
     def _after_passes(self, work: SolveFailure) -> Solution:
-        log.info("the step is solved once more, from where remodeling passes lead: %s", work.reason)
         with self.state.tentative(), closing(newton_of_still_cells(self.still, self.settings)) as newton:
             settled = self._pass(newton, work)
             unknowns, guess = self.unknown.x.array.copy(), self.cells.tensor_of_state()
@@ -300,18 +296,9 @@ class ImplicitNewton(GuardedNewton):
             part = min(1.0, 2 * part)
         return bool(ways) and ways[-1] <= SETTLES * max(ways)
 
-    def _patiently(self, work: SolveFailure) -> Solution:
-        log.info("the step is solved once more, with shorter Newton steps: %s", work.reason)
-        self._patient = True
-        try:
-            return self._solved()
-        finally:
-            self._patient = False
-
     def gives_up(self, trial: Look) -> bool:
-        """Where cells have no solution: passes cost less than shorter steps."""
-        right_way_out = trial.extension.min_jacobian > 0 and not self._patient
-        return right_way_out and self.cells.unsolved(self.equilibrium.locking_length())
+        """Where cells have no solution: passes, and parts of the step, cost less than shorter steps."""
+        return trial.extension.min_jacobian > 0 and self.cells.unsolved(self.equilibrium.locking_length())
 
 
 class Implicit:

@@ -19,7 +19,7 @@ from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
-from remodel_fenicsx.model.energy import Tissue, axes_sum
+from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, tensor_target
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
@@ -262,29 +262,19 @@ class RemodelingPass:
 
     def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
         """Give the state other cells, or a share of the change; returns the power of remodeling at frozen F."""
-        cells, shape = self.state.cells, self.quadrature.shape
+        cells = self.state.cells
         self._change = cells.point_cells.copy(), asked
         updated = self.law.share(self._change[0], asked, factor)
-        increment = self._energy_increment(F, self._change[0], updated)
+        increment = self.parameters.at_points().energy_increment(F, self._change[0], updated)
         power: float = 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
-        cells.set(updated.dimensions.reshape(*shape, 3), updated.axes.reshape(*shape, 3, 3))
+        cells.set(*updated[:2])
         return power
 
     def look_ahead(self, time: float, residual: float = 0.0) -> None:
         """What a pass to the limit would make of the present cells, for `residual`; nothing changes."""
+        # at rest the time is so long that nothing is left of a start (`Scene.last_time`): as much again is the limit
         asked, _ = self.updated_cells(time, 2 * time, residual)
         self._change = self.state.cells.point_cells.copy(), asked
-
-    def _energy_increment(self, F: Array, old: UnitCell, new: UnitCell) -> Array:
-        """`Tissue.energy_increment` at all points, with the sums over the axes compiled."""
-        tissue = self.parameters.at_points()
-        increment: Any
-        if tissue.chain is None or tissue.repulsion.sum is not axes_sum:
-            increment = tissue.energy_increment(F, old, new)
-        else:
-            (before, sum_before), (after, sum_after) = (self.kernels.squared_length_and_sum(F, c) for c in (old, new))
-            increment = tissue.increment(before, after - before, sum_after - sum_before)
-        return np.asarray(increment)
 
     def distance(self) -> float:
         """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths."""

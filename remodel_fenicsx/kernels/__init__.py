@@ -11,7 +11,7 @@ in C                stands for
 principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
-stretches           model.energy.squared_end_to_end_length, model.energy.axes_sum
+squared_length      model.energy.squared_end_to_end_length
 parts               kernels.PointKernels.gradient_and_driver
 structure           model.cells.structure_tensor
 extension           kernels.PointKernels.extension
@@ -157,10 +157,6 @@ class PointKernels:
         """`energy.squared_end_to_end_length` of one whole cell."""
         return np.asarray(energy.squared_end_to_end_length(F, [cell]))
 
-    def squared_length_and_sum(self, F: Array, cell: UnitCell) -> tuple[Array, Array]:
-        """The same, and `energy.axes_sum`."""
-        return self.squared_length(F, cell), np.asarray(energy.axes_sum(F, [cell], 1.0))
-
     def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
         """F and the symmetric part of the driving tensor, (n, 3, 3) each, from both (n, 2, 3, 3)."""
         return both[:, 0], (both[:, 1] + np.swapaxes(both[:, 1], 1, 2)) / 2
@@ -226,15 +222,8 @@ class CompiledPointKernels(PointKernels):
         return tensor
 
     def squared_length(self, F: Array, cell: UnitCell) -> Array:
-        return self._stretches(F, cell, None)
-
-    def squared_length_and_sum(self, F: Array, cell: UnitCell) -> tuple[Array, Array]:
-        logarithms = np.empty(len(F))
-        return self._stretches(F, cell, logarithms), logarithms
-
-    def _stretches(self, F: Array, cell: UnitCell, logarithms: Array | None) -> Array:
         squared = np.empty(len(F))
-        self._call("stretches", len(F), F, cell.dimensions, cell.axes, squared, logarithms)
+        self._call("squared_length", len(F), F, cell.dimensions, cell.axes, squared)
         return squared
 
     def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:

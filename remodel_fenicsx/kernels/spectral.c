@@ -206,21 +206,19 @@ void without_noise(int64_t n, const double *tensors, const double *axes, const d
     }
 }
 
-/* energy.squared_end_to_end_length and energy.axes_sum: r^2 = sum l_I^2 I_I and M = sum l_I^2 ln I_I. */
-void stretches(int64_t n, const double *F, const double *dimensions, const double *axes, double *squared, double *sum)
+/* energy.squared_end_to_end_length: r^2 = sum l_I^2 I_I. */
+void squared_length(int64_t n, const double *F, const double *dimensions, const double *axes, double *squared)
 {
     for (int64_t at = 0; at < n; ++at) {
         const double *f = F + 9 * at;
-        double length = 0.0, logarithms = 0.0;
+        double length = 0.0;
         for (int rank = 0; rank < 3; ++rank) {
             const double *a = axes + 9 * at + 3 * rank, l = dimensions[3 * at + rank];
             const double x = f[0] * a[0] + f[1] * a[1] + f[2] * a[2], y = f[3] * a[0] + f[4] * a[1] + f[5] * a[2];
-            const double z = f[6] * a[0] + f[7] * a[1] + f[8] * a[2], stretch = x * x + y * y + z * z;
-            length += l * l * stretch;
-            if (sum) logarithms += l * l * log(stretch);
+            const double z = f[6] * a[0] + f[7] * a[1] + f[8] * a[2];
+            length += l * l * (x * x + y * y + z * z);
         }
         squared[at] = length;
-        if (sum) sum[at] = logarithms;
     }
 }
 

@@ -576,24 +576,16 @@ class Tissue:
         old, new
             The cells, (..., 3) and (..., 3, 3).
         """
-        F = deformation_gradient
+        F, r0 = deformation_gradient, self.end_to_end_length
         if self.chain is None:
             return 0.0 * det(F)
-        C = F.swapaxes(-1, -2) @ F
-        squared = (structure_tensor(*old[:2]) * C).sum(axis=(-1, -2))
-        squared_change = (structure_tensor(*new[:2]) * C).sum(axis=(-1, -2)) - squared
-        r0 = self.end_to_end_length
-        repulsion_change = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
-        return self.increment(squared, squared_change, repulsion_change)
-
-    def increment(self, squared: Any, squared_change: Any, repulsion_change: Any) -> Any:
-        """The same from the old r^2, its change and that of M: for those who have them already; arrays."""
-        assert self.chain is not None
+        squared, squared_after = (squared_end_to_end_length(F, [cell]) for cell in (old, new))
         stiffness = self.chain.stiffness(self.relative(sqrt(squared)), self.contour_length)
         if self.natural_length is not None:
             stiffness = stiffness / self.natural_length**2
-        initial = self.chain.stiffness(self.end_to_end_length, self.contour_length)
-        return self.present_modulus / 2 * (stiffness * squared_change - initial * repulsion_change)
+        chains = self.present_modulus / 2 * stiffness * (squared_after - squared)
+        repulsion = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
+        return chains - self.repulsion_modulus / 2 * repulsion
 
     def turnover_increment(self, deformation_gradient: Any, cell: UnitCell, content: Any, natural_length: Any) -> Any:
         """First-order change of W at frozen F and cells when ln m and ln rho change, per reference volume; arrays.

@@ -40,28 +40,29 @@ Shares = Callable[[], Sequence[UnitCell]]
 class PointwiseRepulsion:
     """Second Piola-Kirchhoff stress of the repulsion and its derivative, as quadrature functions that forms take."""
 
-    def __init__(self, state: State, tissue: Tissue, shares: Shares):
+    def __init__(self, state: State, tissue: Tissue, cells: Sequence[UnitCell], shares: Shares):
         self.state, self.shares = state, shares
         self.tissue = with_kernels(tissue, state.comm)
         self.quadrature = state.cells.quadrature
         self._parameters = Parameters(self.tissue, self.quadrature)
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
-        self._known: list[Array] = []  # F, A and c g(r0) of the values that are there
-        self._cells: list[Array] = []  # what A was made of
-        self._structure: Array
-        self._stiffness_is_known = False
+        of_cells = [ufl.as_ufl(part) for cell in cells for part in cell]
+        of_stress = [state.kinematics.elastic_gradient(state.unknown), *of_cells, *self.tissue.parameters.values()]
+        self._structure: Remembered[Array] = Remembered(None, *of_cells)
+        self._stresses, self._stiffnesses = (Remembered[None](None, *of_stress) for _ in range(2))
 
     def update(self, stiffness: bool = False) -> None:
         """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
+        self._stresses(lambda: self._evaluate(stiffness=False))
+        if stiffness:
+            self._stiffnesses(lambda: self._evaluate(stiffness=True))
+
+    def _evaluate(self, stiffness: bool) -> None:
         derivatives = self.tissue.repulsion.derivatives
         assert derivatives is not None
-        F, A, modulus = self.state.elastic_gradient(), self._structure_tensor(), self._modulus()
-        asked = [F, A, modulus]
-        known = bool(self._known) and all(map(np.array_equal, asked, self._known))
-        if known and (self._stiffness_is_known or not stiffness):
-            return
-        self._known, self._stiffness_is_known = asked, stiffness
+        F, modulus = self.state.elastic_gradient(), self._modulus()
+        A = self._structure(lambda: whole_structure_tensor(self.shares()))
         first, second = derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
         shape = self.quadrature.shape
         # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
@@ -69,14 +70,6 @@ class PointwiseRepulsion:
         if second is not None:
             values = self.quadrature.values(self.stiffness, (6, 6))
             values[:] = (-2 * modulus[:, None, None] * second).reshape(*shape, 6, 6)
-
-    def _structure_tensor(self) -> Array:
-        """A of the present cells; they stay through a solve."""
-        shares = self.shares()
-        cells = [np.asarray(part) for cell in shares for part in cell]
-        if not self._cells or not all(map(np.array_equal, cells, self._cells)):
-            self._structure, self._cells = whole_structure_tensor(shares), [part.copy() for part in cells]
-        return self._structure
 
     def energy(self) -> float:
         """Its part of the stored energy, over all ranks."""
@@ -106,7 +99,7 @@ class PointStresses:
     """Stresses at the quadrature points as the residual has them: with what the formulation and the repulsion add."""
 
     def __init__(self, state: State, tissue: Tissue):
-        self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(state, tissue)
+        self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(state, tissue, [state.cells.ufl_cell])
         F = state.kinematics.elastic_gradient(state.unknown)
         self.ufl: Stresses = state.dilatation.stresses(tissue, F, [state.cells.ufl_cell])
         if self._repulsion is not None:
@@ -127,11 +120,13 @@ def mandel_vector(tensor: Any) -> Any:
     return ufl.as_vector([tensor[i, j] if i == j else np.sqrt(2.0) * tensor[i, j] for i, j in MANDEL])
 
 
-def pointwise_repulsion(state: State, tissue: Tissue, shares: Shares | None = None) -> PointwiseRepulsion | None:
+def pointwise_repulsion(
+    state: State, tissue: Tissue, cells: Sequence[UnitCell], shares: Shares | None = None
+) -> PointwiseRepulsion | None:
     """The part of a tissue's energy that UFL leaves out, with the state's cells or shares of them; None without one."""
     if tissue.chain is None or tissue.repulsion.derivatives is None:
         return None
-    return PointwiseRepulsion(state, tissue, shares or (lambda: [state.cells.point_cells]))
+    return PointwiseRepulsion(state, tissue, cells, shares or (lambda: [state.cells.point_cells]))
 
 
 @dataclass(frozen=True)
@@ -177,7 +172,7 @@ class Equilibrium:
         F = state.kinematics.elastic_gradient(u)
         self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.stress_free_weight(mesh))
         external = loading.external_residual(test)
-        self.pointwise = pointwise_repulsion(state, self.tissue, point_shares)
+        self.pointwise = pointwise_repulsion(state, self.tissue, shares, point_shares)
         internal, tangents = self.internal_and_tangents(F, test, trial)
         self.internal_forms = [jit.form(form) for form in internal]
         self.external_form = None if external is None else jit.form(external)
