@@ -177,14 +177,13 @@ class ShownBody:
         names = (*NAMES, *(OF_WALLS if whole.recording.scene.geometry.is_a("Walled") else ()))
         rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in shown}
         volume, is_deformed = _volumes(whole.points[whole.elements]), True
-        with whole.recording.kept_open():
-            for time in times:
-                displacement, found = whole.fields(float(time), names)
-                is_deformed = displacement is not None
-                moved = 0.0 if displacement is None else displacement
-                rows["position"].append((whole.points + moved).astype(np.float32))
-                for name, values in (_of_elements(found) | _of_layers(whole, volume, found)).items():
-                    rows[name].append(values.astype(np.float32))
+        for time in times:
+            displacement, found = whole.fields(float(time), names)
+            is_deformed = displacement is not None
+            moved = 0.0 if displacement is None else displacement
+            rows["position"].append((whole.points + moved).astype(np.float32))
+            for name, values in (_of_elements(found) | _of_layers(whole, volume, found)).items():
+                rows[name].append(values.astype(np.float32))
         series: Any = {name: np.stack(values) if values else None for name, values in rows.items()}
         return cls(whole, times, volume, **series, is_deformed=is_deformed)
 

@@ -123,7 +123,6 @@ class RecordedRun:
 
     def __init__(self, folder: str | os.PathLike[str]):
         self.path = Path(folder)
-        self._root: h5py.Group | None = None  # of the file of the fields, while it is kept open
         if not self.path.is_dir():
             raise RecordingError(f"{self.path}: {'is a file' if self.path.exists() else 'there is no such folder'}")
         for name in (SCENE, HISTORY):
@@ -253,32 +252,29 @@ class RecordedRun:
         return found[0]
 
     @contextmanager
-    def kept_open(self) -> Iterator[None]:
-        """Within, the file of the fields is opened once, for many times that are read."""
-        with self._fields_file() as root:
-            self._root = root
-            try:
-                yield
-            finally:
-                self._root = None
-
-    @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:
-        import h5py  # late: a run without fields needs none
-
-        if self._root is not None:
-            yield self._root
-            return
         path = self.path / FIELDS
         if not path.exists():
             raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")
-        try:
-            check_regular(path)
-            with h5py.File(path, "r") as file:
-                yield file["VTKHDF"]
-        except (OSError, RuntimeError, KeyError, ValueError, IndexError, TypeError) as error:
-            # h5py's own words can be several lines
-            raise RecordingError(f"{path}: is damaged or of another kind: {' '.join(str(error).split())}") from error
+        with series_file(path) as root:
+            yield root
+
+
+@contextmanager
+def series_file(path: Path, remedy: str = "") -> Iterator[h5py.Group]:
+    """A file of fields; HDF5's errors within say in one line that it is damaged, those of the disk stay what they are."""
+    import h5py  # late: a run without fields needs none
+
+    try:
+        check_regular(path)
+        with h5py.File(path, "r") as file:
+            yield file["VTKHDF"]
+    except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # the disk's have a number, HDF5's none
+            raise
+        # h5py's own words can be several lines
+        words = f"{' '.join(str(error).split())}{remedy}"
+        raise RecordingError(f"{path}: is damaged or of another kind: {words}") from error
 
 
 def scene_as_run(folder: Path) -> Scene:
