@@ -8,7 +8,7 @@ import os
 import re
 import socket
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -123,6 +123,7 @@ class RecordedRun:
 
     def __init__(self, folder: str | os.PathLike[str]):
         self.path = Path(folder)
+        self._root: h5py.Group | None = None  # of the file of the fields, while it is kept open
         if not self.path.is_dir():
             raise RecordingError(f"{self.path}: {'is a file' if self.path.exists() else 'there is no such folder'}")
         for name in (SCENE, HISTORY):
@@ -252,17 +253,27 @@ class RecordedRun:
         return found[0]
 
     @contextmanager
+    def kept_open(self) -> Iterator[None]:
+        """Within, the file of the fields is opened once, for many times that are read."""
+        with self._fields_file() as root:
+            self._root = root
+            try:
+                yield
+            finally:
+                self._root = None
+
+    @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:
         path = self.path / FIELDS
         if not path.exists():
             raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")
-        with series_file(path) as root:
+        with nullcontext(self._root) if self._root else series_file(path) as root:
             yield root
 
 
 @contextmanager
 def series_file(path: Path, remedy: str = "") -> Iterator[h5py.Group]:
-    """A file of fields; HDF5's errors within say in one line that it is damaged, those of the disk stay what they are."""
+    """A file of fields; HDF5's errors say in one line that it is damaged, those of the disk stay."""
     import h5py  # late: a run without fields needs none
 
     try:
