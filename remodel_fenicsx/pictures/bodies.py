@@ -19,7 +19,6 @@ import textwrap
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
@@ -35,7 +34,6 @@ from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
     CHAIN_LOOK,
-    HistoryColumns,
     LEVELS,
     RecordedRun,
     RecordingError,
@@ -75,11 +73,6 @@ def coloured(angle: Array) -> Array:
     """Colours (m, 3) of angles in degrees (m,), from red (0, aligned) over yellow to blue (90); NaN is grey."""
     step = np.clip(np.nan_to_num(angle) * LEVELS / 90.0, 0, LEVELS - 1).astype(int)
     return np.where(np.isnan(angle)[:, None], NOTHING_KNOWN, np.array([to_rgb(c) for c in ANGLE_COLOURS])[step])
-
-
-def _middles() -> Array:
-    """Of the steps of the scale, in degrees."""
-    return (np.arange(LEVELS) + 0.5) * (90.0 / LEVELS)
 
 
 # ---------------------------------------------------------------- in PyVista
@@ -149,7 +142,8 @@ def add_body(
     looks = {"scalars": name, "show_edges": True, "edge_color": "#777777", **light}
     if name in ANGLES:
         table: Any = pyvista.LookupTable()
-        table.values = np.rint(255 * np.column_stack([coloured(_middles()), np.ones(LEVELS)])).astype(np.uint8)
+        middles = (np.arange(LEVELS) + 0.5) * (90.0 / LEVELS)  # of the steps of the scale, in degrees
+        table.values = np.rint(255 * np.column_stack([coloured(middles), np.ones(LEVELS)])).astype(np.uint8)
         table.scalar_range, table.nan_color = (0.0, 90.0), NOTHING_KNOWN
         looks["cmap"] = table
     is_deformed = "displacement" in found.point_data
@@ -377,11 +371,6 @@ class Sight:
         self.is_deformed = self.whole.is_turned <= ("deformation_gradient" in recorded) and "displacement" in recorded
         self.shown = shown_elements(self.whole, viewing)
 
-    @cached_property
-    def history(self) -> HistoryColumns:
-        """Of the run, which may still be under way."""
-        return self.recording.history
-
     def times(self, wanted: Sequence[float] | None) -> list[float]:
         """The recorded times nearest to these, each once; the last one where none are wanted."""
         recorded = self.recording.times
@@ -392,10 +381,6 @@ class Sight:
                 raise FigureError(f"times {time:g}: allowed are times from {first:g} to {last:g}", 2)
         nearest = [float(recorded[np.abs(recorded - time).argmin()]) for time in wanted or (last,)]
         return list(dict.fromkeys(nearest))
-
-    def grids(self, times: Sequence[float]) -> list[pyvista.UnstructuredGrid]:
-        """What is seen at recorded times."""
-        return [grid(self.whole, time, self.shown, SHOWN_FIELDS) for time in times]
 
     def axes(self) -> Array:
         """Right, up and towards the eye: unit vectors, as rows (3, 3)."""
@@ -420,12 +405,12 @@ class Sight:
 
     def loads(self, time: float) -> list[str]:
         """The loads at a recorded time, as its row of the history has them; none before there is one."""
-        scene, found = self.recording.scene, []
-        row = np.flatnonzero([same_time(recorded, time) for recorded in self.history["time"]])
+        scene, history, found = self.recording.scene, self.recording.history, []
+        row = np.flatnonzero([same_time(recorded, time) for recorded in history["time"]])
         for name in scene.loads:
             column = scene.load_kinds[name].make_column(name)
-            if len(row) and column.name in self.history:
-                value = with_unit(float(self.history[column.name][row[0]]), unit_of(scene, column.unit))
+            if len(row) and column.name in history:
+                value = with_unit(float(history[column.name][row[0]]), unit_of(scene, column.unit))
                 found.append(f"{words(column.name)} {value}")
         return found
 
@@ -480,7 +465,7 @@ def draw_animation(
     sight = Sight(RecordedRun(folder), viewing or Viewing())
     if len(sight.recording.times) < FEWEST_FRAMES:
         raise FigureError(f"{sight.recording.path}: fields of one time alone are recorded, so nothing moves", 2)
-    times = [float(time) for time in kept_times(sight.history, sight.recording.times, frames)]
+    times = [float(time) for time in kept_times(sight.recording.history, sight.recording.times, frames)]
     sheets, view = _sheets(sight, times, FRAME, 0)
     images = render(sheets, view)
     return _write(path, sight, [times[0], times[-1]], path.suffix.lower() if path else ".gif", images, "animate")
@@ -490,7 +475,7 @@ def _sheets(
     sight: Sight, times: Sequence[float], box: tuple[int, int], columns: int
 ) -> tuple[list[PictureSheet], View]:
     """One of so many columns for all times, or one for each; all of one view."""
-    grids = sight.grids(times)
+    grids = [grid(sight.whole, time, sight.shown, SHOWN_FIELDS) for time in times]
     view, parts = sight.view(grids, box), [slice(None)] if columns else [slice(k, k + 1) for k in range(len(times))]
     titles, loads = [f"t = {time:g}" for time in times], ["\n".join(sight.loads(time)) for time in times]
     along, across = sight.recording.scene.geometry.angle_in_words

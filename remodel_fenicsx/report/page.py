@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import json
 import os
 import re
 import shlex
-import zlib
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -81,10 +82,8 @@ def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]
     block = bytearray(start)
     for place, data in parts:
         block[place : place + len(data)] = data
-    deflate = zlib.compressobj(
-        3, zlib.DEFLATED, 31
-    )  # 31: with the head of gzip; 6 is 5 % smaller and takes as long again
-    return base64.b64encode(deflate.compress(bytes(block)) + deflate.flush()).decode("ascii"), table
+    # level 6 is 5 % smaller and takes as long again
+    return base64.b64encode(gzip.compress(bytes(block), 3, mtime=0)).decode("ascii"), table
 
 
 def of_angles(degrees: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -162,35 +161,27 @@ class ShownBody:
     whole: WholeBody
     times: Places
     volume: Places
-    position: NDArray[np.float32]
-    angle: NDArray[np.float32] | None
-    extension: NDArray[np.float32] | None
-    edges: NDArray[np.float32] | None
-    wall_stress: Places | None
-    made: Places | None  # content and growth
+    series: dict[str, NDArray[np.float32]]  # position, and of `_of_elements` and `_of_layers` what was recorded
     is_deformed: bool
 
     @classmethod
     def of(cls, whole: WholeBody, times: Places) -> ShownBody:
         """What a run has recorded at these times."""
-        shown = ("position", "angle", "extension", "edges", "wall_stress", "made")
         names = (*NAMES, *(OF_WALLS if whole.recording.scene.geometry.is_a("Walled") else ()))
-        rows: dict[str, list[NDArray[np.float32]]] = {name: [] for name in shown}
+        rows = defaultdict[str, list[NDArray[np.float32]]](list)
         volume, is_deformed = _volumes(whole.points[whole.elements]), True
-        with whole.recording.kept_open():
-            for time in times:
-                displacement, found = whole.fields(float(time), names)
-                is_deformed = displacement is not None
-                moved = 0.0 if displacement is None else displacement
-                rows["position"].append((whole.points + moved).astype(np.float32))
-                for name, values in (_of_elements(found) | _of_layers(whole, volume, found)).items():
-                    rows[name].append(values.astype(np.float32))
-        series: Any = {name: np.stack(values) if values else None for name, values in rows.items()}
-        return cls(whole, times, volume, **series, is_deformed=is_deformed)
+        for time in times:
+            displacement, found = whole.fields(float(time), names)
+            is_deformed = displacement is not None
+            moved = 0.0 if displacement is None else displacement
+            rows["position"].append((whole.points + moved).astype(np.float32))
+            for name, values in (_of_elements(found) | _of_layers(whole, volume, found)).items():
+                rows[name].append(values.astype(np.float32))
+        return cls(whole, times, volume, {name: np.stack(values) for name, values in rows.items()}, is_deformed)
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """The same in few bytes, and the numbers that lead back."""
-        position, origin, step = of_places(self.position)
+        position, origin, step = of_places(self.series["position"])
         size = np.uint16 if len(self.whole.points) <= 65536 else np.uint32
         arrays = {
             "elements": Array(self.whole.elements.astype(size)),
@@ -200,12 +191,13 @@ class ShownBody:
             "position": Array(position, differences=True),
         }
         scales: dict[str, Any] = {"origin": origin, "position_step": step}
-        if self.angle is not None:
-            arrays["angle"] = Array(of_angles(self.angle), differences=True)
-        if self.extension is not None:
-            arrays["extension"] = Array(np.rint(255 * self.extension).astype(np.uint8), differences=True)
-        if self.edges is not None:
-            edges, scales["edge_step"] = of_vectors(self.edges)
+        if "angle" in self.series:
+            arrays["angle"] = Array(of_angles(self.series["angle"]), differences=True)
+        if "extension" in self.series:
+            extension = np.rint(255 * self.series["extension"]).astype(np.uint8)
+            arrays["extension"] = Array(extension, differences=True)
+        if "edges" in self.series:
+            edges, scales["edge_step"] = of_vectors(self.series["edges"])
             arrays["edges"] = Array(edges.reshape(*edges.shape[:2], 9), differences=True)
         return arrays, scales
 
@@ -394,7 +386,7 @@ def view(run: ReportedRun) -> Card | None:
         **scales, "times": [float(time) for time in body.times], "layers": len(body.whole.depth),
         "words": run.recording.scene.geometry.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT,
         "views": VIEWS,
-        "least_extension": 0.0 if body.extension is None else float(np.floor(20 * np.nanmin(body.extension)) / 20),
+        "least_extension": float(np.floor(20 * np.nanmin(body.series.get("extension", 0.0))) / 20),
         "chain": CHAIN_LOOK,
     }  # fmt: skip
     html = (ASSETS / "view.html").read_text(encoding="utf-8")
@@ -420,7 +412,7 @@ def _ways_to_show(arrays: Mapping[str, Array]) -> str:
 def angles(run: ReportedRun) -> Card | None:
     """The fibre angle through the body, and where the collagen points."""
     body, shape, regions = run.body, run.recording.scene.geometry, run.recording.scene.regions
-    if body is None or body.angle is None:
+    if body is None or "angle" not in body.series:
         return None
     through, start, end = shape.depth_in_words
     if not np.isfinite(run.recording.history.get("lumen_volume", np.zeros(1))).any():
@@ -439,14 +431,14 @@ def angles(run: ReportedRun) -> Card | None:
 def stress(run: ReportedRun) -> Card | None:
     """Stress through the wall, and what the law of Laplace says of its mean around."""
     body, history = run.body, run.recording.history
-    if body is None or body.wall_stress is None or len(body.whole.depth) < 2:
+    if body is None or "wall_stress" not in body.series or len(body.whole.depth) < 2:
         return None
     through, unit = run.recording.scene.geometry.depth_in_words[0], unit_of(run.recording.scene, "stress")
     laplace: Any = np.full(len(body.times), np.nan)
     if {"pressure", "inner_radius", "outer_radius"} <= set(history):
         inner, outer = history["inner_radius"], history["outer_radius"]
         laplace = np.interp(body.times, history["time"], history["pressure"] * inner / (outer - inner))
-    data = _by_layer(run, body, body.wall_stress, ("around", "along", "across"))
+    data = _by_layer(run, body, body.series["wall_stress"], ("around", "along", "across"))
     data |= {"level": [_finite(value) for value in laplace]}
     legend = "Means of layers, in axes that move with the wall."
     legend += " Dashed: p r_i / h, by the law of Laplace the mean around." if np.isfinite(laplace).any() else ""
@@ -459,17 +451,18 @@ def stress(run: ReportedRun) -> Card | None:
 def content(run: ReportedRun) -> Card | None:
     """Content and growth of the collagen through the wall, where they were recorded."""
     body = run.body
-    if body is None or body.made is None or len(body.whole.depth) < 2:
+    if body is None or "made" not in body.series or len(body.whole.depth) < 2:
         return None
-    known: Any = np.isfinite(body.made).all(axis=(0, 1))
+    made = body.series["made"]
+    known: Any = np.isfinite(made).all(axis=(0, 1))
     names = [words(name) for name, is_known in zip(MADE, known, strict=True) if is_known]
     title = f"{' and '.join(names).capitalize()} {run.recording.scene.geometry.depth_in_words[0]}"
     legend = '<p class="note">Means of layers, over those at the start: amount of the collagen, volume of the wall.</p>'
     html = section(title, f'<div id="content" class="stack"></div>{legend}', "half")
-    return Card("content", html, _by_layer(run, body, body.made[..., known], names))
+    return Card("content", html, _by_layer(run, body, made[..., known], names))
 
 
-def _by_layer(run: ReportedRun, body: ShownBody, values: Places, names: Sequence[str]) -> dict[str, Any]:
+def _by_layer(run: ReportedRun, body: ShownBody, values: NDArray[np.float32], names: Sequence[str]) -> dict[str, Any]:
     """What a drawing over the depth needs of values (times, layers, names)."""
     through, start, end = run.recording.scene.geometry.depth_in_words
     return {

@@ -97,10 +97,8 @@ def mesh_arrays(domain: Domain) -> dict[str, Array] | None:
 
 def gather_state(state: State) -> dict[str, Array] | None:
     """Every function of a state by name, (elements, values of one) in input order, on rank 0. Collective."""
-    domain, gathered = state.loading.domain, {}
-    for name, function in state.functions().items():
-        places = _places(function)
-        gathered[name] = domain.gather_elements(function.x.array[places])
+    domain, functions = state.loading.domain, state.functions()
+    gathered = {name: domain.gather_elements(one.x.array[_places(one)]) for name, one in functions.items()}
     return gathered if domain.comm.rank == 0 else None  # type: ignore[return-value]
 
 

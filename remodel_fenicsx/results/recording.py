@@ -8,7 +8,7 @@ import os
 import re
 import socket
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -264,21 +264,28 @@ class RecordedRun:
 
     @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:
-        import h5py  # late: a run without fields needs none
-
-        if self._root is not None:
-            yield self._root
-            return
         path = self.path / FIELDS
         if not path.exists():
             raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")
-        try:
-            check_regular(path)
-            with h5py.File(path, "r") as file:
-                yield file["VTKHDF"]
-        except (OSError, RuntimeError, KeyError, ValueError, IndexError, TypeError) as error:
-            # h5py's own words can be several lines
-            raise RecordingError(f"{path}: is damaged or of another kind: {' '.join(str(error).split())}") from error
+        with nullcontext(self._root) if self._root else series_file(path) as root:
+            yield root
+
+
+@contextmanager
+def series_file(path: Path, remedy: str = "") -> Iterator[h5py.Group]:
+    """A file of fields; HDF5's errors say in one line that it is damaged, those of the disk stay."""
+    import h5py  # late: a run without fields needs none
+
+    try:
+        check_regular(path)
+        with h5py.File(path, "r") as file:
+            yield file["VTKHDF"]
+    except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # the disk's have a number, HDF5's none
+            raise
+        # h5py's own words can be several lines
+        words = f"{' '.join(str(error).split())}{remedy}"
+        raise RecordingError(f"{path}: is damaged or of another kind: {words}") from error
 
 
 def scene_as_run(folder: Path) -> Scene:

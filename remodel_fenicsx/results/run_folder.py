@@ -157,7 +157,7 @@ class History:
         self._path, self._file = path, open(open_own(path, flags), "r+b", buffering=0)
         self._columns = None if after is None else next(csv.reader([self._file.readline().decode()]))
         self._sizes = [size]  # bytes up to the end of the last whole row, and before of the one before it
-        self._flushed_at, self._is_flushed = -math.inf, True
+        self._flushed_at = -math.inf
         self._cut()
 
     def append(self, row: dict[str, float]) -> None:
@@ -176,7 +176,6 @@ class History:
         try:
             while view:
                 view = view[self._file.write(view) :]
-            self._is_flushed = False
             if clock.monotonic() - self._flushed_at >= FLUSHED_AFTER:
                 self.flush()
         except OSError:
@@ -186,12 +185,11 @@ class History:
 
     def flush(self) -> None:
         """Bring all rows to the disk."""
-        if not self._is_flushed:
-            os.fsync(self._file.fileno())
-            if os.fstat(self._file.fileno()).st_nlink == 0:
-                lost = "the rows of this run, and what else was in its folder"
-                raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", self._path)
-            self._flushed_at, self._is_flushed = clock.monotonic(), True
+        os.fsync(self._file.fileno())
+        if os.fstat(self._file.fileno()).st_nlink == 0:
+            lost = "the rows of this run, and what else was in its folder"
+            raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", self._path)
+        self._flushed_at = clock.monotonic()
 
     def drop_last(self) -> None:
         """Take the last row back; only once after each row."""

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, part_of
+from remodel_fenicsx.results.recording import series_file
+from remodel_fenicsx.system.files import ClosedAtEnd, part_of
 from remodel_fenicsx.system.interrupts import handled
 
 if TYPE_CHECKING:
@@ -122,10 +122,7 @@ class TransientGrid(ClosedAtEnd):
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
         """With the steps of a file up to `time`, to append more."""
-        import h5py
-
-        with damage_named(path), h5py.File(path, "r") as file:
-            root = file["VTKHDF"]
+        with series_file(path, WITHOUT_IT) as root:
             points, cell_type = root["Points"][: int(root["NumberOfPoints"][0])], int(root["Types"][0])
             cells = root["Connectivity"][:].reshape(int(root["NumberOfCells"][0]), -1)
         grid = cls(path, points, cells, cell_type, point_dtype=points.dtype, replaces=True)
@@ -266,27 +263,13 @@ def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple
 
 # ---------------------------------------------------------------- files that somebody else may have made
 
-
-@contextmanager
-def damage_named(path: Path) -> Iterator[None]:
-    """Within, HDF5's errors say in one line that the file is damaged; those of the disk stay what they are."""
-    try:
-        check_regular(path)
-        yield
-    except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
-        if isinstance(error, OSError) and error.errno is not None:  # the disk's have a number, HDF5's none
-            raise
-        words = " ".join(str(error).split())
-        remedy = "the run goes on without this file"
-        raise RecordingError(f"{path}: is damaged or of another kind: {words}; {remedy}") from error
+WITHOUT_IT = "; the run goes on without this file"
 
 
 def recorded_steps(path: Path) -> Iterator[RecordedStep]:
     """The steps of a file of `TransientGrid`; what does not belong there is an error."""
-    import h5py
-
-    with damage_named(path), h5py.File(path, "r") as file:
-        root, number = file["VTKHDF"], int(file["VTKHDF/Steps"].attrs["NSteps"])
+    with series_file(path, WITHOUT_IT) as root:
+        number = int(root["Steps"].attrs["NSteps"])
         times = root["Steps/Values"][:number]
         if len(times) != number or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise ValueError("the times of its steps do not increase")

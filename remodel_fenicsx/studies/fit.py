@@ -575,9 +575,8 @@ def fit(
                 runs = journal.path.read_bytes().count(b"\n") - 1
                 line.show(f"{runs} runs, {len(left)} of {len(asked)} left: {', '.join(tasks)}")
             answers = [one.result() for one in asked]
-            for _, known in answers:
-                problem.known |= known
-            return [answer for answer, _ in answers]
+            problem.known |= Journal(place).known
+            return answers
 
         rough = partial(minimised, near=near, enough=ROUGHLY)
         found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
@@ -604,14 +603,13 @@ def _begin_with(problem: Problem) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _told(words: str, task: Callable[[Problem], Any]) -> tuple[Any, dict[Point, Array]]:
-    """What a task returns, and all that was evaluated for it, which the log counts."""
-    before, differences, begun = set(_problem.known), _problem.differences, clock.monotonic()
+def _told(words: str, task: Callable[[Problem], Any]) -> Any:
+    """What a task returns; what was evaluated for it stands in the journal, and the log counts it."""
+    before, differences, begun = len(_problem.known), _problem.differences, clock.monotonic()
     answer = task(_problem)
-    new = {point: found for point, found in _problem.known.items() if point not in before}
-    numbers = len(new), clock.monotonic() - begun, _problem.differences - differences
+    numbers = len(_problem.known) - before, clock.monotonic() - begun, _problem.differences - differences
     log.info("%s: %d runs in %.1f s; derivatives by differences at %d points", words, *numbers)
-    return answer, new
+    return answer
 
 
 def _end(pool: ProcessPoolExecutor, others: Sequence[Any]) -> None:

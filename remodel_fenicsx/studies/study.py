@@ -171,8 +171,7 @@ class Study:
                         self._pause()
                     self._begin()
                     self._collect(pausing)
-                    if not self.quiet:
-                        line.show(self._progress())
+                    line.show(self._progress())
             finally:
                 for worker in [*self._running, *self._idle]:
                     worker.stop()
@@ -192,9 +191,8 @@ class Study:
         for run in list(self._waiting):
             if len(self._running) >= self.jobs:
                 return
-            if (
-                run.folder.is_dir() and writer(run.folder)[1]
-            ):  # by another command, or one that was killed and is ending
+            # by another command, or one that was killed and is ending
+            if run.folder.is_dir() and writer(run.folder)[1]:
                 continue
             self._waiting.remove(run)
             if self._is_left(run) and self.fits(run):
