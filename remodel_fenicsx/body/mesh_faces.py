@@ -88,7 +88,7 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     """Find the named faces on the boundary of the one body that a file holds."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
-    normals = _area_vectors(places)
+    normals = area_vectors(places)
     owner = np.full(len(facets), "", dtype=object)
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
     for name, numbers in groups.items():
@@ -148,26 +148,29 @@ def through_the_wall(boundary: Boundary) -> bool:
     return bool(np.isin(inner, outer).any())
 
 
-def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
+def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle)."""
     # They run so that the normal of a flat cap on one points out of what the face encloses.
     rows = np.concatenate([np.empty(0, dtype=np.int64), *(part.facets for part in boundary.parts(face))])
-    edges: dict[tuple[int, int], int] = {}
-    for row, corners in zip(distinct(rows), as_rows(boundary.facets[rows]), strict=True):
-        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-            if edges.pop((end, start), None) is None:
-                edges[start, end] = row
-    if not edges:
-        return []
-    pairs = np.array(list(edges), dtype=np.int64)
-    label = components(pairs, len(file.points))
-    if file.degree == 2:
-        middles = [_middle(file, int(boundary.cell[row]), pair) for pair, row in edges.items()]
-        pairs = np.column_stack([pairs, middles])
-    return [pairs[label == one] for one in distinct(label)]
+    found = []
+    for edges, facets in rims(boundary.facets[rows]):
+        beside = zip(boundary.cell[rows[facets]], edges, strict=True)
+        middles = [[_middle(file, cell, pair) for cell, pair in beside]] if file.degree == 2 else []
+        found.append(np.column_stack([edges, *middles]))
+    return found
 
 
-def area_vector(points: Array, rim: Integers) -> Array:
+def rims(facets: Integers) -> list[tuple[Integers, Integers]]:
+    """The closed lines in which facets end: edges (n, 2), as the facets go along them, and the facets' numbers."""
+    edges = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
+    _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    alone = np.sort(first[count == 1])
+    label = components(edges[alone], int(facets.max(initial=0)) + 1)
+    parts = [alone[label == one] for one in distinct(label)]
+    return [(edges[part], part // facets.shape[1]) for part in parts]
+
+
+def cap_vector(points: Array, rim: Integers) -> Array:
     """Integral of x cross dx / 2 along a closed line of straight or parabolic edges: area times normal of a cap."""
     a, b = points[rim[:, 0]], points[rim[:, 1]]
     if rim.shape[1] == 2:
@@ -178,7 +181,7 @@ def area_vector(points: Array, rim: Integers) -> Array:
 
 def cap_volume(points: Array, rim: Integers) -> float:
     """Of the cone between the origin and a flat cap on a closed line."""
-    return float(points[rim[:, 0]].mean(axis=0) @ area_vector(points, rim) / 3)
+    return float(points[rim[:, 0]].mean(axis=0) @ cap_vector(points, rim) / 3)
 
 
 def components(rows: Integers, nodes: int) -> Integers:
@@ -255,14 +258,14 @@ def node_order(file: MeshFile) -> NDArray[np.int64]:
     return np.asarray(dolfinx.cpp.io.perm_gmsh(kind, file.cells.shape[1]), dtype=np.int64)
 
 
-def _area_vectors(places: Array) -> Array:
+def area_vectors(places: Array) -> Array:
     """Area times normal of facets at (facets, 3 or 4, 3): half the cross product of two edges, or of the diagonals."""
     if places.shape[1] == 3:
         return np.asarray(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2)
     return np.asarray(np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2)
 
 
-def _middle(file: MeshFile, cell: int, pair: tuple[int, int]) -> int:
+def _middle(file: MeshFile, cell: Any, pair: Any) -> int:
     (nodes,) = as_rows(file.cells[[cell]])
     local = tuple(sorted(nodes.index(node) for node in pair))
     return int(nodes[MIDDLES[file.kind][local[0], local[1]]])

@@ -14,7 +14,7 @@ import pytest
 
 from remodel_fenicsx import SceneError
 from remodel_fenicsx.body import mesh_file
-from remodel_fenicsx.body.lumen import rims
+from remodel_fenicsx.body.mesh_faces import rims
 from remodel_fenicsx.body.mesh_faces import boundary_of, jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFileError, read_mesh
 from remodel_fenicsx.body.mesh_body import refined
@@ -109,7 +109,7 @@ def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, ca
     wedges = np.concatenate([np.hstack([triangles + k * size, triangles + (k + 1) * size]) for k in range(2)])
     quads = [
         np.concatenate([np.hstack([rim + k * size, rim[:, ::-1] + (k + 1) * size]) for k in range(2)])
-        for rim in rims(triangles)
+        for rim, _ in rims(triangles)
     ]
     cells = [("wedge", wedges), ("triangle", triangles), ("triangle", triangles + 2 * size)]
     cells += [("quad", quad) for quad in quads]
