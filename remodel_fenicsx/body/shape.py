@@ -30,7 +30,7 @@ from remodel_fenicsx.schema.settings import (
     in_region,
 )
 from remodel_fenicsx.schema.tables import Table, fault, refuse
-from remodel_fenicsx.schema.units import Dimension, LengthUnit
+from remodel_fenicsx.schema.units import FORCE, Dimension, LengthUnit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -872,6 +872,17 @@ def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
     found = length_fault(lengths)
     if found is not None:
         raise fault(found[1], found[0], getattr(shape, found[0]))
+
+
+def axial_dead_force(face: str) -> LoadKind:
+    """A force along z on a face across it."""
+    return LoadKind(
+        lambda shape, loading, name: loading.add_dead_force(name, face, component=2),
+        "total force along z on the top; its direction stays (a dead load)",
+        FORCE,
+        reductions=("point",),
+        area=lambda shape: shape.section_area,
+    )
 
 
 def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:

@@ -15,13 +15,14 @@ from remodel_fenicsx.body.shape import (
     Column,
     LoadKind,
     Shape,
+    axial_dead_force,
     cauchy_columns,
     check_lengths,
     homogeneous_bar,
     uniaxial_columns,
 )
 from remodel_fenicsx.schema.settings import Mesh
-from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
+from remodel_fenicsx.schema.units import AREA, LENGTH
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -60,15 +61,7 @@ class Tendon(Shape):
     remodel_fenicsx.schema.tables.SceneError: length = -1.0: must be a finite number greater than 0
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {
-        "force": LoadKind(
-            lambda shape, loading, name: loading.add_dead_force(name, "top", component=2),
-            "total force along z on the top; its direction stays (a dead load)",
-            FORCE,
-            reductions=("point",),
-            area=lambda shape: shape.section_area,
-        )
-    }
+    loads: ClassVar[dict[str, LoadKind]] = {"force": axial_dead_force("top")}
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
     columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
