@@ -35,9 +35,9 @@ class Box(Shape):
     """A block from the origin along x, y and z, which slides on the planes x = y = z = 0."""
 
     face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
-    counts: ClassVar[tuple[int, int, int]]
+    _counts: ClassVar[tuple[int, int, int]]
     reductions: ClassVar[dict[str, Reduction]] = {
-        "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape.lengths)),
+        "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape._lengths)),
     }
 
     @property
@@ -46,19 +46,19 @@ class Box(Shape):
         """By their keys: along x, y and z, or one for all."""
 
     @property
-    def lengths(self) -> list[float]:
+    def _lengths(self) -> list[float]:
         """Along x, y and z."""
         return (3 * [*self.sides.values()])[:3]
 
     @property
     def axial_length(self) -> float:
         """Along z."""
-        return self.lengths[2]
+        return self._lengths[2]
 
     @property
     def section_area(self) -> float:
         """Across z."""
-        return self.lengths[0] * self.lengths[1]
+        return self._lengths[0] * self._lengths[1]
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Box:
@@ -67,7 +67,7 @@ class Box(Shape):
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """So many elements along x, y and z, times the refinement; of the paper's cube one."""
-        return box_domain(self.name, self.sides, self.lengths, self.counts, mesh, comm)
+        return box_domain(self.name, self.sides, self._lengths, self._counts, mesh, comm)
 
     def hold(self, loading: Loading) -> None:
         """Symmetry planes x = y = z = 0."""
@@ -100,7 +100,7 @@ class Cube(Box):
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
     columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
     number_of_elements: ClassVar[int] = 1
-    counts: ClassVar[tuple[int, int, int]] = (1, 1, 1)
+    _counts: ClassVar[tuple[int, int, int]] = (1, 1, 1)
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
     side: Annotated[float, LENGTH] = Field(

@@ -15,9 +15,9 @@ from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, rims
 from remodel_fenicsx.body.mesh_file import in_place, of_vtk, split_quads, split_wedges, vtk_arrays
 from remodel_fenicsx.body.wall import shared_out
-from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.errors import RemodelError, UnreadableFile
 from remodel_fenicsx.schema.settings import LARGEST_MESH
-from remodel_fenicsx.system.children import UnreadableFile, check_xml, read_guarded
+from remodel_fenicsx.system.children import check_xml, read_guarded
 from remodel_fenicsx.system.files import ForeignFileError, write_new
 
 Array = NDArray[np.float64]

@@ -124,7 +124,7 @@ class Sheet(Box):
         ),
     )
     number_of_elements: ClassVar[int] = 16
-    counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
+    _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the sheet", "lower face", "upper face")
     angle_in_words: ClassVar[tuple[str, str]] = ("along x", "across x")
     buckles: ClassVar[bool] = False  # it lies on z = 0

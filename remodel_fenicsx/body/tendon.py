@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.reductions import Reduction, Strut, cylinder, unturned
+from remodel_fenicsx.body.reductions import Reduction, Strut, cylinder
 from remodel_fenicsx.body.shape import (
     Column,
     LoadKind,
@@ -21,6 +21,7 @@ from remodel_fenicsx.body.shape import (
     homogeneous_bar,
     uniaxial_columns,
 )
+from remodel_fenicsx.model.cells import global_axes
 from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.units import AREA, LENGTH
 
@@ -102,7 +103,7 @@ class Tendon(Shape):
     def strut(self, ends: str) -> Strut:
         """Its bottom stays in its plane, its top is free."""
         moment = self.area / (4 * math.pi)
-        return Strut(self.length, 2.0, unturned, lambda places: np.full(len(places), moment))
+        return Strut(self.length, 2.0, global_axes, lambda places: np.full(len(places), moment))
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Tendon:

@@ -113,6 +113,12 @@ class Table(BaseModel):
         __init__.__pydantic_base_init__ = True
 
 
+def with_key(name: str, kind: Any, **field: Any) -> Any:
+    """A class of tables with a key that is a word of Python."""
+    fields: Any = {name: (kind, Field(**field))}
+    return create_model(f"_With_{name}", __base__=Table, **fields)
+
+
 def _of_python(value: Any) -> Any:
     """A value with numpy's numbers and arrays, at any depth, as Python's own."""
     if hasattr(value, "dtype") and hasattr(value, "tolist"):
