@@ -42,6 +42,10 @@ class RemodelError(Exception):
         return " ".join(str(self).split())
 
 
+class UnreadableFile(RemodelError, ValueError):  # noqa: N818
+    """What is wrong with a file of others; one line."""
+
+
 def printable(text: str) -> str:
     """Text on one line: control characters and line ends become spaces."""
     return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)

@@ -17,6 +17,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading, LoadValues, values_of_loads
 from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
 from remodel_fenicsx.body.wall import RoundWall
+from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.evolution.coupling import Maker
 from remodel_fenicsx.evolution.stepper import OtherCase, OtherCaseWatcher, Step, Stepper, Watcher, times
 from remodel_fenicsx.fem.formulations import FORMULATIONS
@@ -410,24 +411,22 @@ def in_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) 
 
 
 def _fibre_file(cells: Cells, region: str) -> Any:
-    from remodel_fenicsx.body.fibres import FibreFileError, read_fibre_file  # few scenes have one
+    from remodel_fenicsx.body.fibres import read_fibre_file  # few scenes have one
 
     try:
         file = read_fibre_file(Path(str(cells.fibres)))
         if cells.fibres_sha256 not in (None, file.sha256):
-            raise FibreFileError(f"has changed: its SHA-256 was {str(cells.fibres_sha256)[:12]}...")
-    except FibreFileError as error:
+            raise UnreadableFile(f"has changed: its SHA-256 was {str(cells.fibres_sha256)[:12]}...")
+    except UnreadableFile as error:
         raise SceneError(f"{in_region(region)}cells.fibres = {cells.fibres!r}: {error}") from error
     return file
 
 
 def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str, Any]:
-    from remodel_fenicsx.body.fibres import FibreFileError
-
     key, file = f"{in_region(region)}cells.fibres", _fibre_file(cells, region)
     try:
         rows, farthest = file.rows_of(corners, chosen)
-    except FibreFileError as error:
+    except UnreadableFile as error:
         raise SceneError(f"{key} = {cells.fibres!r}: {error}") from error
     count, names = len(next(iter(file.measured.values()))), ", ".join(file.measured)
     way = "by number" if farthest is None else f"the nearest ones, {farthest:.3g} away at most"

@@ -23,6 +23,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, dof_of_node
+from remodel_fenicsx.body.mesh_faces import area_vectors
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import Positive, SolveStopped, of_all_ranks, over_ranks
 from remodel_fenicsx.fem.compat import geometry_dofmap
@@ -140,10 +141,8 @@ def outward_areas(mesh: Any, facets: Facets) -> Array:
     """Area times outward normal of the facets between their corners, (n, 3); zero for those that another rank owns."""
     cells, _ = cells_of(mesh, facets)
     corners = mesh.geometry.x[corners_of(mesh, facets)]
-    if corners.shape[1] == 3:
-        vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    else:  # the diagonals of a quadrilateral, in dolfinx's order of its corners
-        vectors = np.cross(corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]) / 2
+    around = corners[:, [0, 1, 3, 2]] if corners.shape[1] == 4 else corners  # dolfinx does not go around
+    vectors = area_vectors(around)
     middles = mesh.geometry.x[geometry_dofmap(mesh)[cells]].mean(axis=1)
     outwards = np.sign(np.sum(vectors * (corners.mean(axis=1) - middles), axis=1))
     owned = facets < mesh.topology.index_map(2).size_local

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -13,6 +14,7 @@ from remodel_fenicsx.body.shape import (
     Column,
     LoadKind,
     Shape,
+    axial_dead_force,
     cauchy_columns,
     check_lengths,
     homogeneous_bar,
@@ -20,7 +22,7 @@ from remodel_fenicsx.body.shape import (
 )
 from remodel_fenicsx.body.reductions import Reduction, box
 from remodel_fenicsx.schema.settings import Mesh
-from remodel_fenicsx.schema.units import FORCE, LENGTH
+from remodel_fenicsx.schema.units import LENGTH
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -29,7 +31,51 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.loading import Loading
 
 
-class Cube(Shape):
+class Box(Shape):
+    """A block from the origin along x, y and z, which slides on the planes x = y = z = 0."""
+
+    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    _counts: ClassVar[tuple[int, int, int]]
+    reductions: ClassVar[dict[str, Reduction]] = {
+        "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape._lengths)),
+    }
+
+    @property
+    @abstractmethod
+    def sides(self) -> dict[str, float]:
+        """By their keys: along x, y and z, or one for all."""
+
+    @property
+    def _lengths(self) -> list[float]:
+        """Along x, y and z."""
+        return (3 * [*self.sides.values()])[:3]
+
+    @property
+    def axial_length(self) -> float:
+        """Along z."""
+        return self._lengths[2]
+
+    @property
+    def section_area(self) -> float:
+        """Across z."""
+        return self._lengths[0] * self._lengths[1]
+
+    @model_validator(mode="after")
+    def _can_be_meshed(self) -> Box:
+        check_lengths(self, self.sides)
+        return self
+
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+        """So many elements along x, y and z, times the refinement; of the paper's cube one."""
+        return box_domain(self.name, self.sides, self._lengths, self._counts, mesh, comm)
+
+    def hold(self, loading: Loading) -> None:
+        """Symmetry planes x = y = z = 0."""
+        for component, face in enumerate(("x0", "y0", "z0")):
+            loading.hold_face(face, component)
+
+
+class Cube(Box):
     """A cube, pulled along z: the homogeneous body of the paper's Fig. 5. It slides on the planes x = y = z = 0.
 
     Its keyword arguments are the keys of `[geometry]`: `side` in the unit `length_unit`, or in any one unit.
@@ -50,22 +96,11 @@ class Cube(Shape):
     (4.0, ['force'])
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {
-        "force": LoadKind(
-            lambda shape, loading, name: loading.add_dead_force(name, "z1", component=2),
-            "total force along z on the top; its direction stays (a dead load)",
-            FORCE,
-            reductions=("point",),
-            area=lambda shape: shape.section_area,
-        )
-    }
+    loads: ClassVar[dict[str, LoadKind]] = {"force": axial_dead_force("z1")}
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
     columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
     number_of_elements: ClassVar[int] = 1
-    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
-    reductions: ClassVar[dict[str, Reduction]] = {
-        "point": homogeneous_bar("z0", "z1", lambda shape: {"side": shape.side}, lambda shape: box(*3 * (shape.side,))),
-    }
+    _counts: ClassVar[tuple[int, int, int]] = (1, 1, 1)
 
     shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
     side: Annotated[float, LENGTH] = Field(
@@ -73,28 +108,9 @@ class Cube(Shape):
     )
 
     @property
-    def axial_length(self) -> float:
-        """The side."""
-        return self.side
-
-    @property
-    def section_area(self) -> float:
-        """Across z."""
-        return self.side**2
-
-    @model_validator(mode="after")
-    def _can_be_meshed(self) -> Cube:
-        check_lengths(self, {"side": self.side})
-        return self
-
-    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """The cube [0, side]^3; with refinement 1 the paper's single element."""
-        return box_domain(self.name, {"side": self.side}, 3 * (self.side,), (1, 1, 1), mesh, comm)
-
-    def hold(self, loading: Loading) -> None:
-        """Symmetry planes x = y = z = 0."""
-        for component, face in enumerate(("x0", "y0", "z0")):
-            loading.hold_face(face, component)
+    def sides(self) -> dict[str, float]:
+        """The one."""
+        return {"side": self.side}
 
 
 def box_domain(

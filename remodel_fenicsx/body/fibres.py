@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.mesh_file import in_place, read_exchange_file
-from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
-from remodel_fenicsx.schema.text import TableFileError, read_columns
+from remodel_fenicsx.schema.text import read_columns
 from remodel_fenicsx.system.files import read_regular
-from remodel_fenicsx.system.children import LARGEST_FILE, UnreadableFile
+from remodel_fenicsx.system.children import LARGEST_FILE
 
 Array = NDArray[np.float64]
 
@@ -33,10 +33,6 @@ OF_TABLES = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, par
 SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
 SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_"}
 EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [f"axis_{i}_{c}" for i in (1, 2, 3) for c in "xyz"]
-
-
-class FibreFileError(RemodelError, ValueError):
-    """What is wrong with a file of fibres; one line."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +56,14 @@ class FibreFile:
             if self.places is None or (np.abs(self.places - centres) < SAME_PLACE * sizes[:, None]).all():
                 return np.arange(count), None
         if self.places is None:
-            raise FibreFileError(f"has {count} rows without places (x, y, z), the mesh has {len(centres)} elements")
+            raise UnreadableFile(f"has {count} rows without places (x, y, z), the mesh has {len(centres)} elements")
         rows = np.zeros(len(centres), dtype=np.int64)
         far, rows[chosen] = cKDTree(self.places).query(centres[chosen])
         if (far > sizes[chosen]).any():
             worst = (far / sizes[chosen]).argmax()
             place, size = in_place(centres[chosen][worst]), sizes[chosen][worst]
             rule = f"nothing is measured within one element ({size:.3g}) of {place}; "
-            raise FibreFileError(rule + f"the nearest is {far[worst]:.3g} away")
+            raise UnreadableFile(rule + f"the nearest is {far[worst]:.3g} away")
         return rows, float(far.max())
 
 
@@ -75,7 +71,7 @@ def read_fibre_file(path: Path) -> FibreFile:
     """Read measured fibres."""
     ending = path.suffix.lower()
     if ending not in FIBRE_ENDINGS:
-        raise FibreFileError(f"allowed are files {', '.join(FIBRE_ENDINGS)}")
+        raise UnreadableFile(f"allowed are files {', '.join(FIBRE_ENDINGS)}")
     try:
         if ending == ".csv":
             data = read_regular(path, LARGEST_FILE)
@@ -83,11 +79,11 @@ def read_fibre_file(path: Path) -> FibreFile:
         else:
             measured, places, data = _of_mesh(path)
     except OSError as error:
-        raise FibreFileError(f"cannot be read: {error.strerror or error}") from error
+        raise UnreadableFile(f"cannot be read: {error.strerror or error}") from error
     if (found := fault_of_fibres(measured)) is not None:
-        raise FibreFileError(found)
+        raise UnreadableFile(found)
     if places is not None and not np.isfinite(places).all():
-        raise FibreFileError("has places that are not finite")
+        raise UnreadableFile("has places that are not finite")
     if "angle" in measured and SMALL < np.abs(measured["angle"]).max() <= np.pi:
         log.warning("%s: all angles lie within 3.14, as in radians; degrees are asked", path.name)
     return FibreFile(measured, places, data)
@@ -95,10 +91,7 @@ def read_fibre_file(path: Path) -> FibreFile:
 
 def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     """Columns by name: structure_tensor_xx ..., fibre_x ..., fibre_2_x ..., weight, angle; element, or x, y, z."""
-    try:
-        columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
-    except TableFileError as error:
-        raise FibreFileError(str(error)) from error
+    columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
     left = dict.fromkeys(columns)
 
     def together(name: str, *components: str) -> Array | None:
@@ -116,15 +109,15 @@ def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     found |= {name: together("", name) for name in ("angle", "weight")}
     places, elements = together("", *"xyz"), together("", "element")
     if left:
-        raise FibreFileError(f"has {', '.join(left)} without the other columns of x, y, z or of the tensor")
+        raise UnreadableFile(f"has {', '.join(left)} without the other columns of x, y, z or of the tensor")
     measured = {name: values for name, values in found.items() if values is not None}
     if not set(measured) & set(SOURCES):
-        raise FibreFileError(f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z")
+        raise UnreadableFile(f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z")
     if elements is None:
         return measured, places
     order = np.argsort(elements[:, 0])
     if not np.array_equal(elements[order, 0], np.arange(1, len(order) + 1)):
-        raise FibreFileError(f"the column element must have the numbers 1 to {len(order)}, each once")
+        raise UnreadableFile(f"the column element must have the numbers 1 to {len(order)}, each once")
     return {name: values[order] for name, values in measured.items()}, None if places is None else places[order]
 
 
@@ -133,8 +126,8 @@ _NEEDED = f"needed is one of {', '.join(SOURCES)}"
 
 def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
     """Arrays of the solid elements, or else of the points; and the file."""
+    mesh = read_exchange_file(path)
     try:
-        mesh = read_exchange_file(path)
         solid = [n for n, (kind, _) in enumerate(mesh.cells) if kind.startswith(("tetra", "hexa", "wedge"))]
         of_cells = {
             name: np.concatenate([_columns(blocks[n]) for n in solid])
@@ -145,16 +138,14 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
         points = np.asarray(mesh.points, dtype=np.float64)
         points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])])
         centres = [points[mesh.cells[n][1]].mean(axis=1) for n in solid]
-    except UnreadableFile as error:
-        raise FibreFileError(str(error)) from None
     except (ValueError, TypeError, IndexError) as error:
-        raise FibreFileError(f"has arrays that do not fit its elements: {' '.join(str(error).split())}") from error
+        raise UnreadableFile(f"has arrays that do not fit its elements: {' '.join(str(error).split())}") from error
     if set(of_cells) & set(SOURCES):
         return of_cells, np.concatenate(centres), mesh.data
     if set(of_points) & set(SOURCES):
         return of_points, points, mesh.data
     known = ", ".join([*mesh.cell_data, *mesh.point_data]) or "none"
-    raise FibreFileError(f"has arrays {known}; {_NEEDED}")
+    raise UnreadableFile(f"has arrays {known}; {_NEEDED}")
 
 
 def _columns(values: Array) -> Array:

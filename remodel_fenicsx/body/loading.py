@@ -70,7 +70,6 @@ class Loading:
         self.weight = self.kinematics.weight(domain.mesh)
         self.boundary_conditions: list[Any] = []
         self.values: LoadValues = {}
-        self._magnitudes: dict[str, list[tuple[Any, Any]]] = {}  # constant, and its value at magnitude 1
         self._setters: dict[str, list[Callable[[float], None]]] = {}
         self._terms: list[Callable[[Any, Any], Any]] = []
         self._potentials: list[Callable[[Any], Any]] = []
@@ -385,8 +384,6 @@ class Loading:
         for name, value in values.items():
             if name not in self.values:
                 raise KeyError(name)
-            for constant, scale in self._magnitudes.get(name, ()):
-                constant.value = value * scale
             for setter in self._setters.get(name, ()):
                 setter(float(value))
             self.values[name] = float(value)
@@ -407,8 +404,11 @@ class Loading:
 
     def _take(self, name: str, constant: Any, scale: Any) -> None:
         """From now on the constant is the named load's magnitude times `scale`."""
-        self._magnitudes.setdefault(name, []).append((constant, scale))
-        self.values[name] = 0.0
+
+        def set_value(magnitude: float) -> None:
+            constant.value = magnitude * scale
+
+        self.follow(name, set_value)
 
     def _check_three_dimensional(self, what: str) -> None:
         if not self.kinematics.three_dimensional:

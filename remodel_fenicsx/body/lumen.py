@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
+from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, rims
 from remodel_fenicsx.body.mesh_file import in_place, of_vtk, split_quads, split_wedges, vtk_arrays
 from remodel_fenicsx.body.wall import shared_out
-from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.errors import RemodelError, UnreadableFile
 from remodel_fenicsx.schema.settings import LARGEST_MESH
-from remodel_fenicsx.system.children import UnreadableFile, check_xml, read_guarded
+from remodel_fenicsx.system.children import check_xml, read_guarded
 from remodel_fenicsx.system.files import ForeignFileError, write_new
 
 Array = NDArray[np.float64]
@@ -152,34 +153,11 @@ def _edges(triangles: Integers) -> tuple[Integers, Flags, Integers]:
     return np.sort(edges, axis=1), edges[:, 0] < edges[:, 1], np.tile(np.arange(len(triangles)), 3)
 
 
-def rims(triangles: Integers) -> list[Integers]:
-    """Edges (n, 2) of each opening, as the triangles go along them."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    edges, forward, _ = _edges(triangles)
-    _, first, counts = np.unique(edges, axis=0, return_index=True, return_counts=True)
-    alone = first[counts == 1]
-    found = np.where(forward[alone, None], edges[alone], edges[alone][:, ::-1])
-    nodes, local = np.unique(found, return_inverse=True)
-    local = local.reshape(found.shape)
-    _, part = connected_components(coo_matrix((np.ones(len(found)), local.T), (len(nodes),) * 2), directed=False)
-    return [found[part[local[:, 0]] == k] for k in range(part.max() + 1)]
-
-
 def _signed_volume(points: Array, triangles: Integers) -> float:
     """Inside of the triangles and flat caps on their openings."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    volume = float(np.einsum("ni,ni->", a, np.cross(b, c)))
-    for rim in rims(triangles):
-        middle = points[rim].mean(axis=(0, 1))
-        volume += float(np.einsum("i,ni->", middle, np.cross(points[rim[:, 1]], points[rim[:, 0]])))
-    return volume / 6
-
-
-def _area(surface: Surface) -> float:
-    a, b, c = (surface.points[surface.triangles[:, k]] for k in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    places = points[triangles]
+    sides = np.einsum("ni,ni->", places.mean(axis=1), area_vectors(places)) / 3
+    return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim, _ in rims(triangles)))
 
 
 def remeshed(surface: Surface, size: float) -> Surface:
@@ -227,7 +205,8 @@ def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], throu
     shares, ends = np.array(list(layers.values())), np.cumsum([0.0, *layers.values()])
     levels = np.concatenate([[0.0], *(np.linspace(ends[k], ends[k + 1], n + 1)[1:] for k, n in enumerate(counts))])
     levels /= shares.sum()
-    size, openings, layer = len(surface.points), rims(surface.triangles), np.arange(len(levels) - 1)[:, None, None]
+    openings = [rim for rim, _ in rims(surface.triangles)]
+    size, layer = len(surface.points), np.arange(len(levels) - 1)[:, None, None]
     wedges = np.concatenate([surface.triangles, surface.triangles + size], axis=1) + size * layer
     tetrahedra = split_wedges(wedges.reshape(-1, 6)).reshape(-1, 4)
     normals = _normals(surface, openings)
@@ -252,10 +231,9 @@ def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], throu
 
 def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
     """Unit vectors out of the lumen at the points, by the triangles around them; those of a rim in its plane."""
-    a, b, c = (surface.points[surface.triangles[:, k]] for k in range(3))
-    found = np.zeros_like(surface.points)
+    found, vectors = np.zeros_like(surface.points), area_vectors(surface.points[surface.triangles])
     for k in range(3):
-        np.add.at(found, surface.triangles[:, k], np.cross(b - a, c - a))
+        np.add.at(found, surface.triangles[:, k], vectors)
     return _in_planes(found, surface.points, openings)
 
 
@@ -323,7 +301,8 @@ def write_wall(
     if not 1 <= through <= MOST_THROUGH:
         raise LumenError(f"--through: allowed is a whole number from 1 to {MOST_THROUGH}")
     shares, read = _thicknesses(layers), read_surface(surface)
-    number = 3 * max(through, len(shares)) * _area(read) / (np.sqrt(0.1875) * size**2)  # of equilateral triangles
+    area = np.linalg.norm(area_vectors(read.points[read.triangles]), axis=1).sum()
+    number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # of equilateral triangles
     if number > LARGEST_MESH:
         raise LumenError(f"--size {size:g}: makes about {number:.2g} tetrahedra; at most {LARGEST_MESH:g} are made")
     found = remeshed(read, size)

@@ -24,13 +24,13 @@ from remodel_fenicsx.body.mesh_file import (
     Array,
     Block,
     MeshFile,
-    MeshFileError,
     assembled,
     distinct,
     read_mesh,
 )
 from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
 from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_columns, stress_columns
+from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
@@ -211,7 +211,7 @@ class FileBody(WithRegions, FromFile):
         tags, (file, *surfaces) = own["geometry"].get("tags"), map(Path, files)
         try:
             found = read_mesh(file, tags if isinstance(tags, str) else None, surfaces)
-        except MeshFileError as error:
+        except UnreadableFile as error:
             raise fault(str(error), "geometry.file", file.name) from None
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
 
@@ -258,7 +258,7 @@ class FileBody(WithRegions, FromFile):
             boundary = mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
         except mesh_faces.FaceError as error:
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
-        except MeshFileError as error:
+        except UnreadableFile as error:
             raise self._fault(str(error)) from None
         self.check_boundary(file, boundary)
         counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
@@ -273,7 +273,7 @@ class FileBody(WithRegions, FromFile):
             raise SceneError(f"mesh.refinement = {mesh.refinement}: {number} elements; at most {LARGEST_MESH} are made")
         try:
             file = refined(file, mesh.refinement, mesh.degree)
-        except MeshFileError as error:
+        except UnreadableFile as error:
             asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}"
             raise SceneError(f"{asked}: {self._name} {error}") from None
         words = "the faces of the body stay plane as in the file"
@@ -284,7 +284,7 @@ class FileBody(WithRegions, FromFile):
         try:
             mesh, *surfaces = map(Path, _files(self.file))
             file = read_mesh(mesh, self.tags, surfaces)
-        except MeshFileError as error:
+        except UnreadableFile as error:
             raise self._fault(str(error)) from None
         if self.sha256 not in (None, file.sha256):
             raise self._fault(f"has changed: its SHA-256 was {str(self.sha256)[:12]}...")
@@ -500,7 +500,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
             STRESS,
         ),
         "elongation": LoadKind(
-            lambda shape, loading, name: None,  # a part of the supports (`support`)
+            _by_hold_faces,
             "prescribed engineering strain of the length: the outlet moves along its own normal",
             column="axial_elongation",
             above=-1.0,
@@ -594,7 +594,7 @@ def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     if (refinement, degree) == (1, file.degree):
         return file
     if file.degree != 1:
-        raise MeshFileError(f"has elements of degree {file.degree}: they are taken as they are")
+        raise UnreadableFile(f"has elements of degree {file.degree}: they are taken as they are")
     with gmsh_model("file") as gmsh:
         mesh, parts = gmsh.model.mesh, {3: (file.cells, file.cell_groups), 2: (file.facets, file.facet_groups)}
         entities = {

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.axes import facets_of, harmonic, slopes
 from remodel_fenicsx.body.domain import Domain, SymbolicMesh, cells_of, corners_of
-from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims
+from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import agreed, over_ranks
@@ -113,7 +113,7 @@ def shared(
         extent = float(np.ptp(file.points, axis=0).max())
         told = (
             *(file.kind, file.degree, file.cells.shape[1], extent, regions),
-            *(boundary.facets, tuple(boundary.faces), boundary.volume, tuple(rims(file, boundary, "inner"))),
+            *(boundary.facets, tuple(boundary.faces), boundary.volume, tuple(rims_of(file, boundary, "inner"))),
         )
     kind, degree, nodes, extent, regions, facets, parts, volume, lines = comm.bcast(told)
     symbolic = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, MeshFileError, as_rows, distinct, in_place
+from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, as_rows, distinct, in_place
+from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
 
@@ -27,20 +28,12 @@ FACETS = {
     "tetrahedron": ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)),
     "hexahedron": ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
 }
-# Gmsh's number of the node in the middle of each edge of an element, by its corners
-MIDDLES = {
-    "tetrahedron": {(0, 1): 4, (1, 2): 5, (0, 2): 6, (0, 3): 7, (2, 3): 8, (1, 3): 9},
-    "hexahedron": {
-        (0, 1): 8, (0, 3): 9, (0, 4): 10, (1, 2): 11, (1, 5): 12, (2, 3): 13,
-        (2, 6): 14, (3, 7): 15, (4, 5): 16, (4, 7): 17, (5, 6): 18, (6, 7): 19,
-    },
-}  # fmt: skip
 FLAT = 1e-12  # of the mean |det J| of the elements: below it one has no volume
 NOT_AROUND = 0.5  # length of the mean normal of a face that has a direction: that of a half sphere
 Groups = Mapping[str, Sequence[int]]
 
 
-class FaceError(MeshFileError):
+class FaceError(UnreadableFile):
     """A fault of one face, under its name."""
 
     def __init__(self, face: str, rule: str):
@@ -88,7 +81,7 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     """Find the named faces on the boundary of the one body that a file holds."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
-    normals = _area_vectors(places)
+    normals = area_vectors(places)
     owner = np.full(len(facets), "", dtype=object)
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
     for name, numbers in groups.items():
@@ -107,7 +100,7 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     if bare.any() and not open_boundary:
         where, share = in_place(places[bare][0].mean(axis=0)), bare.sum()
         rule = f"{share} of {len(bare)} facets of the boundary are in no face of geometry.faces, the first at {where}"
-        raise MeshFileError(rule + "; if that is meant: geometry.open_boundary = true")
+        raise UnreadableFile(rule + "; if that is meant: geometry.open_boundary = true")
     faces = []
     for name in groups:
         rows = np.flatnonzero(owner == name)
@@ -148,26 +141,29 @@ def through_the_wall(boundary: Boundary) -> bool:
     return bool(np.isin(inner, outer).any())
 
 
-def rims(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
+def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle)."""
     # They run so that the normal of a flat cap on one points out of what the face encloses.
     rows = np.concatenate([np.empty(0, dtype=np.int64), *(part.facets for part in boundary.parts(face))])
-    edges: dict[tuple[int, int], int] = {}
-    for row, corners in zip(distinct(rows), as_rows(boundary.facets[rows]), strict=True):
-        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-            if edges.pop((end, start), None) is None:
-                edges[start, end] = row
-    if not edges:
-        return []
-    pairs = np.array(list(edges), dtype=np.int64)
-    label = components(pairs, len(file.points))
-    if file.degree == 2:
-        middles = [_middle(file, int(boundary.cell[row]), pair) for pair, row in edges.items()]
-        pairs = np.column_stack([pairs, middles])
-    return [pairs[label == one] for one in distinct(label)]
+    found = []
+    for edges, facets in rims(boundary.facets[rows]):
+        beside = zip(boundary.cell[rows[facets]], edges, strict=True)
+        middles = [[_middle(file, cell, pair) for cell, pair in beside]] if file.degree == 2 else []
+        found.append(np.column_stack([edges, *middles]))
+    return found
 
 
-def area_vector(points: Array, rim: Integers) -> Array:
+def rims(facets: Integers) -> list[tuple[Integers, Integers]]:
+    """The closed lines in which facets end: edges (n, 2), as the facets go along them, and the facets' numbers."""
+    edges = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
+    _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    alone = np.sort(first[count == 1])
+    label = components(edges[alone], int(facets.max(initial=0)) + 1)
+    parts = [alone[label == one] for one in distinct(label)]
+    return [(edges[part], part // facets.shape[1]) for part in parts]
+
+
+def cap_vector(points: Array, rim: Integers) -> Array:
     """Integral of x cross dx / 2 along a closed line of straight or parabolic edges: area times normal of a cap."""
     a, b = points[rim[:, 0]], points[rim[:, 1]]
     if rim.shape[1] == 2:
@@ -178,7 +174,7 @@ def area_vector(points: Array, rim: Integers) -> Array:
 
 def cap_volume(points: Array, rim: Integers) -> float:
     """Of the cone between the origin and a flat cap on a closed line."""
-    return float(points[rim[:, 0]].mean(axis=0) @ area_vector(points, rim) / 3)
+    return float(points[rim[:, 0]].mean(axis=0) @ cap_vector(points, rim) / 3)
 
 
 def components(rows: Integers, nodes: int) -> Integers:
@@ -204,7 +200,7 @@ def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
     )
     if (count > 2).any():
         bad = int(first[count > 2][0]) // len(local)
-        raise MeshFileError(f"element {file.cell_numbers[bad]} shares a facet with two others")
+        raise UnreadableFile(f"element {file.cell_numbers[bad]} shares a facet with two others")
     one = np.flatnonzero(count[inverse.reshape(-1)] == 1)
     facets_one, cell = facets[one], one // len(local)
     flipped = signs[cell] < 0
@@ -218,20 +214,20 @@ def _checked_signs(file: MeshFile) -> Array:
     _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
         rule = "is there twice: in two named volumes?"
-        raise MeshFileError(f"element {file.cell_numbers[first[count > 1][0]]} {rule}")
+        raise UnreadableFile(f"element {file.cell_numbers[first[count > 1][0]]} {rule}")
     extent = np.ptp(file.points, axis=0).max()
     if extent == 0:
-        raise MeshFileError("all nodes are at one place")
+        raise UnreadableFile("all nodes are at one place")
     bodies = len(distinct(components(file.corners, len(file.points))))
     if bodies > 1:
-        raise MeshFileError(f"{bodies} bodies that have no node in common; allowed is one (in Gmsh: BooleanFragments)")
+        raise UnreadableFile(f"{bodies} bodies that have no node in common; allowed is one (in Gmsh: BooleanFragments)")
     determinants = jacobian_determinants(file)
     signs: Array = np.sign(determinants.mean(axis=1))
     bad = np.flatnonzero((determinants * signs[:, None]).min(axis=1) <= FLAT * np.abs(determinants).mean())
     if len(bad):
         cell = int(bad[0])
         where = in_place(file.points[file.corners[cell]].mean(axis=0))
-        raise MeshFileError(
+        raise UnreadableFile(
             f"element {file.cell_numbers[cell]} at {where} is twisted or flat: its volume is not above zero "
             f"everywhere in it ({len(bad)} such element{'s' if len(bad) > 1 else ''})"
         )
@@ -255,17 +251,18 @@ def node_order(file: MeshFile) -> NDArray[np.int64]:
     return np.asarray(dolfinx.cpp.io.perm_gmsh(kind, file.cells.shape[1]), dtype=np.int64)
 
 
-def _area_vectors(places: Array) -> Array:
+def area_vectors(places: Array) -> Array:
     """Area times normal of facets at (facets, 3 or 4, 3): half the cross product of two edges, or of the diagonals."""
     if places.shape[1] == 3:
         return np.asarray(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2)
     return np.asarray(np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2)
 
 
-def _middle(file: MeshFile, cell: int, pair: tuple[int, int]) -> int:
-    (nodes,) = as_rows(file.cells[[cell]])
-    local = tuple(sorted(nodes.index(node) for node in pair))
-    return int(nodes[MIDDLES[file.kind][local[0], local[1]]])
+def _middle(file: MeshFile, cell: Any, pair: Any) -> int:
+    """The node between two corners of an element of degree 2."""
+    element = basix.create_element(basix.ElementFamily.P, basix.CellType[file.kind], 2)
+    edges = file.cells[cell][node_order(file)][np.array(element.entity_closure_dofs[1])]  # ends, middle
+    return next(middle for *ends, middle in as_rows(edges) if {*ends} == {*pair.tolist()})
 
 
 # ---------------------------------------------------------------- supports of faces

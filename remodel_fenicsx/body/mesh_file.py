@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.system.children import DAMAGED, UnreadableFile, check_xml, read_guarded
+from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.system.children import DAMAGED, check_xml, read_guarded
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -49,10 +49,6 @@ ORDERS = {
         0, 1, 2, 3, 4, 5, 6, 7, 8, 11, 16, 9, 17, 10, 18, 19, 12, 15, 13, 14, 24, 22, 20, 21, 23, 25, 26
     ),
 }  # fmt: skip
-
-
-class MeshFileError(RemodelError, ValueError):
-    """What is wrong with a mesh file: one line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,15 +212,13 @@ def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()
     try:
         stats = [file.stat() for file in (path, *surfaces)]
         if any(file.is_dir() for file in (path, *surfaces)):
-            raise MeshFileError("is a folder; a mesh is a file")
+            raise UnreadableFile("is a folder; a mesh is a file")
         changed = tuple((found.st_mtime_ns, found.st_size) for found in stats)
         return _read(path, tags, tuple(surfaces), changed)
     except FileNotFoundError as error:
-        raise MeshFileError(f"no such file: {error.filename}") from None
+        raise UnreadableFile(f"no such file: {error.filename}") from None
     except OSError as error:
-        raise MeshFileError(f"cannot be read: {error.strerror or error}") from None
-    except UnreadableFile as error:
-        raise MeshFileError(str(error)) from None
+        raise UnreadableFile(f"cannot be read: {error.strerror or error}") from None
 
 
 @functools.lru_cache(maxsize=1)
@@ -232,7 +226,7 @@ def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tu
     mesh = read_exchange_file(path)
     points = np.asarray(mesh.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise MeshFileError(f"its nodes have {points.shape[-1]} coordinates; needed are three")
+        raise UnreadableFile(f"its nodes have {points.shape[-1]} coordinates; needed are three")
     names: dict[int, dict[str, int]] = {2: {}, 3: {}}
     for dimension, number, name in mesh.group_names:
         names.setdefault(dimension, {})[name] = number
@@ -255,22 +249,24 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
     from scipy.spatial import cKDTree  # most meshes are one file
 
     if file.kind != "tetrahedron":
-        raise MeshFileError(f"{path.name}: surfaces are of triangles, so the mesh must be of tetrahedra")
+        raise UnreadableFile(f"{path.name}: surfaces are of triangles, so the mesh must be of tetrahedra")
     if path.stem in file.names[2]:
-        raise MeshFileError(f"{path.name}: there is a face {path.stem!r} already; give the surface another name")
+        raise UnreadableFile(f"{path.name}: there is a face {path.stem!r} already; give the surface another name")
     try:
         arrays, data = read_guarded(path, f"remodel_fenicsx.body.lumen:{path.suffix[1:].lower()}")
     except UnreadableFile as error:
-        raise MeshFileError(f"{path.name}: {error}") from None
+        raise UnreadableFile(f"{path.name}: {error}") from None
     corners = np.asarray(arrays["points"], dtype=np.float64)[arrays["triangles"]]
     if not corners.size or not np.isfinite(corners).all():
-        raise MeshFileError(f"{path.name}: has no triangles with corners at finite places")
+        raise UnreadableFile(f"{path.name}: has no triangles with corners at finite places")
     away, nodes = cKDTree(file.points).query(corners)
     far = away > SAME_NODE * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1, keepdims=True)
     if far.any():
         where = f"at {in_place(corners[far][0])}, the nearest is {away[far][0]:.3g} away"
         rule = f"{where}: is it the surface of this mesh, in its unit?"
-        raise MeshFileError(f"{path.name}: {far.sum()} corners of triangles are no nodes of the mesh, the first {rule}")
+        raise UnreadableFile(
+            f"{path.name}: {far.sum()} corners of triangles are no nodes of the mesh, the first {rule}"
+        )
     number = 1 + max([*distinct(file.facet_groups), *file.names[2].values()], default=0)
     return replace(
         file,
@@ -291,7 +287,7 @@ def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> list[Inte
     if name is None:
         wanted = repr(asked) if asked else " or ".join(map(repr, TAGS))
         there = ", ".join(map(repr, arrays)) or "none"
-        raise MeshFileError(
+        raise UnreadableFile(
             f"has no array {wanted} with the numbers of faces and volumes (geometry.tags); it has {there}"
         )
     found = []
@@ -299,7 +295,7 @@ def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> list[Inte
         numbers = np.asarray(values, dtype=np.float64)
         numbers = numbers.reshape(len(numbers)) if numbers.shape == (len(numbers), 1) else numbers  # as Gmsh and VTK do
         if numbers.ndim != 1 or not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any():
-            raise MeshFileError(f"the array {name!r} has no whole number for each element")
+            raise UnreadableFile(f"the array {name!r} has no whole number for each element")
         found.append(numbers.astype(np.int64))
     return found
 
@@ -453,22 +449,22 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
     """What a file of any kind holds."""
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
-        raise MeshFileError(f"a node is at {tuple(points[bad][0].tolist())}: its place must be finite")
+        raise UnreadableFile(f"a node is at {tuple(points[bad][0].tolist())}: its place must be finite")
     for number, block in _numbered(blocks):
         if block.kind not in (*VOLUMES, *FACET_CORNERS, WEDGE) and not block.kind.startswith(("vertex", "line")):
-            raise MeshFileError(f"elements of type {block.kind!r}; allowed are {ALLOWED_ELEMENTS}")
+            raise UnreadableFile(f"elements of type {block.kind!r}; allowed are {ALLOWED_ELEMENTS}")
         if (lost := ((block.nodes < 0) | (block.nodes >= len(points))).any(axis=1)).any():
-            raise MeshFileError(f"element {number[lost][0]} has a node that is not there")
+            raise UnreadableFile(f"element {number[lost][0]} has a node that is not there")
     if any(block.kind == WEDGE and len(block.nodes) for block in blocks):
         log.info("wedges are split into three tetrahedra each, quadrilaterals of faces into two triangles")
         blocks = [_split(points, block) for block in blocks]
     solid = [(number, block) for number, block in _numbered(blocks) if block.kind in VOLUMES]
     kinds = sorted({VOLUMES[block.kind] for _, block in solid if len(block.nodes)})
     if not kinds:
-        raise MeshFileError("no elements of a volume; in Gmsh: a physical volume, and Mesh 3D")
+        raise UnreadableFile("no elements of a volume; in Gmsh: a physical volume, and Mesh 3D")
     if len(kinds) > 1:
         listed = " and ".join(f"{kind} of degree {degree}" for kind, degree in kinds)
-        raise MeshFileError(f"elements of several types: {listed}; allowed is one")
+        raise UnreadableFile(f"elements of several types: {listed}; allowed is one")
     kind, degree = kinds[0]
     corners = 3 if kind == "tetrahedron" else 4
     flat = [block for block in blocks if FACET_CORNERS.get(block.kind) == corners]

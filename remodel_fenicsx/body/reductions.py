@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO
-from remodel_fenicsx.model.cells import cylindrical_axes, global_axes
+from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.schema.settings import LARGEST_MESH
@@ -301,11 +301,6 @@ def _leaves_symmetry(scene: Any) -> str:
 
 
 # ---------------------------------------------------------------- where the body's places are in the reduction
-def unturned(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same everywhere."""
-    return global_axes(places)
-
-
 def about_z(places: NDArray[np.float64]) -> NDArray[np.float64]:
     """x, y, z become the radial, circumferential and axial direction."""
     circumferential, axial, radial = np.moveaxis(cylindrical_axes(places), -2, 0)

@@ -12,12 +12,12 @@ from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, create_model
+from pydantic import Field
 
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
-from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.model.cells import angle_to_axis, global_axes
 from remodel_fenicsx.schema.settings import (
     NAME,
     TURNOVER_POWER,
@@ -29,8 +29,8 @@ from remodel_fenicsx.schema.settings import (
     faces_of,
     in_region,
 )
-from remodel_fenicsx.schema.tables import Table, fault, refuse
-from remodel_fenicsx.schema.units import Dimension, LengthUnit
+from remodel_fenicsx.schema.tables import fault, refuse, with_key
+from remodel_fenicsx.schema.units import FORCE, Dimension, LengthUnit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -455,17 +455,13 @@ class End(NamedTuple):
     frees_length: bool = False
 
 
-_is: Any = {  # a word of Python
-    "is": (
-        Literal["unloaded", "loaded"],
-        Field(
-            default="unloaded",
-            description="What the geometry describes: the body without loads, or (a tube, a body of your own) the one "
-            "under the loads at the end of their ramps; the unloaded body is found first (docs/tissue_that_lives.md).",
-        ),
-    )
-}
-_Is: Any = create_model("_Is", __base__=Table, **_is)
+_Is: Any = with_key(
+    "is",
+    Literal["unloaded", "loaded"],
+    default="unloaded",
+    description="What the geometry describes: the body without loads, or (a tube, a body of your own) the one "
+    "under the loads at the end of their ramps; the unloaded body is found first (docs/tissue_that_lives.md).",
+)
 
 
 class Shape(_Is):  # type: ignore[misc]
@@ -874,6 +870,17 @@ def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
         raise fault(found[1], found[0], getattr(shape, found[0]))
 
 
+def axial_dead_force(face: str) -> LoadKind:
+    """A force along z on a face across it."""
+    return LoadKind(
+        lambda shape, loading, name: loading.add_dead_force(name, face, component=2),
+        "total force along z on the top; its direction stays (a dead load)",
+        FORCE,
+        reductions=("point",),
+        area=lambda shape: shape.section_area,
+    )
+
+
 def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
     """Columns of a body that is pulled along z: its stretches and its mean fibre angle.
 
@@ -970,6 +977,4 @@ def homogeneous_bar(
         return lattice_domain(points, [1], degree, faces, shape.name, dimensions(shape), comm)
 
     rules = (reduced.same_cells, reduced.symmetric_law, reduced.homogeneous, reduced.known_loads("point"))
-    return reduced.Reduction(
-        build, lambda scene: 1, rules, reduced.unturned, lambda shape, points, corners: whole(shape)
-    )
+    return reduced.Reduction(build, lambda scene: 1, rules, global_axes, lambda shape, points, corners: whole(shape))

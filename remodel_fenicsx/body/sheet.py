@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from remodel_fenicsx.body.cube import box_domain
-from remodel_fenicsx.body.reductions import Reduction, box, choice
-from remodel_fenicsx.body.shape import Column, LoadKind, Shape, cauchy_columns, check_lengths, homogeneous_bar
+from remodel_fenicsx.body.cube import Box
+from remodel_fenicsx.body.reductions import choice
+from remodel_fenicsx.body.shape import Column, LoadKind, cauchy_columns
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.tables import fault
 from remodel_fenicsx.schema.units import FORCE, LENGTH
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
-    from remodel_fenicsx.body.domain import Domain
-    from remodel_fenicsx.body.loading import Loading
 
 SIDES = "xy"
 
@@ -77,7 +70,7 @@ def _elongation(side: int) -> LoadKind:
     )
 
 
-class Sheet(Shape):
+class Sheet(Box):
     """A sheet in the plane of x and y, as biaxial tests have it. It slides on the planes x = y = z = 0.
 
     Along x and along y a force or an elongation may be given, or neither: then the edge is free. Lengths: 1e-6 to 1e6,
@@ -131,13 +124,10 @@ class Sheet(Shape):
         ),
     )
     number_of_elements: ClassVar[int] = 16
-    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
     depth_in_words: ClassVar[tuple[str, str, str]] = ("through the sheet", "lower face", "upper face")
     angle_in_words: ClassVar[tuple[str, str]] = ("along x", "across x")
     buckles: ClassVar[bool] = False  # it lies on z = 0
-    reductions: ClassVar[dict[str, Reduction]] = {
-        "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape.sides.values())),
-    }
 
     shape: Literal["sheet"] = Field(default="sheet", description="Which body it is.")
     length_x: Annotated[float, LENGTH] = Field(default=10.0, gt=0, description="Side along x.")
@@ -149,21 +139,6 @@ class Sheet(Shape):
         """Along x, y and z, by their keys."""
         return {"length_x": self.length_x, "length_y": self.length_y, "thickness": self.thickness}
 
-    @property
-    def axial_length(self) -> float:
-        """The thickness."""
-        return self.thickness
-
-    @property
-    def section_area(self) -> float:
-        """Of the plane."""
-        return self.length_x * self.length_y
-
-    @model_validator(mode="after")
-    def _can_be_meshed(self) -> Sheet:
-        check_lengths(self, self.sides)
-        return self
-
     def check_with(self, scene: Any, key: str) -> None:
         """What all bodies ask, and that the strain is the same everywhere where shear is prescribed."""
         super().check_with(scene, key)
@@ -171,15 +146,6 @@ class Sheet(Shape):
             reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
             rule = f"needs the same strain everywhere, model.kinematics = 'point': {reasons}"
             raise fault(rule, "loads.shear.value", scene.loads["shear"].value)
-
-    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Four elements along either side and one through the sheet; times the refinement."""
-        return box_domain(self.name, self.sides, [*self.sides.values()], (4, 4, 1), mesh, comm)
-
-    def hold(self, loading: Loading) -> None:
-        """The planes x = y = z = 0."""
-        for component, face in enumerate(("x0", "y0", "z0")):
-            loading.hold_face(face, component)
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
         """To x."""

@@ -10,18 +10,20 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.reductions import Reduction, Strut, cylinder, unturned
+from remodel_fenicsx.body.reductions import Reduction, Strut, cylinder
 from remodel_fenicsx.body.shape import (
     Column,
     LoadKind,
     Shape,
+    axial_dead_force,
     cauchy_columns,
     check_lengths,
     homogeneous_bar,
     uniaxial_columns,
 )
+from remodel_fenicsx.model.cells import global_axes
 from remodel_fenicsx.schema.settings import Mesh
-from remodel_fenicsx.schema.units import AREA, FORCE, LENGTH
+from remodel_fenicsx.schema.units import AREA, LENGTH
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -60,15 +62,7 @@ class Tendon(Shape):
     remodel_fenicsx.schema.tables.SceneError: length = -1.0: must be a finite number greater than 0
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {
-        "force": LoadKind(
-            lambda shape, loading, name: loading.add_dead_force(name, "top", component=2),
-            "total force along z on the top; its direction stays (a dead load)",
-            FORCE,
-            reductions=("point",),
-            area=lambda shape: shape.section_area,
-        )
-    }
+    loads: ClassVar[dict[str, LoadKind]] = {"force": axial_dead_force("top")}
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
     columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
     axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
@@ -109,7 +103,7 @@ class Tendon(Shape):
     def strut(self, ends: str) -> Strut:
         """Its bottom stays in its plane, its top is free."""
         moment = self.area / (4 * math.pi)
-        return Strut(self.length, 2.0, unturned, lambda places: np.full(len(places), moment))
+        return Strut(self.length, 2.0, global_axes, lambda places: np.full(len(places), moment))
 
     @model_validator(mode="after")
     def _can_be_meshed(self) -> Tendon:

@@ -26,6 +26,13 @@ DEGREES = {
 }
 
 
+def shape_functions(kind: str, degree: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of a Lagrange element: values, then slopes along its coordinates, (1 + dimension, points, nodes)."""
+    family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
+    element = basix.create_element(family, basix.CellType[kind], degree, variant, discontinuous=degree == 0)
+    return np.asarray(element.tabulate(1, points))[..., 0]
+
+
 class Quadrature:
     """The quadrature points of a mesh, and functions and reductions over them.
 
@@ -168,13 +175,7 @@ class Quadrature:
     @cached_property
     def gradients(self) -> NDArray[np.float64]:
         """G with ``|grad u| <= G max |u_node|`` in each element, (elements,): the slopes of its functions."""
-        element = basix.create_element(
-            basix.ElementFamily.P,
-            basix.CellType[self.element_kind],
-            self.element_degree,
-            basix.LagrangeVariant.gll_warped,
-        )
-        slopes = np.asarray(element.tabulate(1, self.points))[1:, :, :, 0]  # by reference coordinate, point and node
+        slopes = shape_functions(self.element_kind, self.element_degree, self.points)[1:]
         sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
         return np.max(sums / self.smallest_lengths, axis=1, initial=0.0)
 
@@ -212,9 +213,7 @@ class Quadrature:
         if self.shape[1] == 1:
             return values - self._means_at_nodes(values).mean(axis=1, keepdims=True)
         if degree not in self._complements:
-            kind = basix.CellType[self.element_kind]
-            element = basix.create_element(basix.ElementFamily.P, kind, degree, discontinuous=True)
-            polynomials = np.asarray(element.tabulate(0, self.points))[0, :, :, 0]
+            polynomials = shape_functions(self.element_kind, degree, self.points)[0]
             roots = np.sqrt(self.weights)[:, None]
             fit = polynomials @ (np.linalg.pinv(roots * polynomials) * roots.T)
             self._complements[degree] = np.eye(self.shape[1]) - fit
@@ -231,11 +230,8 @@ class Quadrature:
     @cached_property
     def _continuation(self) -> NDArray[np.float64]:
         """From values at an element's points to those at its nodes, (nodes, points)."""
-        kind = basix.CellType[self.element_kind]
-        element = basix.create_element(
-            basix.ElementFamily.P, kind, self.mesh.geometry.cmap.degree, basix.LagrangeVariant.gll_warped
-        )
-        return np.asarray(np.linalg.pinv(np.asarray(element.tabulate(0, self.points))[0, :, :, 0]))
+        functions = shape_functions(self.element_kind, self.mesh.geometry.cmap.degree, self.points)
+        return np.asarray(np.linalg.pinv(functions[0]))
 
     def _means_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of values at an element's nodes, or the same at all, (owned elements, nodes or 1, n): means by volume."""

@@ -526,8 +526,7 @@ class Scene(Table):
         SceneError
             One line: key, value, what is allowed.
         """
-        names = [name for name in type(self).model_fields if name != "format" or self.is_as_run]
-        values = _plain({name: getattr(self, name) for name in names}, every_value=True)
+        values = self.model_dump(exclude_none=True, exclude=None if self.is_as_run else {"format"})
         for key, value in changes.items():
             if not isinstance(key, str):
                 raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
@@ -675,17 +674,12 @@ def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, Any]) 
         )
 
 
-def _plain(value: Any, every_value: bool = False) -> Any:
-    """Tables as dicts of the values that were set (or of all), so that they merge as the same keys in TOML do."""
+def _plain(value: Any) -> Any:
+    """Tables as dicts of the values that were set, so that they merge as the same keys in TOML do."""
     if isinstance(value, BaseModel):
         kind = {"shape": value.name} if isinstance(value, Shape) else {}
-        names = [name for name in type(value).model_fields if every_value or name in value.model_fields_set]
-        names += value.model_extra or ()
-        found = {name: _plain(getattr(value, name), every_value) for name in names}
-        return kind | {name: entry for name, entry in found.items() if entry is not None}
-    if isinstance(value, Mapping):
-        return {name: _plain(entry, every_value) for name, entry in value.items()}
-    return value
+        return kind | value.model_dump(exclude_unset=True, exclude_none=True)
+    return {name: _plain(entry) for name, entry in value.items()} if isinstance(value, Mapping) else value
 
 
 # ---------------------------------------------------------------- reading

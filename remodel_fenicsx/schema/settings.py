@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, create_model, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, model_validator
 
 from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
@@ -36,7 +36,18 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES, TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.model.spectral import PAIRINGS
-from remodel_fenicsx.schema.tables import IN_A_LIST, KeysOfParts, OneOf, Table, fault, named, quoted, refuse, shown
+from remodel_fenicsx.schema.tables import (
+    IN_A_LIST,
+    KeysOfParts,
+    OneOf,
+    Table,
+    fault,
+    named,
+    quoted,
+    refuse,
+    shown,
+    with_key,
+)
 from remodel_fenicsx.schema import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
@@ -322,19 +333,16 @@ class Prestretch(Table):
         return around, along, across
 
 
-_share: Any = {  # `from` is a word of Python
-    "from": (
-        float,
-        Field(default=0.0, ge=0, lt=1, description="Where it begins, from the inside (0) to the outside (1)."),
-    ),
-    "to": (float, Field(default=1.0, gt=0, le=1, description="Where it ends.")),
-}
-_Share: Any = create_model("_Share", __base__=Table, **_share)
+_From: Any = with_key(
+    "from", float, default=0.0, ge=0, lt=1, description="Where it begins, from the inside (0) to the outside (1)."
+)
 
 
-class NaturalLayer(_Share):  # type: ignore[misc]
+class NaturalLayer(_From):  # type: ignore[misc]
     """A part of the wall that was stretched before it was joined to the rest (docs/tissue_that_lives.md)."""
 
+    to: float = Field(default=1.0, gt=0, le=1)
+    """Where it ends."""
     region: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a region"})
     """Name of a region, in place of `from` and `to`."""
     prestretch: Prestretch
@@ -662,18 +670,14 @@ COUPLINGS = {
 
 AT_REST = "rest"
 _Start: Any = Annotated[float, Field(ge=0)] | Literal["rest"]
-_start: Any = {  # `from` is a word of Python
-    "from": (
-        Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_Start))],
-        Field(
-            default=0.0,
-            json_schema_extra={"allowed": "a finite number of at least 0, or 'rest'"},
-            description="Time from which turnover adds volume; a step ends there. 0: always. 'rest', with time.end = "
-            "'equilibrium': once the tissue rests under the loads before their last change.",
-        ),
-    )
-}
-_WithStart: Any = create_model("_WithStart", __base__=Table, **_start)
+_WithStart: Any = with_key(
+    "from",
+    Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_Start))],
+    default=0.0,
+    json_schema_extra={"allowed": "a finite number of at least 0, or 'rest'"},
+    description="Time from which turnover adds volume; a step ends there. 0: always. 'rest', with time.end = "
+    "'equilibrium': once the tissue rests under the loads before their last change.",
+)
 
 
 class Turnover(_WithStart):  # type: ignore[misc]

@@ -5,14 +5,11 @@ A leaf: it knows no key of any scene. `parameters` and `scene` declare the keys.
 
 from __future__ import annotations
 
-import ast
 import difflib
 import functools
 import inspect
-import itertools
 import math
 import re
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import NoneType
@@ -29,7 +26,7 @@ from pydantic import (
     create_model,
 )
 from pydantic.fields import FieldInfo
-from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, SchemaValidator, core_schema
 
 from remodel_fenicsx.errors import RemodelError, printable, shortened
 
@@ -78,7 +75,9 @@ class Table(BaseModel):
     further: ClassVar[type[BaseModel] | None] = None
     widened: ClassVar[Any] = None
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     def check_with(self, scene: Any, key: str) -> None:
         """Refuse what does not go with the rest of a scene, in which this table stands at a key: raise a `fault`."""
@@ -112,6 +111,12 @@ class Table(BaseModel):
 
         # A table inside a table is then validated by pydantic directly, so that an error keeps its whole dotted key.
         __init__.__pydantic_base_init__ = True
+
+
+def with_key(name: str, kind: Any, **field: Any) -> Any:
+    """A class of tables with a key that is a word of Python."""
+    fields: Any = {name: (kind, Field(**field))}
+    return create_model(f"_With_{name}", __base__=Table, **fields)
 
 
 def _of_python(value: Any) -> Any:
@@ -175,10 +180,8 @@ class VariantOf:
         if not isinstance(value, Mapping):
             return value
         name = value[self.tag]
-        try:
-            return self.registry[name].model_validate(dict(value))
-        except ValidationError as error:
-            raise PydanticCustomError("inner", "faults in {name}", {"name": name, "error": error}) from None
+        only = core_schema.tagged_union_schema({name: self.registry[name].__pydantic_core_schema__}, self.tag)
+        return SchemaValidator(only).validate_python(dict(value))  # its faults name the variant after the field
 
 
 @dataclass(frozen=True)
@@ -261,7 +264,7 @@ def is_number(value: Any) -> bool:
 def one_line(error: ValidationError, table: type[BaseModel]) -> str:
     """`key = value: what is allowed` of the first fault, with the number of further ones."""
     faults: dict[str, ErrorDetails] = {}  # where several kinds of values are allowed there is one for each kind
-    for detail in sorted(_details(error), key=lambda detail: detail["type"] != "extra_forbidden"):
+    for detail in sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden"):
         faults.setdefault(locate(table, detail["loc"])[0], detail)
     for detail in [detail for detail in faults.values() if detail["type"] == "extra_forbidden"]:
         key, owner, _ = locate(table, detail["loc"])
@@ -270,19 +273,6 @@ def one_line(error: ValidationError, table: type[BaseModel]) -> str:
             del faults[meant]
     text, more = _describe(next(iter(faults.values())), table), len(faults) - 1
     return f"{text} (and {more} more fault{'s' if more > 1 else ''})" if more else text
-
-
-def _details(error: ValidationError) -> list[ErrorDetails]:
-    """All faults; the place of one inside of a variant names the variant after its field."""
-    details: list[ErrorDetails] = []
-    for detail in error.errors(include_url=False):
-        if detail["type"] == "inner":
-            inner = _details(detail["ctx"]["error"])
-            place = (*detail["loc"], detail["ctx"]["name"])
-            details += [{**entry, "loc": (*place, *entry["loc"])} for entry in inner]  # type: ignore[list-item]
-        else:
-            details.append(detail)
-    return details
 
 
 def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
@@ -463,27 +453,9 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
 # ---------------------------------------------------------------- documentation
 
 
-@functools.cache
-def _texts_below_fields(module: str) -> dict[tuple[str, str], str]:
-    """Of the classes of a module: the text that stands below a field, by names of class and field."""
-    try:
-        tree = ast.parse(inspect.getsource(sys.modules[module]))
-    except (OSError, TypeError):  # a console has no source
-        return {}
-    found = {}
-    for table in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
-        for field, text in itertools.pairwise(table.body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                found[table.name, ast.unparse(field.target)] = " ".join(str(text.value.value).split())
-    return found
-
-
 def description(table: type[BaseModel], name: str) -> str:
-    """What a field means: its own description, or the text below it (pydantic would read the source at each start)."""
-    if own := table.model_fields[name].description:
-        return own
-    found = (_texts_below_fields(owner.__module__).get((owner.__name__, name), "") for owner in table.__mro__)
-    return next(filter(None, found), "")
+    """What a field means, on one line."""
+    return " ".join((table.model_fields[name].description or "").split())
 
 
 def meaning(table: type[BaseModel]) -> str:

@@ -21,7 +21,7 @@ import tomlkit
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from remodel_fenicsx.errors import RemodelError, printable
+from remodel_fenicsx.errors import UnreadableFile, printable
 from remodel_fenicsx.schema.tables import SceneError, description, shown
 from remodel_fenicsx.schema.units import is_quantity
 from remodel_fenicsx.system.files import read_regular
@@ -155,10 +155,6 @@ def _is_of_tables(value: Any) -> bool:
 DELIMITERS = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "spaces"}
 
 
-class TableFileError(RemodelError, ValueError):
-    """What is wrong with a table; one line."""
-
-
 def read_columns(
     data: bytes,
     file: str,
@@ -173,19 +169,19 @@ def read_columns(
     head = [known.get((spellings or {}).get(name.lower(), name.lower()), "") for name in names]
     if unknown := [name for name, found in zip(names, head, strict=True) if not found]:
         if all(_number(name, ".") is not None for name in names):
-            raise TableFileError("begins with a row of numbers; the first row must have the names of the columns")
-        raise TableFileError(f"the column {shown(unknown[0])} is not known; allowed are {', '.join(allowed)}")
+            raise UnreadableFile("begins with a row of numbers; the first row must have the names of the columns")
+        raise UnreadableFile(f"the column {shown(unknown[0])} is not known; allowed are {', '.join(allowed)}")
     if twice := [name for number, name in enumerate(head) if name in head[:number]]:
-        raise TableFileError(f"the column {twice[0]} is there twice")
+        raise UnreadableFile(f"the column {twice[0]} is there twice")
     mark = "," if any("," in cell for row in rows for cell in row) else "."
     values = np.empty((len(rows), len(head)))
     for number, row in enumerate(rows):
         if len(row) != len(head):
-            raise TableFileError(f"row {number + 1} has {len(row)} numbers, not {len(head)}")
+            raise UnreadableFile(f"row {number + 1} has {len(row)} numbers, not {len(head)}")
         for place, cell in enumerate(row):
             if (value := _number(cell, mark)) is None:
                 more = " (others have decimal commas)" if mark == "," and "." in cell else ""
-                raise TableFileError(f"row {number + 1}, {head[place]}: {shown(cell)} is no number{more}")
+                raise UnreadableFile(f"row {number + 1}, {head[place]}: {shown(cell)} is no number{more}")
             values[number, place] = value
     used = {name: column for name, column in zip(head, values.T, strict=True) if name not in unused}
     words = [f"{written} between columns", *(["decimal commas"] if mark == "," else [])]
@@ -200,7 +196,7 @@ def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise TableFileError("is no text in UTF-8") from error
+        raise UnreadableFile("is no text in UTF-8") from error
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     said = lines.pop(0).strip()[4:] if lines and lines[0].lower().startswith("sep=") else ""
     head = lines[0] if lines else ""
@@ -210,13 +206,13 @@ def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
     try:
         table = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)]
     except (TypeError, csv.Error) as error:  # a delimiter of several letters
-        raise TableFileError(f"cannot be read as a table: {error}") from error
+        raise UnreadableFile(f"cannot be read as a table: {error}") from error
     while table and table[0] and not table[0][-1]:
         table[0].pop()
     width = len(table[0]) if table else 0
     table = [row[:width] if not any(row[width:]) else row for row in table if any(row)]
     if len(table) < 2:
-        raise TableFileError("is no table: needed are a row of names and rows of numbers")
+        raise UnreadableFile("is no table: needed are a row of names and rows of numbers")
     return table[0], table[1:], DELIMITERS.get(mark, repr(mark))
 
 

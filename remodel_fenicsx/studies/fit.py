@@ -27,13 +27,13 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
-from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError
+from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError, UnreadableFile
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.tables import Table, fault, shown
-from remodel_fenicsx.schema.text import TableFileError, read_columns, read_toml
+from remodel_fenicsx.schema.text import read_columns, read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
 from remodel_fenicsx.simulation import Simulation, begin_again, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
@@ -255,7 +255,7 @@ def _read_columns(path: Path, place: str, scene: Scene) -> dict[str, Array]:
     allowed = sorted({*scene.loads, *known, "time", *strains})
     try:
         columns = read_columns(read_regular(path, LARGEST_TABLE), path.name, allowed)
-    except (OSError, ForeignFileError, TableFileError) as error:
+    except (OSError, ForeignFileError, UnreadableFile) as error:
         raise SceneError(f"{place}: {getattr(error, 'strerror', None) or error}") from error
     for stretch, strain in strains.items():
         if stretch in columns and strain in columns:

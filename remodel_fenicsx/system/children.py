@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.system.environment import extensions_for_children
 from remodel_fenicsx.system.files import open_own, read_regular
 
@@ -154,10 +154,6 @@ _COUNTS = re.compile(r"(?i)^(number.*|dimensions|offset)$")
 _LINES = re.compile(
     rb"(?im)^\s*(?:points|cells|cell_types|point_data|cell_data|offsets|connectivity)\b[^\n]{0,99}\s-\d"
 )
-
-
-class UnreadableFile(RemodelError, ValueError):  # noqa: N818
-    """What is wrong with a file; one line."""
 
 
 def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], bytes]:

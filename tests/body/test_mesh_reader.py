@@ -14,9 +14,10 @@ import pytest
 
 from remodel_fenicsx import SceneError
 from remodel_fenicsx.body import mesh_file
-from remodel_fenicsx.body.lumen import rims
+from remodel_fenicsx.body.mesh_faces import rims
 from remodel_fenicsx.body.mesh_faces import boundary_of, jacobian_determinants
-from remodel_fenicsx.body.mesh_file import MeshFileError, read_mesh
+from remodel_fenicsx.body.mesh_file import read_mesh
+from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.body.mesh_body import refined
 from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_lumen import tube
@@ -109,7 +110,7 @@ def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, ca
     wedges = np.concatenate([np.hstack([triangles + k * size, triangles + (k + 1) * size]) for k in range(2)])
     quads = [
         np.concatenate([np.hstack([rim + k * size, rim[:, ::-1] + (k + 1) * size]) for k in range(2)])
-        for rim in rims(triangles)
+        for rim, _ in rims(triangles)
     ]
     cells = [("wedge", wedges), ("triangle", triangles), ("triangle", triangles + 2 * size)]
     cells += [("quad", quad) for quad in quads]
@@ -162,11 +163,11 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
         scene_of(file, faces=names, regions={"media": 99}).geometry.checked()
     with pytest.raises(SceneError, match="has no array 'parts' with the numbers of faces"):
         scene_of(file, faces=names, tags="parts")
-    with pytest.raises(MeshFileError, match="no such file"):
+    with pytest.raises(UnreadableFile, match="no such file"):
         read_mesh(tmp_path / "other.vtu")
     half = tmp_path / "half.vtu"
     half.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(MeshFileError, match="cannot be read: .*; save it as VTU with data mode ASCII"):
+    with pytest.raises(UnreadableFile, match="cannot be read: .*; save it as VTU with data mode ASCII"):
         read_mesh(half)
 
 
@@ -186,7 +187,7 @@ def test_other_meshes_are_refused(tmp_path: Path, cells: Any, tags: Any, words: 
         places, [(kind, np.array([list(row) for row in rows])) for kind, rows in cells], cell_data=arrays
     )
     mesh.write(tmp_path / "one.vtu")
-    with pytest.raises(MeshFileError, match=words):
+    with pytest.raises(UnreadableFile, match=words):
         read_mesh(tmp_path / "one.vtu")
 
 
