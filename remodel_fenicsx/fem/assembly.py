@@ -7,7 +7,6 @@ energies in few operations, matrices in memory that dolfinx and PETSc share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from numbers import Real
 from typing import Any, Generic, TypeVar, cast
 
@@ -26,6 +25,7 @@ from ufl.domain import extract_unique_domain
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import lagrange
+from remodel_fenicsx.fem.solver_methods import ProblemOptions, multigrid_options
 
 
 # ---------------------------------------------------------------- a linear equation with a positive definite form
@@ -44,6 +44,50 @@ def factorised(matrix: Any) -> Any:
     return solver
 
 
+def rigid_motions(space: Any, matrix: Any) -> Any:
+    """Those of the space of a vector, which multigrid must know of its matrix."""
+    place = matrix.createVecRight()
+    place.array[:] = space.tabulate_dof_coordinates()[: place.getLocalSize() // 3].ravel()
+    motions = PETSc.NullSpace().createRigidBody(place)
+    place.destroy()
+    return motions
+
+
+class DegreeOne:
+    """Multigrid for elements of degree 2 whose next level is degree 1: all others then cost little. Collective."""
+
+    def __init__(self, pc: Any, space: Any, matrix: Any):
+        below = lagrange(space.mesh, 1, tuple(space.value_shape)).function_space
+        self._prolongation = dolfinx.fem.petsc.interpolation_matrix(below, space)
+        self._prolongation.assemble()
+        self._coarse = matrix.PtAP(self._prolongation)
+        self._coarse.setBlockSize(below.dofmap.bs)
+        if below.dofmap.bs == 3:
+            self._coarse.setNearNullSpace(rigid_motions(below, self._coarse))
+        self._options = ProblemOptions(multigrid_options(), {})
+        pc.setType("mg")
+        pc.setMGLevels(2)
+        pc.setMGType(PETSc.PC.MGType.ADDITIVE)
+        pc.setMGInterpolation(1, self._prolongation)
+        fine, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
+        fine.setOptionsPrefix(self._options.prefix + "fine_")  # not those of GAMG's levels
+        fine.setType("preonly")
+        fine.getPC().setType("pbjacobi")
+        coarse.setOperators(self._coarse)
+        coarse.setType("preonly")
+        self._options.apply(coarse.getPC())
+
+    def renew(self, matrix: Any) -> None:
+        """The next level of another matrix."""
+        matrix.PtAP(self._prolongation, result=self._coarse)
+
+    def destroy(self) -> None:
+        """Free PETSc's objects."""
+        self._options.close()
+        self._coarse.destroy()
+        self._prolongation.destroy()
+
+
 class SolveStopped(ArithmeticError):
     """The iterations did not converge."""
 
@@ -56,20 +100,12 @@ class Positive:
         self._matrix = create_matrix(form)
         assemble_matrix(self._matrix, [form], [])
 
-    @cached_property
-    def _prolongation(self) -> Any:
-        """From elements of degree 1. Collective."""
-        coarse = lagrange(self.space.mesh, 1, tuple(self.space.value_shape)).function_space
-        made = dolfinx.fem.petsc.interpolation_matrix(coarse, self.space)
-        made.assemble()
-        return made
-
     def solve(self, linear: Any, conditions: Sequence[Any] = (), multigrid: bool = False) -> Any:
         """The function u with bilinear(u, v) = linear(v) for all v; linear is 0 where it is None. Collective."""
         # Conjugate gradients, with no memory for factors. Multigrid is for where what is held is far away; it cannot be
         # where all is held.
         unknown = dolfinx.fem.Function(self.space)
-        answer, matrix = unknown.x.petsc_vec, self._matrix.copy()
+        answer, matrix = unknown.x.petsc_vec, self._matrix.copy() if conditions else self._matrix
         load = answer.duplicate()
         if linear is not None:
             external = dolfinx.fem.assemble_vector(jit.form(linear))
@@ -87,30 +123,19 @@ class Positive:
         solver.setOperators(matrix)
         solver.setType("cg")
         solver.getPC().setType("gamg" if multigrid else "jacobi")
+        levels = None
         if multigrid and self.space.ufl_element().degree > 1:
-            self._begin_with_degree_one(solver.getPC(), matrix)
+            levels = DegreeOne(solver.getPC(), self.space, matrix)
         solver.setInitialGuessNonzero(True)
         solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
         solver.solve(load, answer)
         reason, iterations = solver.getConvergedReason(), solver.getIterationNumber()
         unknown.x.scatter_forward()
-        for thing in (solver, matrix, load):
+        for thing in (solver, load, *([levels] if levels else []), *([matrix] if conditions else [])):
             thing.destroy()
         if reason < 0:
             raise SolveStopped(f"the linear solve stopped after {iterations} iterations (reason {reason} of PETSc)")
         return unknown
-
-    def _begin_with_degree_one(self, pc: Any, matrix: Any) -> None:
-        """Multigrid whose first level are elements of degree 1: the others then cost next to nothing."""
-        pc.setType("mg")
-        pc.setMGLevels(2)
-        pc.setMGType(PETSc.PC.MGType.ADDITIVE)
-        pc.setMGInterpolation(1, self._prolongation)
-        fine, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
-        coarse.setOperators(matrix.PtAP(self._prolongation))
-        for solver, kind in ((fine, "jacobi"), (coarse, "gamg")):
-            solver.setType("preonly")
-            solver.getPC().setType(kind)
 
 
 T = TypeVar("T")

@@ -160,6 +160,11 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, An
     return options
 
 
+def multigrid_options() -> dict[str, Any]:
+    """PETSc options of the preconditioner of `iterative`."""
+    return {name: value for name, value in SOLVER_METHODS["iterative"].options.items() if name[:2] in ("pc", "mg")}
+
+
 def factor_options(kind: str) -> dict[str, Any]:
     """PETSc options of a preconditioner that factorises on one rank, a key of `FACTOR_OPTIONS`."""
     return {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}

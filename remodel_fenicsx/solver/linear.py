@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from remodel_fenicsx import kernels
+from remodel_fenicsx.fem.assembly import DegreeOne, rigid_motions
 from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
@@ -103,6 +104,9 @@ SLOW_STEP = 2 / 3  # of `worth`: iterations of a step after which the next one s
 SINGLE_ERROR = 0.5  # relative, of the answer to the softest motion: 0.36 (40,800 unknowns) cost no iteration, for
 # L-BFGS learns such motions; above 1 a factor may even have another sign there
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; Newton's method goes on, as often again
+
+# relative, of a linear solve: as Newton's method needs it far away; where that is more than LAST one solve ends it all
+KRYLOV_TOLERANCE, LAST, SURELY = 1e-3, 1e-5, 0.3
 
 
 def worth(unknowns: int) -> float:
@@ -394,27 +398,57 @@ class EveryTangent:
 
 
 class Multigrid(EveryTangent):
-    """Needs to know the motions of a rigid body; keeps its levels as long as PETSc's options say."""
+    """GMRES with levels: of degree 1 below degree 2, made anew with each tangent, or kept as PETSc's options say."""
 
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
-        if not equilibrium.state.kinematics.reduced:
-            place = matrix.createVecRight()
-            nodes = equilibrium.state.unknown.function_space.tabulate_dof_coordinates()
-            place.array[:] = nodes[: place.getLocalSize() // 3].ravel()
-            matrix.setNearNullSpace(PETSc.NullSpace().createRigidBody(place))
-            place.destroy()
+        self._solver, self._space = snes.getKSP(), equilibrium.state.unknown.function_space
+        self._below: DegreeOne | None = None
+        if equilibrium.state.kinematics.reduced:
+            return
+        given = {name.split("_")[0] for name in options.given}
+        self._chooses = "ksp" not in given and "snes_ksp_ew" not in options.given
+        if self._space.ufl_element().degree > 1 and not given & {"pc", "mg"}:
+            self._below = DegreeOne(self._solver.getPC(), self._space, matrix)
+            if self._chooses:
+                self._solver.setPCSide(PETSc.PC.Side.RIGHT)  # its tolerance is then that of the residual itself
+        else:
+            matrix.setNearNullSpace(rigid_motions(self._space, matrix))
+
+    def tangent(self, norm: float, tolerance: float) -> None:
+        super().tangent(norm, tolerance)
+        if self._below is not None and self._chooses:
+            last = SURELY * tolerance / norm
+            self._solver.setTolerances(rtol=last if last > LAST else KRYLOV_TOLERANCE)
 
     def renew(self) -> None:
         super().renew()
-        if self._always:
-            preconditioner = self.snes.getKSP().getPC()
+        if self._below is not None:
+            self._below.renew(self.matrix)
+        if self._below is not None or self._always:
+            preconditioner = self._solver.getPC()
             preconditioner.setReusePreconditioner(False)
             preconditioner.setOperators(self.matrix)
             preconditioner.setUp()
 
     def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return "with new levels in every iteration", self._anew()
+        if self._below is None:
+            return "with new levels in every iteration", self._anew()
+        if self.snes.getConvergedReason() != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+            return None
+        self.close()  # a stiff bulk needs more than degree 1 knows of it, and an error measured by the levels
+        self._solver.getPC().setFromOptions()
+        self.matrix.setNearNullSpace(rigid_motions(self._space, self.matrix))
+        if self._chooses:
+            self._solver.setPCSide(PETSc.PC.Side.LEFT)
+            self._solver.setNormType(PETSc.KSP.NormType.PRECONDITIONED)
+            self._solver.setTolerances(rtol=KRYLOV_TOLERANCE)
+        return "with levels of the matrix, from now on", nullcontext()
+
+    def close(self) -> None:
+        if self._below is not None:
+            self._below.destroy()
+        self._below = None
 
 
 class Lagged(EveryTangent):

@@ -301,6 +301,25 @@ def test_levels_that_have_become_useless_are_made_anew(caplog: pytest.LogCapture
     assert_same(rows, expected)
 
 
+@pytest.mark.parametrize(("bulk", "options"), [(27.3, {}), (5000.0, {}), (27.3, {"pc_gamg_threshold": 0.02})])
+def test_degree_one_is_the_next_level_of_degree_two(
+    bulk: float, options: dict[str, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Where options of one's own say nothing else, until a stiff bulk is too much for it."""
+    caplog.set_level(logging.INFO)
+    rows, scene = {}, preset_scene("kuhl-holzapfel-2007", "tube")
+    values = {"mesh.degree": 2, "material.lame_lambda": bulk, "time.end": 1.0, "geometry.length": 2.0}
+    for method, given in (("direct", {}), ("iterative", options)):
+        with_method = scene.with_values(values | {"solver.method": method, "solver.petsc_options": given})
+        with made(with_method, tube(length=2.0, divisions=(8, 2, 1), degree=2, comm=SELF)) as simulation:
+            rows[method] = [step.row for step in simulation.steps()]
+            kind = simulation.stepper.coupling.newton._snes.getKSP().getPC().getType()
+    assert_same(rows["iterative"], rows["direct"])
+    stiff = bulk > 100
+    assert kind == ("gamg" if options or stiff else "mg")
+    assert ("solved once more, with levels of the matrix, from now on" in caplog.text) == stiff
+
+
 # ---------------------------------------------------------------- quasi-Newton steps
 def test_a_linear_problem_is_soon_solved_with_secants() -> None:
     """Many times faster than with its diagonal alone."""
