@@ -23,7 +23,7 @@ from scipy.optimize import brentq, least_squares
 from remodel_fenicsx.extend import CHAINS
 from remodel_fenicsx.parts import Material
 from remodel_fenicsx.scene.presets import aligned_stiffness
-from remodel_fenicsx.schema.text import TableFileError, read_columns
+from remodel_fenicsx.schema.text import read_columns
 
 Array = NDArray[np.float64]
 Stress = Callable[[Array], Array]  # lambda_i dW/dlambda_i of three stretches with product 1
@@ -93,11 +93,11 @@ def read(path: Path) -> tuple[list[tuple[float, float | None]], Array]:
     """Stretches and nominal stresses of a table."""
     found = read_columns(path.read_bytes(), path.name, COLUMNS, {}, ())
     if not {"stretch_x", "nominal_stress_x"} <= set(found):
-        raise TableFileError(f"{path}: needs the columns stretch_x and nominal_stress_x")
+        raise ValueError(f"{path}: needs the columns stretch_x and nominal_stress_x")
     empty = np.full(len(found["stretch_x"]), np.nan)
     for name in {"stretch_x", "stretch_y"} & {*found}:
         if (least := float(found[name].min())) <= 0:
-            raise TableFileError(f"{path}: a stretch is {least}: it must be above 0")
+            raise ValueError(f"{path}: a stretch is {least}: it must be above 0")
     across = [None] * len(empty) if "stretch_y" not in found else found["stretch_y"].tolist()
     stresses = [found[name] if name in found else empty for name in COLUMNS[2:]]
     return list(zip(found["stretch_x"].tolist(), across, strict=True)), np.stack(stresses, axis=1)
@@ -143,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     else:
         try:
             rows, wanted = read(given.table)
-        except (OSError, TableFileError) as error:
+        except (OSError, ValueError) as error:
             parser.error(f"--table: {error}")
     wanted[[y is None for _, y in rows], 1] = np.nan  # 0, whatever the numbers
     numbers, misfit = fitted(rows, wanted, cells, given.c)
