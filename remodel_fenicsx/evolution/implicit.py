@@ -209,8 +209,8 @@ class ImplicitEquilibrium(Equilibrium):
 
 
 def newton_of_still_cells(equilibrium: Equilibrium, settings: Solver) -> GuardedNewton:
-    """For cells that stay as they are; to be closed. A matrix and factors of its own, for as long as it is needed."""
-    return GuardedNewton(equilibrium, settings, robust=settings.method == AUTO)
+    """For cells that stay as they are, robust as the parts of a step; to be closed, with its matrix and factors."""
+    return GuardedNewton(equilibrium, settings, robust=True)
 
 
 class ImplicitNewton(GuardedNewton):

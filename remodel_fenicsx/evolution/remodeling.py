@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from functools import cached_property
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import Remembered, coefficient, over_ranks, point_values
-from remodel_fenicsx.kernels import with_kernels
+from remodel_fenicsx.kernels import in_numpy, with_kernels
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
@@ -60,7 +59,7 @@ class RemodelingPass:
 
             self.turnover = TurnoverPass(state, tissue, settings.turnover)
         # of a pass's change of the cells that is made
-        self.share = settings.relaxation_factor if COUPLINGS[settings.coupling].makes_a_share else 1.0
+        self.relaxation = settings.relaxation_factor if COUPLINGS[settings.coupling].makes_a_share else 1.0
         self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
         self.parameters = Parameters(self.tissue, self.quadrature)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
@@ -80,6 +79,11 @@ class RemodelingPass:
         self.stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
         self._expression = jit.expression(self.stacked, self.quadrature.points)
         self._known: Remembered[Array] = Remembered(state.comm, self.stacked)
+        self._target: Any = self.law.target
+        if self._target is tensor_target and not settings.has_set_point and not in_numpy():
+            from remodel_fenicsx.kernels.tensor import TensorKernels
+
+            self._target = TensorKernels(state.comm).target  # of the paper's alone
 
     def join(self, cases: Sequence[Any], weights: Sequence[float]) -> None:
         """From now on further load cases drive the cells too, with these weights: of the first case, and of them."""
@@ -207,25 +211,12 @@ class RemodelingPass:
     def target(self, residual: float = 0.0) -> Target:
         """What the structure tensor tends to in the present state; of laws that have one."""
         if self._averages_targets:
-            return mean_target([self._target_of(drive) for drive in self._drives(residual)], self.weights)
-        return self._target_of(self.drive(residual))
+            return mean_target([self._target(drive) for drive in self._drives(residual)], self.weights)
+        return self._target(self.drive(residual))
 
     @property
     def _averages_targets(self) -> bool:
         return bool(self.cases) and MEANS_OF_CASES[self.settings.mean].of_targets
-
-    def _target_of(self, drive: Drive) -> Target:
-        target = self.law.target
-        assert target is not None
-        if target is not tensor_target or self.settings.has_set_point:  # C knows the paper's alone
-            return target(drive)
-        return target(drive) if self._tensor_kernels is None else self._tensor_kernels.target(drive)
-
-    @cached_property
-    def _tensor_kernels(self) -> Any:
-        from remodel_fenicsx.kernels.tensor import tensor_kernels
-
-        return tensor_kernels(self.state.comm)
 
     def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
         """Of all points in one row: those without tension, or with hardly any beside compression. Cells there stay."""
@@ -256,9 +247,9 @@ class RemodelingPass:
         """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling."""
         # The power is the stored energy that the pass releases at frozen deformation, per time, to first order
         # (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `noise`. Of the change of
-        # the cells `share` is made (`Law.share`).
+        # the cells the share `relaxation` is made (`Law.share`).
         asked, F = self.updated_cells(time_old, time_new, residual)
-        return self.replace(asked, F, time_new - time_old, self.share)
+        return self.replace(asked, F, time_new - time_old, self.relaxation)
 
     def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
         """Give the state other cells, or a share of the change; returns the power of remodeling at frozen F."""

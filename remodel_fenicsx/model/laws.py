@@ -379,11 +379,11 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
 
 
 def follow_tensor(
-    cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, rate: Array | float
+    cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, kappa_dt: Array | float
 ) -> UnitCell:
     """Cells whose structure tensor is `tensor_law.follow`; where its eigenvalues agree, the axes stay."""
     # Lengths are NaN where the target, extrapolated, makes the tensor indefinite by more than rounding.
-    structure = tensor_law.follow(structure_tensor(*cells[:2]), target, end_to_end_length, rate)
+    structure = tensor_law.follow(structure_tensor(*cells[:2]), target, end_to_end_length, kappa_dt)
     squared, axes = spectral.continued(structure, cells.axes)
     rounding = spectral.ROUNDING * np.abs(squared).max(axis=-1, keepdims=True)
     return UnitCell(np.where(squared < -rounding, np.nan, np.sqrt(np.maximum(squared, 0.0))), axes)

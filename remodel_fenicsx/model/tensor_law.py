@@ -82,11 +82,11 @@ def awake(tensor: Array, least_tension: float) -> Array:
     return np.where(largest > least_tension, 1 - least_tension / np.where(largest > 0, largest, 1.0), 0.0)
 
 
-def weight_of_the_end(rate: Array | float) -> Array:
-    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it; rate (n,)."""
+def weight_of_the_end(kappa_dt: Array | float) -> Array:
+    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it; (n,)."""
     # A forgets: A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z, z = kappa h:
     # one half for short steps, one for long ones.
-    z = np.asarray(rate, dtype=np.float64)
+    z = np.asarray(kappa_dt, dtype=np.float64)
     short = z < 1e-3
     long = np.where(short, 1.0, z)
     return np.where(short, 0.5 + z / 12, -1.0 / np.expm1(-long) - 1.0 / long)
@@ -122,9 +122,9 @@ def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Arra
     return direction, share
 
 
-def follow(structure: Array, towards: Target, end_to_end_length: Array | float, rate: Array | float) -> Array:
+def follow(structure: Array, towards: Target, end_to_end_length: Array | float, kappa_dt: Array | float) -> Array:
     """A after a time in which the target does not change: exact."""
     squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
-    weight = -np.expm1(-rate * towards.share)[:, None, None]
+    weight = -np.expm1(-kappa_dt * towards.share)[:, None, None]
     change: Array = weight * (squared * towards.direction - structure)
     return structure + change

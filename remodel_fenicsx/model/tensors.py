@@ -180,20 +180,10 @@ def on_diagonal(values: Array) -> Array:
 
 # ---------------------------------------------------------------- eigenvalues and logarithm
 
-_last: list[tuple[Array, Array, Array]] = []  # tensors, values, vectors of the last question
-
 
 def eigen(tensors: Array) -> tuple[Array, Array]:
     """Eigenvalues (n, 3), ascending, and eigenvectors as columns (n, 3, 3) of symmetric tensors (n, 3, 3)."""
-    # The last answer is kept: residual, tangent, driving stress, energy and power ask one after the other for the same
-    # tensors, and the decomposition is half of their work.
-    for known, *answer in _last:
-        if np.array_equal(known, tensors):
-            return answer[0], answer[1]
     values, vectors = np.linalg.eigh(tensors)
-    for array in (values, vectors):
-        array.flags.writeable = False
-    _last[:] = [(tensors.copy(), values, vectors)]
     return values, vectors
 
 
@@ -276,13 +266,7 @@ def passes_through_zero(before: Any, after: Any) -> Any:
     """Where det((1 - s) F + s G) is not positive for an s between 0 and 1."""
     # Both ends may be in order all the same, for two axes can turn at once. Exact: the determinant is a cubic in s.
     change = after - before
-    crossing = np.zeros(len(before), dtype=bool)
-    # |F^-1| <= F:F / (2 det F): nearer than its inverse nothing is singular, and the cubic need not be asked
-    size, square = np.sqrt(np.einsum("nij,nij->n", change, change)), np.einsum("nij,nij->n", before, before)
-    near = np.flatnonzero(size * square >= 2 * det(before))
-    if not near.size:
-        return crossing
-    at = [det(before[near] + s * change[near]) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
+    at = [det(before + s * change) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
     coefficients = np.linalg.solve(np.vander([0.0, 1 / 3, 2 / 3, 1.0], 4, increasing=True), np.stack(at))
     _, linear, quadratic, cubic = coefficients
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -290,8 +274,7 @@ def passes_through_zero(before: Any, after: Any) -> Any:
         root = -(quadratic + np.copysign(np.sqrt(quadratic**2 - 3 * cubic * linear), quadratic))
         places = [np.where((s > 0) & (s < 1), s, 0.0) for s in (root / (3 * cubic), linear / root)]
     lowest = np.min([np.polynomial.polynomial.polyval(s, coefficients, tensor=False) for s in places] + at, axis=0)
-    crossing[near] = lowest <= 1e-12 * np.max(at, axis=0)  # a double root by rounding
-    return crossing
+    return lowest <= 1e-12 * np.max(at, axis=0)  # a double root by rounding
 
 
 def cofactor(tensors: Any) -> Any:

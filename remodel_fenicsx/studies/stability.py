@@ -250,7 +250,7 @@ def stability(
         return made[0]
 
     def answer() -> Analysis:
-        share, kinematics = made[0].stepper.remodeling.share, made[0].stepper.state.kinematics.name
+        share, kinematics = made[0].stepper.remodeling.relaxation, made[0].stepper.state.kinematics.name
         taken = scene.model_copy(update={"model": Model(kinematics=kinematics)})
         return Analysis(taken, as_table(made[0], share), share)
 

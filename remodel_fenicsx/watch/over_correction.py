@@ -168,7 +168,7 @@ class OverCorrection(WarnsOnce):
 
     def _advice(self, factor: float) -> str:
         """A share of the pass with which the swing dies out: 1 - theta (1 - f) > -1."""
-        share = self.stepper.remodeling.share
+        share = self.stepper.remodeling.relaxation
         stable = 2 * share / (1 - factor)
         if share == 1.0 and stable > 0.5:
             return 'remodeling.coupling = "relaxed"'
