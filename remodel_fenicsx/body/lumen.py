@@ -15,8 +15,9 @@ from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, rims
 from remodel_fenicsx.body.mesh_file import in_place, of_vtk, split_quads, split_wedges, vtk_arrays
 from remodel_fenicsx.body.wall import shared_out
-from remodel_fenicsx.errors import RemodelError, UnreadableFile
+from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.schema.settings import LARGEST_MESH
+from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.system.children import check_xml, read_guarded
 from remodel_fenicsx.system.files import ForeignFileError, write_new
 
@@ -31,10 +32,6 @@ SMOOTHINGS = 50  # of the normals where a wall would fold over: more change no c
 MOST_THROUGH = 100  # elements through the wall
 LEAST_ROOM = 0.5  # of the thickness: an outer face that is nearer to the lumen lies in another part of the wall
 EDGES = ([0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3])  # of a tetrahedron, in the order of its further nodes
-
-
-class LumenError(RemodelError, ValueError):
-    """What is wrong with a surface, or with what is asked of it; one line."""
 
 
 class Surface(NamedTuple):
@@ -52,15 +49,15 @@ def read_surface(path: Path) -> Surface:
     """The surface of a file; its ending is one of `SURFACE_ENDINGS`."""
     ending = path.suffix.lower()
     if ending not in SURFACE_ENDINGS:
-        raise LumenError(f"{path}: allowed is a file that ends with {', '.join(SURFACE_ENDINGS)}")
+        raise SceneError(f"{path}: allowed is a file that ends with {', '.join(SURFACE_ENDINGS)}")
     try:
         found, _ = read_guarded(path, f"{__name__}:{ending[1:]}")
     except (OSError, UnreadableFile, ForeignFileError) as error:
-        raise LumenError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+        raise SceneError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
     points, triangles = found.pop("points"), found.pop("triangles")
     known = points.ndim == 2 and points.shape[1:] == (3,) and len(triangles) and np.isfinite(points).all()
     if not known or triangles.min() < 0 or triangles.max() >= len(points):
-        raise LumenError(f"{path}: has no triangles between points of three finite coordinates")
+        raise SceneError(f"{path}: has no triangles between points of three finite coordinates")
     _, first, number = np.unique(points, axis=0, return_index=True, return_inverse=True)  # STL repeats its corners
     triangles = number.reshape(-1)[triangles]
     whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
@@ -125,9 +122,9 @@ def oriented(surface: Surface, name: str) -> Surface:
     number = number.reshape(-1)
     if (counts > 2).any():
         place = points[distinct[counts > 2][0]].mean(axis=0)
-        raise LumenError(f"{name}: three triangles or more meet in one edge, at {in_place(place)}; a lumen has two")
+        raise SceneError(f"{name}: three triangles or more meet in one edge, at {in_place(place)}; a lumen has two")
     if (counts == 2).all():
-        raise LumenError(f"{name}: the surface is closed; cut its ends open, where the vessel goes on")
+        raise SceneError(f"{name}: the surface is closed; cut its ends open, where the vessel goes on")
     order = np.argsort(number, kind="stable")
     shared = counts[number[order]] == 2
     one, other = order[shared].reshape(-1, 2).T
@@ -136,7 +133,7 @@ def oriented(surface: Surface, name: str) -> Surface:
     links = coo_matrix((np.where(turned, 2.0, 1.0), (owners[one], owners[other])), (count, count)).tocsr()
     links = links.maximum(links.T)
     if (parts := connected_components(links, directed=False)[0]) > 1:
-        raise LumenError(f"{name}: has {parts} parts that do not touch; allowed is one lumen")
+        raise SceneError(f"{name}: has {parts} parts that do not touch; allowed is one lumen")
     visited, before = breadth_first_order(links, 0, directed=False)
     flipped: Flags = np.zeros(count, dtype=bool)
     for triangle in visited[1:]:
@@ -176,7 +173,7 @@ def remeshed(surface: Surface, size: float) -> Surface:
                 gmsh.option.setNumber(option, size)
             gmsh.model.mesh.generate(2)
         except Exception as error:  # Gmsh has no other
-            raise LumenError(f"--size {size:g}: Gmsh could not divide the surface so: {error}") from error
+            raise SceneError(f"--size {size:g}: Gmsh could not divide the surface so: {error}") from error
         numbers, places, _ = gmsh.model.mesh.getNodes()
         corners = gmsh.model.mesh.getElementsByType(2)[1]
     used, triangles = np.unique(corners, return_inverse=True)
@@ -218,7 +215,7 @@ def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], throu
         normals = _smoothed(normals, surface, openings)
     else:
         place = points[tetrahedra[folded][0]].mean(axis=0)
-        raise LumenError(f"--thickness: too thick: the wall folds over at {in_place(place)}, where the lumen is hollow")
+        raise SceneError(f"--thickness: too thick: the wall folds over at {in_place(place)}, where the lumen is hollow")
     _check_room(surface.points, points[-size:], thickness)
     of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(surface.triangles))
     faces = {"inner": surface.triangles, "outer": surface.triangles + size * (len(levels) - 1)}
@@ -263,7 +260,7 @@ def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
     distance, _ = cKDTree(inner).query(outer)
     if (crossed := distance < LEAST_ROOM * thickness).any():
         place = outer[int(np.argmax(crossed))]
-        raise LumenError(f"--thickness: too thick: the wall meets another part of the vessel at {in_place(place)}")
+        raise SceneError(f"--thickness: too thick: the wall meets another part of the vessel at {in_place(place)}")
 
 
 def _of_degree_2(points: Array, tetrahedra: Integers, layers: Integers, faces: Mapping[str, Integers]) -> GrownWall:
@@ -293,23 +290,23 @@ def write_wall(
     import meshio
 
     if path.suffix.lower() != ".msh":
-        raise LumenError(f"-o {path}: allowed is a file that ends with .msh")
+        raise SceneError(f"-o {path}: allowed is a file that ends with .msh")
     if path.exists():
-        raise LumenError(f"-o {path}: is there already; nothing is overwritten")
+        raise SceneError(f"-o {path}: is there already; nothing is overwritten")
     if not 0.0 < size < np.inf:
-        raise LumenError("--size: allowed is a number above 0")
+        raise SceneError("--size: allowed is a number above 0")
     if not 1 <= through <= MOST_THROUGH:
-        raise LumenError(f"--through: allowed is a whole number from 1 to {MOST_THROUGH}")
+        raise SceneError(f"--through: allowed is a whole number from 1 to {MOST_THROUGH}")
     shares, read = _thicknesses(layers), read_surface(surface)
     area = np.linalg.norm(area_vectors(read.points[read.triangles]), axis=1).sum()
     number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # of equilateral triangles
     if number > LARGEST_MESH:
-        raise LumenError(f"--size {size:g}: makes about {number:.2g} tetrahedra; at most {LARGEST_MESH:g} are made")
+        raise SceneError(f"--size {size:g}: makes about {number:.2g} tetrahedra; at most {LARGEST_MESH:g} are made")
     found = remeshed(read, size)
     depth = _thickness(thickness, shares, found)
     wall = grown(found, depth, shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
-        raise LumenError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
+        raise SceneError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
     names = list(shares) or ["wall"]
     groups = {name: (number, 2) for number, name in enumerate(wall.faces, 1)}
     groups |= {name: (len(wall.faces) + number, 3) for number, name in enumerate(names, 1)}
@@ -335,7 +332,7 @@ def _thicknesses(said: Sequence[str]) -> dict[str, float]:
     for text in said:
         name, _, number = text.partition("=")
         if not name.isidentifier() or name in found or (value := _positive(number)) is None:
-            raise LumenError(f"--layers {text}: allowed is NAME=THICKNESS, each name once, from the lumen outwards")
+            raise SceneError(f"--layers {text}: allowed is NAME=THICKNESS, each name once, from the lumen outwards")
         found[name] = value
     return found
 
@@ -344,18 +341,18 @@ def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) 
     """At the points, (n,): a number, an array of the file, or the sum of the layers."""
     whole = sum(layers.values())
     if said is None and not layers:
-        raise LumenError("--thickness: missing; a number in the unit of the surface, an array of it, or --layers")
+        raise SceneError("--thickness: missing; a number in the unit of the surface, an array of it, or --layers")
     value = _positive(said or "")
     if said is None or value is not None:
         number = value or whole
         if layers and not np.isclose(number, whole):
-            raise LumenError(f"--thickness {said}: the layers come to {whole:g}; leave one of both out")
+            raise SceneError(f"--thickness {said}: the layers come to {whole:g}; leave one of both out")
         return np.full(len(surface.points), number)
     if said not in surface.arrays:
         known = ", ".join(surface.arrays) or "none"
-        raise LumenError(f"--thickness {said}: allowed is a number above 0, or an array at the points: {known}")
+        raise SceneError(f"--thickness {said}: allowed is a number above 0, or an array at the points: {known}")
     if not (surface.arrays[said] > 0).all():
-        raise LumenError(f"--thickness {said}: this array has values that are not above 0")
+        raise SceneError(f"--thickness {said}: this array has values that are not above 0")
     return np.asarray(surface.arrays[said], dtype=np.float64)
 
 

@@ -630,19 +630,15 @@ def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, An
         units[key] = chosen.get(name, field.default) if isinstance(chosen, Mapping) else field.default
         if units[key] not in (*known, None):
             raise fault(allowed(field), key, units[key])
-    result: dict[str, Any] = in_units(values, Scene, units)
-    result["geometry"] = in_units(result["geometry"], shape, units, "geometry")
-    if isinstance(regions := result.get("regions"), Mapping):
-        result["regions"] = {
-            name: in_units(entry, Region, units, f"regions.{quoted(str(name))}") for name, entry in regions.items()
-        }
+    result = {**values, "geometry": in_units(values["geometry"], shape, units, "geometry")}
     if isinstance(loads := result.get("loads"), Mapping):
         kinds = shape.loads_on(faces_of(loads))
         result["loads"] = {
             name: in_units(entry, Load, units, f"loads.{name}", {"value": kinds[name].dimension})
             for name, entry in loads.items()
         }
-    return result
+    found: dict[str, Any] = in_units(result, Scene, units)
+    return found
 
 
 def _check_load_names(shape: str, loads: Any) -> None:

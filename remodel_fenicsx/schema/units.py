@@ -12,7 +12,7 @@ import tokenize
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, Field, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
@@ -106,15 +106,16 @@ def in_units(
     if not isinstance(values, Mapping):
         return values
     result = dict(values)
-    kind = free_names(table)
-    if kind is not None:
-        further = [name for name in values if name not in table.model_fields]
-        result |= {name: in_units(values[name], kind, units, f"{key}.{quoted(str(name))}") for name in further}
-    for name, field in table.model_fields.items():
-        value, path = values.get(name), f"{key}.{name}" if key else name
-        if is_table(field.annotation) and name in values:
-            result[name] = in_units(value, field.annotation, units, path)  # type: ignore[arg-type]
-        elif float in (field.annotation, *get_args(field.annotation)) and isinstance(value, str):
+    for name, value in values.items():
+        field, path = table.model_fields.get(name), f"{key}.{quoted(str(name))}" if key else name
+        kind: Any = free_names(table) if field is None else field.annotation
+        if is_table(kind):
+            result[name] = in_units(value, kind, units, path)
+        elif get_origin(kind) is dict and is_table(inner := get_args(kind)[1]) and isinstance(value, Mapping):
+            result[name] = {
+                own: in_units(one, inner, units, f"{path}.{quoted(str(own))}") for own, one in value.items()
+            }
+        elif field is not None and float in (kind, *get_args(kind)) and isinstance(value, str):
             dimension = dimension_of(field) if dimensions is None else dimensions.get(name)
             result[name] = _number(value, field, dimension, units, path)
     return result

@@ -174,6 +174,14 @@ def test_importing_costs_no_more_than_it_must(module: str, never: str) -> None:
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
+def test_a_scene_imports_no_other_shape() -> None:
+    others = [f"{PACKAGE}.body.{name}" for name in ("cube", "tendon", "sheet", "mesh_body", "mesh_file", "mesh_faces")]
+    scene = f"{PACKAGE}.scene.preset_scene('consistent', 'tube')"
+    program = f"import sys, {PACKAGE}.scene; {scene}; print(*(name for name in {others} if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+
+
 # ---------------------------------------------------------------- one name, one meaning
 def test_no_name_has_two_meanings() -> None:
     """No two classes of one name, and no constant of one name with two values."""
