@@ -187,6 +187,8 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
         solver = solver.model_copy(update={"predictor": "none"})
     if at_once and scene.has_random_cells and scene.jumps_by_rank:  # no step is short enough, and passes swing
         settings = settings.model_copy(update={"coupling": "relaxed"})
+        if comm.rank == 0:
+            log.info("the path to the equilibrium takes the coupling 'relaxed': random cells swing from rank to rank")
     first, *more = (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, settings, solver, first, coupling, kappa)
     if settings.turnover.grows:

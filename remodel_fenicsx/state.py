@@ -28,7 +28,6 @@ from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS
 
 Array = NDArray[np.float64]
 
-
 # ---------------------------------------------------------------- the unit cells at the quadrature points
 
 

@@ -19,11 +19,12 @@ from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Earlier, Numbers
 
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+
 
 # ---------------------------------------------------------------- how far a row is from what smaller steps would give
 # An estimate from the step itself.
-
-Array = NDArray[np.float64]
 
 SLOWEST = 20.0  # times as slowly as the cells alone body and cells may forget
 LARGEST_LINEAR_CHANGE = 1.0  # change of a length: a linear answer says no more
@@ -229,8 +230,6 @@ def _same(before: Mapping[str, float], loads: Mapping[str, float]) -> bool:
 
 # ---------------------------------------------------------------- steps as long as a tolerance allows
 # Chosen by the error of those before, taken back where they were too long.
-
-log = logging.getLogger(__name__)
 
 AIM = 0.85  # share of the tolerance that another length aims at
 KEPT, WORTHWHILE = 0.9, 1.5  # best lengths over the present one between which steps stay as they are

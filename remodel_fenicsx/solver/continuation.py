@@ -23,6 +23,8 @@ from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, Counted, GuardedNewton,
 from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
 from remodel_fenicsx.state import Numbers, State
 
+log = logging.getLogger(__name__)
+
 FAR = 2.0
 """`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
 without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
@@ -37,7 +39,6 @@ WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller
 PROOF = 8  # halvings without which a jump is not told from a step that is only too large
 MOST_JUMPS = 3  # that are looked into in a run, each by some 25 solves: a body that falls apart jumps in every step
 KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment leaves at every point
-log = logging.getLogger(__name__)
 
 
 @dataclass

@@ -17,11 +17,12 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.linear import kept_factor, uneven
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+
 
 # ---------------------------------------------------------------- inertia of the tangent
 # How many of its eigenvalues are negative, and the lowest of them with its mode.
-
-Array = NDArray[np.float64]
 
 FIRST_SHIFT = 1e-3  # of the smallest diagonal entry: where the search for a bound of the spectrum starts
 SHIFT_FACTOR = 8.0  # from one trial of it to the next
@@ -199,8 +200,6 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
 
 # ---------------------------------------------------------------- why there is no further step
 # Kinds of refusals, each with its own advice, told apart at the last solved state.
-
-log = logging.getLogger(__name__)
 
 NEARLY_LOCKED = 0.98  # r/L, where a prescribed motion makes chains longer
 LOCKED = 0.999  # r/L under any load

@@ -29,12 +29,12 @@ from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_le
 from remodel_fenicsx.model.tensors import MANDEL, passes_through_zero
 from remodel_fenicsx.state import Parameters, State, on_mesh
 
+Array = NDArray[np.float64]
+Shares = Callable[[], Sequence[UnitCell]]
+
 
 # ---------------------------------------------------------------- the repulsion where UFL has no closed expression
 # Stress and stiffness as values at the quadrature points.
-
-Array = NDArray[np.float64]
-Shares = Callable[[], Sequence[UnitCell]]
 
 
 class PointwiseRepulsion:

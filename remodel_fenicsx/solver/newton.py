@@ -29,6 +29,9 @@ from remodel_fenicsx.solver.linear import EveryTangent
 from remodel_fenicsx.state import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+
 
 # ---------------------------------------------------------------- when Newton's method has converged
 # A residual below a tolerance that no rounding error can pass.
@@ -102,8 +105,6 @@ class Convergence:
 # ---------------------------------------------------------------- admissible states
 # The limits r < L and J > 0 in the line search of Newton's method.
 
-Array = NDArray[np.float64]
-
 NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
 
 
@@ -156,9 +157,6 @@ class Limits:
             self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
         room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, NEAR_LIMIT)
         return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
-
-
-log = logging.getLogger(__name__)
 
 
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up

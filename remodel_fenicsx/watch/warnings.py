@@ -24,6 +24,8 @@ from remodel_fenicsx.model.tensors import cofactor
 from remodel_fenicsx.state import Numbers, at_points
 from remodel_fenicsx.system import NOTICE
 
+Array = NDArray[np.float64]
+
 
 # ---------------------------------------------------------------- what warnings have in common
 # They follow the steps of a run, and speak once.
@@ -132,8 +134,6 @@ class WarnsOnce(Watcher):
 
 # ---------------------------------------------------------------- elements that hold a body back
 # By a stiff bulk (they lock), or because the strain varies too much inside them.
-
-Array = NDArray[np.float64]
 
 # The part of its way that a body lacks, from which it is said. docs/what_may_go_wrong.md: estimate and error; the
 # paper's bodies come to 3.6 % (artery with random cells, t = 5)
