@@ -238,7 +238,7 @@ def _as_typed(error: RemodelError, options: argparse.Namespace) -> str:
 
 
 @contextlib.contextmanager
-def _stopping(kept: str = "all that is recorded is kept, the same command goes on") -> Iterator[None]:
+def _stopping(kept: str) -> Iterator[None]:
     """Within, a signal ends the command at once, which says what is kept."""
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
@@ -552,8 +552,10 @@ def _schema(options: argparse.Namespace) -> None:
     _say(text)
 
 
-def _answer(folder: Path, found: Any) -> int:
-    """Say what a study has found, where, and which of its runs have failed."""
+def _answer(study: Callable[..., tuple[Path, Any]], *wishes: Any) -> int:
+    """Do a study; say what it has found, where, and which of its runs have failed."""
+    with _stopping("all that is recorded is kept, the same command goes on"):
+        folder, found = study(*wishes)
     _say(f"{found.in_words()}\nresults in {folder}")
     _complain_of(found.failed)
     return SOLVE_FAILED if found.failed else 0
@@ -583,8 +585,8 @@ def _sweep(options: argparse.Namespace) -> int:
     is_sampled = options.latin is not None
     axes = study.read_axes(options.axes, is_sampled)
     points = study.latin_hypercube(axes, options.latin, options.seed) if is_sampled else study.grid(axes)
-    with _stopping():
-        return _answer(*study.sweep(options.scene, points, options.output, options.jobs, options.quiet, is_sampled))
+    wishes = options.output, options.jobs, options.quiet, is_sampled
+    return _answer(study.sweep, options.scene, points, *wishes)
 
 
 @command(
@@ -599,8 +601,7 @@ def _ensemble(options: argparse.Namespace) -> int:
     """Run a scene of random cells with many seeds, and with isotropic cells."""
     from remodel_fenicsx.studies.sweep import ensemble
 
-    with _stopping():
-        return _answer(*ensemble(options.scene, options.output, options.seeds, options.jobs, options.quiet))
+    return _answer(ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet)
 
 
 @command(
@@ -618,8 +619,7 @@ def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings: what each costs, and how far off it is."""
     from remodel_fenicsx.studies.trade import trade
 
-    with _stopping():
-        return _answer(*trade(options.scene, options.output, options.budget, options.jobs, options.quiet))
+    return _answer(trade, options.scene, options.output, options.budget, options.jobs, options.quiet)
 
 
 @command(
@@ -639,8 +639,7 @@ def _fit(options: argparse.Namespace) -> int:
     from remodel_fenicsx.studies.fit import fit
 
     wishes = options.starts, options.quiet, options.likelihood_profiles, options.jobs
-    with _stopping():
-        return _answer(*fit(options.scene, options.data, options.output, *wishes))
+    return _answer(fit, options.scene, options.data, options.output, *wishes)
 
 
 @command(

@@ -119,7 +119,11 @@ def run(
     with interrupts.StopRequest() as stop, ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
             scene = body.enter_context(as_unloaded(scene, comm, quiet))
-            simulation = body.enter_context(_built(_with_sums(scene, comm), comm))
+            found = comm.bcast(agreed(comm, lambda: _kept_files(scene)[0] if comm.rank == 0 else {}))
+            # a file that is replaced from here on is refused, so what is kept is what is read
+            if sums := {key: value for key, value in found.items() if key.endswith("sha256")}:
+                scene = scene.with_values(sums)
+            simulation = body.enter_context(_built(scene, comm))
             place = place or chosen_folder(None, scene.name, comm)
         with locked(place, comm, new=True):
             followers = [one if isinstance(one, Watcher) else one(simulation) for one in watchers]
@@ -295,13 +299,6 @@ def _record(
             raise
         log.info("finished")
         leave_report()
-
-
-def _with_sums(scene: Scene, comm: MPI.Intracomm) -> Scene:
-    """With the SHA-256 of its files: one that is replaced from here on is refused, so what is kept is what is read."""
-    found = agreed(comm, lambda: _kept_files(scene)[0] if comm.rank == 0 else {})
-    sums = {key: value for key, value in comm.bcast(found).items() if key.endswith("sha256")}
-    return scene.with_values(sums) if sums else scene
 
 
 def with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:

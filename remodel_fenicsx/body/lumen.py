@@ -18,7 +18,7 @@ from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.schema.tables import SceneError
-from remodel_fenicsx.system.children import check_xml, read_guarded
+from remodel_fenicsx.system.children import read_guarded
 from remodel_fenicsx.system.files import ForeignFileError, write_new
 
 Array = NDArray[np.float64]
@@ -92,7 +92,6 @@ def obj(file: str) -> dict[str, Any]:
 
 def vtp(file: str) -> dict[str, Any]:
     """In the child process: VTK's own file, by VTK."""
-    check_xml(Path(file).read_bytes())
     reader, numbers = of_vtk("vtkIOXML", "vtkXMLPolyDataReader")(), of_vtk("util.numpy_support", "vtk_to_numpy")
     triangulated = of_vtk("vtkFiltersCore", "vtkTriangleFilter")()
     reader.SetFileName(file)

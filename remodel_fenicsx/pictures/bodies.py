@@ -382,17 +382,14 @@ class Sight:
         nearest = [float(recorded[np.abs(recorded - time).argmin()]) for time in wanted or (last,)]
         return list(dict.fromkeys(nearest))
 
-    def axes(self) -> Array:
-        """Right, up and towards the eye: unit vectors, as rows (3, 3)."""
-        towards = np.array(self.direction) / np.linalg.norm(self.direction)
-        up = np.array([0.0, 0.0, 1.0]) if abs(towards[2]) < 0.9999 else np.array([0.0, 1.0, 0.0])
-        right = np.cross(up, towards)
-        right /= np.linalg.norm(right)
-        return np.stack([right, np.cross(towards, right), towards])
-
     def view(self, grids: Sequence[pyvista.UnstructuredGrid], box: tuple[int, int]) -> View:
         """All of what is seen, at all of these times, as large as a box (width, height) in pixels holds it."""
-        axes, moved = self.axes(), [found.point_data.get("displacement", 0.0) for found in grids]
+        towards = np.array(self.direction) / np.linalg.norm(self.direction)
+        is_steep = abs(towards[2]) >= 0.9999  # no direction of z is left in the picture
+        right = np.cross([0.0, 1.0, 0.0] if is_steep else [0.0, 0.0, 1.0], towards)
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(towards, right), towards])
+        moved = [found.point_data.get("displacement", 0.0) for found in grids]
         places = np.concatenate([(found.points + by) @ axes.T for found, by in zip(grids, moved, strict=True)])
         low, high = places.min(axis=0), places.max(axis=0)
         wide, tall, _ = high - low
@@ -400,8 +397,8 @@ class Sight:
         height = min(box[1], box[0] / aspect)
         pixels = round(height * aspect), round(height)
         x, y, z = ((low + high) / 2) @ axes
-        up = axes[1] if abs(axes[2, 2]) >= 0.9999 else np.array([0.0, 0.0, 1.0])
-        return View(tuple(axes[2]), (x, y, z), VIEW_MARGIN * max(tall, wide / aspect), pixels, tuple(up))
+        up = tuple(axes[1]) if is_steep else (0.0, 0.0, 1.0)
+        return View(tuple(towards), (x, y, z), VIEW_MARGIN * max(tall, wide / aspect), pixels, up)
 
     def loads(self, time: float) -> list[str]:
         """The loads at a recorded time, as its row of the history has them; none before there is one."""

@@ -269,20 +269,6 @@ class Warned:
     time: str
 
 
-def _warnings(lines: list[tuple[str, str, str]]) -> list[Warned]:
-    found: dict[str, Warned] = {}
-    time = ""
-    for _, level, text in lines:
-        step = _STEP.match(text)
-        if level == "INFO" and step:
-            time = step[1]
-        if level not in ("WARNING", "ERROR", "CRITICAL"):
-            continue
-        first = found.setdefault(re.sub(r"\d+", "0", text), Warned(text, 0, time))
-        first.count += 1
-    return list(found.values())
-
-
 ASSETS = Path(__file__).with_name("assets")
 MOST_TILES = 8
 MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
@@ -304,7 +290,13 @@ class ReportedRun:
     @cached_property
     def warnings(self) -> list[Warned]:
         """Those of run.log."""
-        return _warnings(self.log)
+        found, time = dict[str, Warned](), ""
+        for _, level, text in self.log:
+            if level == "INFO" and (step := _STEP.match(text)):
+                time = step[1]
+            if level in ("WARNING", "ERROR", "CRITICAL"):
+                found.setdefault(re.sub(r"\d+", "0", text), Warned(text, 0, time)).count += 1
+        return list(found.values())
 
     @cached_property
     def state(self) -> tuple[str, str]:

@@ -72,12 +72,8 @@ class TurnedFields:
 # ---------------------------------------------------------------- chains of unit cells as lines, and a file of them
 
 AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
-OF_CHAINS = (
-    "cell_dimensions",
-    *AXIS_FIELDS,
-    "deformation_gradient",
-    "fibre_angle",
-)  # fields that the lines are made of
+# fields that the lines are made of
+OF_CHAINS = ("cell_dimensions", *AXIS_FIELDS, "deformation_gradient", "fibre_angle")
 
 
 def chain_lines(

@@ -168,7 +168,9 @@ class Study:
                         raise Interrupted(stop.number)
                     if stop.pause and not pausing:
                         pausing = True
-                        self._pause()
+                        self._waiting.clear()
+                        for worker in self._running:  # each run ends with the step under way
+                            worker.process.send_signal(PAUSE)
                     self._begin()
                     self._collect(pausing)
                     line.show(self._progress())
@@ -213,12 +215,6 @@ class Study:
             if worker.is_alive:
                 self._idle.append(worker)
             self.learn()
-
-    def _pause(self) -> None:
-        """Begin nothing more, and let each run end with the step under way."""
-        self._waiting.clear()
-        for worker in self._running:
-            worker.process.send_signal(PAUSE)
 
     def _progress(self) -> str:
         """How many runs are behind, and which are under way."""

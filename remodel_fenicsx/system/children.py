@@ -147,9 +147,9 @@ WAITING = 10  # times the processor time: the machine may be busy
 ELSEWHERE = "its numbers stand in another file; allowed is a file that holds them (Format='XML')"
 LONGEST_REASON = 150  # characters of what is wrong
 DAMAGED = "cannot be read: "
-_LOGGED = re.compile(
-    r"\x1b\[[0-9;]*m|\(0x[0-9a-f]+\)|\S+ \S+ \( *[\d.]+s\) \[ *\w+\]\S+ ERR\| "
-)  # as VTK adds to its words
+# as VTK adds to its words
+_LOGGED = re.compile(r"\x1b\[[0-9;]*m|\(0x[0-9a-f]+\)|\S+ \S+ \( *[\d.]+s\) \[ *\w+\]\S+ ERR\| ")
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # marks of its byte order
 _COUNTS = re.compile(r"(?i)^(number.*|dimensions|offset)$")
 _LINES = re.compile(
     rb"(?im)^\s*(?:points|cells|cell_types|point_data|cell_data|offsets|connectivity)\b[^\n]{0,99}\s-\d"
@@ -211,9 +211,12 @@ def read_as_child(reader: str, source: str, found: str, seconds: str, memory: st
 
 
 def _guard(file: str) -> None:
-    """From here on XML is parsed by rule, and nothing but this file and Python's own is opened."""
-    from xml.etree import ElementTree
-
+    """Refuse XML against the rules; from here on nothing but this file and Python's own is opened."""
+    data = Path(file).read_bytes()
+    if data.startswith(UTF_16) or b"<" in data.lstrip(b"\0 \t\r\n")[:4]:
+        _check_xml(data)
+    if found := _LINES.search(data[: 10**6]):
+        raise UnreadableFile(f"has a number that is negative: {found[0].decode().strip()}")
     own = tuple({*map(os.path.realpath, sysconfig.get_paths().values()), str(Path(__file__).resolve().parents[1])})
     own += tuple(os.path.realpath(folder) for folder in sys.path if folder)
 
@@ -231,31 +234,17 @@ def _guard(file: str) -> None:
             if path != file and not os.path.realpath(path).startswith(own):
                 raise UnreadableFile("refers to another file")
 
-    def parse(place: Any, parser: Any = None) -> Any:
-        return ElementTree.ElementTree(tree_by_rule(Path(place).read_bytes()))
-
-    def fromstring(text: str | bytes, parser: Any = None) -> Any:
-        return tree_by_rule(text.encode() if isinstance(text, str) else text)
-
-    changed: Any = ElementTree
-    changed.parse, changed.fromstring, changed.XML = parse, fromstring, fromstring
-    if found := _LINES.search(Path(file).read_bytes()[: 10**6]):
-        raise UnreadableFile(f"has a number that is negative: {found[0].decode().strip()}")
     sys.addaudithook(watch)
 
 
-def check_xml(data: bytes) -> None:
-    """Refuse XML that `tree_by_rule` would; numbers in bytes at its end are not looked at."""
-    start = data.find(b"<AppendedData")
-    raw = start >= 0 and b'encoding="raw"' in data[start : start + 100]
-    tree_by_rule(data[:start] + b"</VTKFile>" if raw else data)
-
-
-def tree_by_rule(data: bytes) -> Any:
-    """The root of XML in UTF-8 that has no entities of its own and nothing outside of itself."""
+def _check_xml(data: bytes) -> None:
+    """Refuse what is no XML in UTF-8, has entities of its own, or something outside of itself."""
     from xml.etree import ElementTree
 
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):  # which expat would follow, whatever it is told
+    start = data.find(b"<AppendedData")
+    if start >= 0 and b'encoding="raw"' in data[start : start + 100]:  # numbers in bytes at its end are not looked at
+        data = data[:start] + b"</VTKFile>"
+    if data.startswith(UTF_16):  # which expat would follow, whatever it is told
         raise UnreadableFile("is no XML in UTF-8")
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise UnreadableFile("has a document type or entities; allowed is plain XML")
@@ -264,7 +253,7 @@ def tree_by_rule(data: bytes) -> Any:
         parser.feed(data)
         root = parser.close()
     except ElementTree.ParseError as error:
-        raise ElementTree.ParseError(f"is no XML in UTF-8: {error}") from None
+        raise UnreadableFile(f"is no XML in UTF-8: {error}") from None
     for element in root.iter():
         if element.tag.rpartition("}")[2] == "include" or element.get("Format", "XML") != "XML":
             raise UnreadableFile(ELSEWHERE)
@@ -275,7 +264,6 @@ def tree_by_rule(data: bytes) -> Any:
             raise UnreadableFile(f"header_type = {kind!r}; allowed are 'UInt32' and 'UInt64'")
     if len(list(root.iter("Piece"))) > 1:
         raise UnreadableFile("has several pieces; allowed is one: read it in ParaView, Merge Blocks, save it again")
-    return root
 
 
 if __name__ == "__main__":

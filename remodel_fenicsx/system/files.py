@@ -172,9 +172,8 @@ def wall_time(text: str) -> float:
     return seconds
 
 
-MOST_RUNS = (
-    10_000  # of runs of a study, or of times that are analysed: each is a folder or a row that a person looks at
-)
+# of runs of a study, or of times that are analysed: each is a folder or a row that a person looks at
+MOST_RUNS = 10_000
 
 
 def positive(text: str) -> int:
