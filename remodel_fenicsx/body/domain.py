@@ -234,13 +234,7 @@ def build_domain(
             raise failure
         if groups is None:
             raise GeometryError(verdict) from failure
-        return _domain_from_gmsh(model, comm, groups, shape, dimensions)
-
-
-def _domain_from_gmsh(
-    model: Any, comm: MPI.Intracomm, groups: NamedGroups, shape: str, dimensions: dict[str, float]
-) -> Domain:
-    mesh, cell_tags, facet_tags = compat.mesh_from_gmsh(model, comm)
+        mesh, cell_tags, facet_tags = compat.mesh_from_gmsh(model, comm)
     symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
     region = np.zeros(len(mesh.topology.original_cell_index), dtype=np.int32)
     region[cell_tags.indices] = cell_tags.values

@@ -47,7 +47,9 @@ class Wall(NamedTuple):
 
     def nodes(self, degree: int) -> Array:
         """Radii of the nodes of elements of this degree, equally spaced within a layer."""
-        return lattice(self.radii, self.counts, degree)
+        layers = zip(itertools.pairwise(self.radii), self.counts, strict=True)
+        parts = [np.linspace(a, b, degree * count + 1) for (a, b), count in layers]
+        return np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
 
     def marked(self, domain: Domain) -> Domain:
         """The domain with its layers as regions: an element is where the middle of its radii is."""
@@ -70,12 +72,6 @@ def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
     for _ in range(elements - len(counts)):
         counts[int(np.argmax(np.divide(thicknesses, counts)))] += 1
     return tuple(counts)
-
-
-def lattice(ends: list[float] | tuple[float, ...], counts: tuple[int, ...], degree: int) -> Array:
-    """Places of nodes between the ends of layers, equally spaced in each."""
-    parts = [np.linspace(a, b, degree * n + 1) for (a, b), n in zip(itertools.pairwise(ends), counts, strict=True)]
-    return np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
 
 
 def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
-import math
 import re
+import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import NoneType
@@ -250,12 +250,7 @@ def named(registry: Mapping[str, Any], fits: Callable[[Any], Any]) -> str:
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number that a float can hold; true and false are not."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 # ---------------------------------------------------------------- one line for an error
