@@ -39,16 +39,15 @@ INDEPENDENT = 1e-12  # of increments: what is less is rounding
 
 
 class LoadStep(NamedTuple):
-    """A step as it is asked for: its end, its length, and the rates of the loads over it."""
+    """A step as it is asked for: its length, and the rates of the loads over it."""
 
-    time: float
     duration: float
     rates: dict[str, float]
 
     @classmethod
-    def between(cls, start: float, old: Mapping[str, float], end: float, new: Mapping[str, float]) -> LoadStep:
-        """From two times and the loads there."""
-        return cls(end, end - start, {name: (new.get(name, old[name]) - old[name]) / (end - start) for name in old})
+    def between(cls, duration: float, old: Mapping[str, float], new: Mapping[str, float]) -> LoadStep:
+        """From the loads at its start and its end."""
+        return cls(duration, {name: (new.get(name, old[name]) - old[name]) / duration for name in old})
 
 
 class Predictor:
@@ -59,7 +58,7 @@ class Predictor:
         self._increments = Earlier(state, "predictor_increment", state.unknown.copy, ORDER + FITTED)
         rates = {f"rate_{name}": 0.0 for name in state.loading.values}
         durations = {f"duration_{age}": 0.0 for age in range(ORDER + FITTED)}  # of the increments, the newest first
-        self._numbers = Numbers(state, "predictor", {"time": 0.0} | durations | rates)
+        self._numbers = Numbers(state, "predictor", durations | rates)
 
     def expected(self, step: LoadStep) -> Array | None:
         """The unknowns at its end, ghosts included, with what supports and loads prescribe; None at first."""
@@ -76,10 +75,10 @@ class Predictor:
             condition.set(values)
         return values
 
-    def solved(self, step: LoadStep, before: Array) -> None:
-        """The state is the solution of the step; `before`: the unknowns of the step before."""
+    def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
+        """The state is the solution of the step; `before`: the unknowns of the step before, or of its first solve."""
         numbers, increment = self._numbers, self.state.unknown.x.array - before
-        if numbers["time"] == step.time:  # solved once more: a coupling that iterates
+        if again:
             self._increments.values[0][:] += increment
             return
         if not self._goes_on(step):
@@ -87,7 +86,7 @@ class Predictor:
         self._increments.push(increment)
         for age in reversed(range(1, ORDER + FITTED)):
             numbers[f"duration_{age}"] = numbers[f"duration_{age - 1}"]
-        numbers["duration_0"], numbers["time"] = step.duration, step.time
+        numbers["duration_0"] = step.duration
         for name, rate in step.rates.items():
             numbers[f"rate_{name}"] = rate
 
@@ -241,21 +240,23 @@ class Staggered:
             self.turnover.lag(time)  # the rates of the row, like its cells, are those of the step before
         return self.balanced(time, loads)
 
-    def balanced(self, time: float, loads: LoadValues) -> Work:
+    def balanced(self, time: float, loads: LoadValues, again: bool = False) -> Work:
         """Equilibrium with what has remodeled.
 
         Parameters
         ----------
         time, loads
             As of `solve`.
+        again
+            The step has been solved already, with other cells.
         """
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
-        step = LoadStep.between(self.state.time, old_loads, time, loads)
+        step = LoadStep.between(time - self.state.time, old_loads, loads)
         if not self._solved_as_expected(step, loads, work):
             self._solve_from_the_last(time, old_loads, loads, work)
-        self._whole(time, old_loads, loads).look_back(before, work)
+        self._whole(time, old_loads, loads).look_back(before, work, again)
         if self.predictor is not None:
-            self.predictor.solved(step, before)
+            self.predictor.solved(step, before, again)
         self.state.settle_cells()
         if self.turnover is not None:
             self.turnover.settle()
@@ -264,7 +265,7 @@ class Staggered:
         self._last["extension"] = work.extension.max_chain_extension
         self.tangents = work.tangents
         for case in self.remodeling.cases:
-            work.count(case.solve(time))
+            work.count(case.solve(time, again))
         return work
 
     def remodel(self, time: float) -> float:
@@ -425,7 +426,7 @@ class Extrapolated(Staggered):
             return work
         cells.set(*self._start[:2])
         self._follow(expected.where(self._begins, self._found), time)
-        again = self.balanced(time, loads)
+        again = self.balanced(time, loads, again=True)
         self._found = self.remodeling.target(self.residual)
         again.substeps += work.substeps - 1
         again.count(work)

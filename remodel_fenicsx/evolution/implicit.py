@@ -372,12 +372,12 @@ class Implicit:
         """Solve after a change, in one piece or in parts."""
         most = MOST_SOLVES * self.settings.maximum_iterations + work.newton_iterations
         change = Change(time, stage, set_fraction, newton, self.settings.maximum_halvings, most_iterations=most)
-        before = self.state.unknown.x.array.copy()
+        before, again = self.state.unknown.x.array.copy(), work.substeps > 0
         try:
             set_fraction(1.0)
             work.add(newton.solve())
             work.substeps += 1
-            if change.look_back(before, work):
+            if change.look_back(before, work, again):
                 work.add(newton.solve())  # the cells that belong to the unknowns: there is nothing else to do
         except SolveFailure as failure:
             work.add(failure)

@@ -415,10 +415,10 @@ class OtherCase:
         self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
         state.stop_signal = lambda: stepper.state.stop_signal()
 
-    def solve(self, time: float) -> Work:
-        """Equilibrium at `time` with the present cells."""
+    def solve(self, time: float, again: bool) -> Work:
+        """Equilibrium at `time` with the present cells; `again` as of `Staggered.balanced`."""
         try:
-            return self.coupling.solve(time, self.load_values(time))
+            return self.coupling.balanced(time, self.load_values(time), again)
         except StepFailure as failure:
             raise StepFailure(failure.time, f"load case {self.number}: {failure}", failure.refusal) from failure
 

@@ -209,17 +209,17 @@ class Change:
         unknown[:] = before
         return bound
 
-    def look_back(self, before: NDArray[np.float64], work: Work) -> bool:
+    def look_back(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
         """After a step: look into one that has ended far from its tangent or from the step before."""
+        # `again`: it was solved once more, with other cells; that is no step of its own
         unknown, jumps = self.newton.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
-        again = jumps["time"] == self.time  # solved once more, with other cells: that is no step of its own
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
         looked = self.is_another_branch(work.last, moved, expected, tangents) and self._looks()
         if looked:
             self.confirm(before, work)
             moved = self._size(unknown - before)
-        jumps["moved"], jumps["time"] = max(moved, last) if again else moved, self.time
+        jumps["moved"] = max(moved, last) if again else moved
         return looked
 
     def confirm(self, before: NDArray[np.float64], work: Work) -> None:
@@ -275,7 +275,7 @@ class Change:
 
     @property
     def _jumps(self) -> Numbers:
-        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0, "time": 0})
+        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0})
 
     def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
         """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""

@@ -32,18 +32,17 @@ def test_a_trend_and_a_swing_are_both_continued_whatever_the_steps(simulation: S
     state = simulation.state
     predictor, unknown, rng = Predictor(state), state.unknown.x.array, np.random.default_rng(1)
     trend, swing = 1e-3 * rng.standard_normal((2, len(unknown)))
-    assert predictor.expected(LoadStep(1.0, 1.0, RATES)) is None
-    time, free = 0.0, np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
+    assert predictor.expected(LoadStep(1.0, RATES)) is None
+    free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
     for number, duration in enumerate(rng.uniform(0.5, 2.0, 8)):
-        time += duration
-        step, before = LoadStep(time, duration, RATES), unknown.copy()
+        step, before = LoadStep(duration, RATES), unknown.copy()
         found, increment = predictor.expected(step), duration * (0.9**number * trend + (-0.8) ** number * swing)
         unknown[:] += increment
         predictor.solved(step, before)
     assert found is not None
     np.testing.assert_allclose((found - before)[free], increment[free], rtol=0, atol=1e-12)
     assert np.all(found[~free] == 0.0)  # what supports prescribe
-    assert predictor.expected(LoadStep(time + 1.0, 1.0, {"force": 2.1})) is None
+    assert predictor.expected(LoadStep(1.0, {"force": 2.1})) is None
 
 
 def iterations(folder: Path) -> int:
