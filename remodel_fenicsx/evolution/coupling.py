@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
-TARGET = np.dtype([("direction", float, (3, 3)), ("share", float), ("time", float)])  # what is kept of one
+TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])  # what is kept of one
 NEVER = -1.0  # time of a target that there has not been
 COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
 
@@ -420,7 +420,7 @@ class Extrapolated(Staggered):
             self.turnover.extrapolate(time)
         work = self.balanced(time, loads)
         self._found = self.remodeling.target(self.residual)
-        self._begins = (self._newest["share"] < COUNTS) & (self._found.share >= COUNTS)
+        self._begins = (self._newest["switch"] < COUNTS) & (self._found.switch >= COUNTS)
         if not self._anywhere(self._begins):
             return work
         cells.set(*self._start[:2])
@@ -436,7 +436,7 @@ class Extrapolated(Staggered):
         self._duration = time - self.state.time
         self._older[:] = self._newest
         self._older["time"][self._begins] = NEVER  # its step had the target of its end
-        self._newest["direction"], self._newest["share"], self._newest["time"] = *self._found, time
+        self._newest["direction"], self._newest["switch"], self._newest["time"] = *self._found, time
         if self.turnover is not None:
             self.turnover.complete(time)
         return self._power
@@ -452,7 +452,7 @@ class Extrapolated(Staggered):
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
         duration = time - self.state.time
         self._power = 0.0
-        if not self._anywhere(target.share != 0.0):
+        if not self._anywhere(target.switch != 0.0):
             return
         asked = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(asked.dimensions).all(axis=-1)
@@ -471,7 +471,7 @@ class Extrapolated(Staggered):
 
 def known(records: Any) -> Target:
     """The target that records of `TARGET` hold; zero where there was none."""
-    return Target(records["direction"], records["share"])
+    return Target(records["direction"], records["switch"])
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]

@@ -24,7 +24,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.assembly import Remembered, over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.kernels.tensor import problem_of, tensor_kernels
-from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, StepOfCells
@@ -69,16 +69,10 @@ class ImplicitCells:
     # ------------------------------------------------------------ a step
     def begin(self, time: float, residual: float) -> None:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
-        old, given = self.state.cells.point_cells.copy(), self.remodeling.settings.turnover
-        step = StepOfCells(
-            self.remodeling.law,
-            self.remodeling.drive(residual),
-            old,
-            structure_tensor(*old[:2]),
-            self.state.time,
-            time,
-            given.rule if given.is_on else None,
-        )
+        old, drive = self.state.cells.point_cells.copy(), self.remodeling.drive(residual)
+        given = self.remodeling.settings.turnover
+        rule = given.rule if given.is_on else None
+        step = StepOfCells(self.remodeling.law, drive, old, self.state.time, time, rule)
         self._problem = problem_of(self._kernels, at_points(self.tissue, self.quadrature), step)
         self._accepted = self.tensor_of_state()
         self.restart()

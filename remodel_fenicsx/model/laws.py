@@ -375,7 +375,7 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
     found = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
         return found
-    return found._replace(share=found.share * tensor_law.awake(drive.tensor, drive.least_tension))
+    return found._replace(switch=found.switch * tensor_law.awake(drive.tensor, drive.least_tension))
 
 
 def follow_tensor(
@@ -456,9 +456,9 @@ def largest_tension(drives: Drives, weights: Weights) -> Drive:
 
 def mean_target(targets: Sequence[Target], weights: Weights) -> Target:
     """The weighted mean of sE: what acts on A is linear in it (`Target.towards`)."""
-    pulled = _weighted([target.share[:, None, None] * target.direction for target in targets], weights)
-    share = np.einsum("nii->n", pulled)
-    return Target(pulled / np.where(share > 0.0, share, 1.0)[:, None, None], share)
+    pulled = _weighted([target.switch[:, None, None] * target.direction for target in targets], weights)
+    switch = np.einsum("nii->n", pulled)
+    return Target(pulled / np.where(switch > 0.0, switch, 1.0)[:, None, None], switch)
 
 
 def _with(drive: Drive, tensor: Array, noise: Any, rounding: Any) -> Drive:
