@@ -30,12 +30,12 @@ log = logging.getLogger(__name__)
 TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])  # what is kept of one
 NEVER = -1.0  # time of a target that there has not been
 COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
-
-
-# ---------------------------------------------------------------- where Newton's method starts a step
 ORDER, FITTED = 3, 2  # increments that predict the next one; increments to which the weights are fitted
 SAME_RATE = 1e-9  # relative difference of two rates of a load that are the same
 INDEPENDENT = 1e-12  # of increments: what is less is rounding
+
+
+# ---------------------------------------------------------------- where Newton's method starts a step
 
 
 class LoadStep(NamedTuple):
