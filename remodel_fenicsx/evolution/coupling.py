@@ -421,7 +421,7 @@ class Extrapolated(Staggered):
         work = self.balanced(time, loads)
         self._found = self.remodeling.target(self.residual)
         self._begins = (self._newest["switch"] < COUNTS) & (self._found.switch >= COUNTS)
-        if not self._anywhere(self._begins):
+        if not how_many(self.state, self._begins):
             return work
         cells.set(*self._start[:2])
         self._follow(expected.where(self._begins, self._found), time)
@@ -452,21 +452,22 @@ class Extrapolated(Staggered):
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
         duration = time - self.state.time
         self._power = 0.0
-        if not self._anywhere(target.switch != 0.0):
+        if not how_many(self.state, target.switch != 0.0):
             return
         asked = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(asked.dimensions).all(axis=-1)
         if lost.any():
             asked = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
-        points = self._anywhere(lost)
+        points = how_many(self.state, lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
         self._power = self.remodeling.replace(asked, self.state.elastic_gradient(), duration)
 
-    def _anywhere(self, points: Flags) -> int:
-        """How many there are on all ranks."""
-        quadrature = self.state.cells.quadrature
-        return int(self.state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
+
+def how_many(state: State, points: Flags) -> int:
+    """Of all points in one row that are chosen, on all ranks."""
+    quadrature = state.cells.quadrature
+    return int(state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
 
 
 def known(records: Any) -> Target:

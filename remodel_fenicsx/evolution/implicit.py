@@ -19,7 +19,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Traits, between
+from remodel_fenicsx.evolution.coupling import Traits, between, how_many
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.assembly import Remembered, over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
@@ -145,7 +145,7 @@ class ImplicitCells:
 
     def complete(self) -> bool:
         """Whether at all points, of all ranks, cells belong to the stress."""
-        return not self._anywhere(~self.solution().converged)
+        return not how_many(self.state, ~self.solution().converged)
 
     def squared_lengths(self) -> Array:
         """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
@@ -154,15 +154,12 @@ class ImplicitCells:
 
     def unsolved(self, locking_length: Array) -> bool:
         """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
-        return self._anywhere(self._refused() & (self.solution().squared_lengths < locking_length.reshape(-1) ** 2))
+        short = self.solution().squared_lengths < locking_length.reshape(-1) ** 2
+        return how_many(self.state, self._refused() & short) > 0
 
     def _refused(self) -> Flags:
         """Points without a solution, after so many iterations that none is expected."""
         return ~self.solution().converged & (self._iterations > BEFORE_REFUSAL)
-
-    def _anywhere(self, points: Flags) -> bool:
-        owned = self.quadrature.owned(points.reshape(self.quadrature.shape))
-        return bool(self.state.comm.allreduce(int(owned.any())))
 
 
 class ImplicitEquilibrium(Equilibrium):
