@@ -27,15 +27,15 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
-TARGET = np.dtype([("direction", float, (3, 3)), ("share", float), ("time", float)])  # what is kept of one
+TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])  # what is kept of one
 NEVER = -1.0  # time of a target that there has not been
 COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
-
-
-# ---------------------------------------------------------------- where Newton's method starts a step
 ORDER, FITTED = 3, 2  # increments that predict the next one; increments to which the weights are fitted
 SAME_RATE = 1e-9  # relative difference of two rates of a load that are the same
 INDEPENDENT = 1e-12  # of increments: what is less is rounding
+
+
+# ---------------------------------------------------------------- where Newton's method starts a step
 
 
 class LoadStep(NamedTuple):
@@ -421,8 +421,8 @@ class Extrapolated(Staggered):
             self.turnover.extrapolate(time)
         work = self.balanced(time, loads)
         self._found = self.remodeling.target(self.residual)
-        self._begins = (self._newest["share"] < COUNTS) & (self._found.share >= COUNTS)
-        if not self._anywhere(self._begins):
+        self._begins = (self._newest["switch"] < COUNTS) & (self._found.switch >= COUNTS)
+        if not how_many(self.state, self._begins):
             return work
         cells.set(*self._start[:2])
         self._follow(expected.where(self._begins, self._found), time)
@@ -437,7 +437,7 @@ class Extrapolated(Staggered):
         self._duration = time - self.state.time
         self._older[:] = self._newest
         self._older["time"][self._begins] = NEVER  # its step had the target of its end
-        self._newest["direction"], self._newest["share"], self._newest["time"] = *self._found, time
+        self._newest["direction"], self._newest["switch"], self._newest["time"] = *self._found, time
         if self.turnover is not None:
             self.turnover.complete(time)
         return self._power
@@ -453,26 +453,27 @@ class Extrapolated(Staggered):
         """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
         duration = time - self.state.time
         self._power = 0.0
-        if not self._anywhere(target.share != 0.0):
+        if not how_many(self.state, target.switch != 0.0):
             return
         asked = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(asked.dimensions).all(axis=-1)
         if lost.any():
             asked = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
-        points = self._anywhere(lost)
+        points = how_many(self.state, lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
         self._power = self.remodeling.replace(asked, self.state.elastic_gradient(), duration)
 
-    def _anywhere(self, points: Flags) -> int:
-        """How many there are on all ranks."""
-        quadrature = self.state.cells.quadrature
-        return int(self.state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
+
+def how_many(state: State, points: Flags) -> int:
+    """Of all points in one row that are chosen, on all ranks."""
+    quadrature = state.cells.quadrature
+    return int(state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
 
 
 def known(records: Any) -> Target:
     """The target that records of `TARGET` hold; zero where there was none."""
-    return Target(records["direction"], records["share"])
+    return Target(records["direction"], records["switch"])
 
 
 Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]

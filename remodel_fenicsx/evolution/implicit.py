@@ -19,12 +19,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Traits, between
+from remodel_fenicsx.evolution.coupling import Traits, between, how_many
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.assembly import Remembered, over_ranks
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.kernels.tensor import problem_of, tensor_kernels
-from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, StepOfCells
@@ -69,16 +69,10 @@ class ImplicitCells:
     # ------------------------------------------------------------ a step
     def begin(self, time: float, residual: float) -> None:
         """The present state is the start of a step to this time; it was accepted with these out-of-balance forces."""
-        old, given = self.state.cells.point_cells.copy(), self.remodeling.settings.turnover
-        step = StepOfCells(
-            self.remodeling.law,
-            self.remodeling.drive(residual),
-            old,
-            structure_tensor(*old[:2]),
-            self.state.time,
-            time,
-            given.rule if given.is_on else None,
-        )
+        old, drive = self.state.cells.point_cells.copy(), self.remodeling.drive(residual)
+        given = self.remodeling.settings.turnover
+        rule = given.rule if given.is_on else None
+        step = StepOfCells(self.remodeling.law, drive, old, self.state.time, time, rule)
         self._problem = problem_of(self._kernels, at_points(self.tissue, self.quadrature), step)
         self._accepted = self.tensor_of_state()
         self.restart()
@@ -151,7 +145,7 @@ class ImplicitCells:
 
     def complete(self) -> bool:
         """Whether at all points, of all ranks, cells belong to the stress."""
-        return not self._anywhere(~self.solution().converged)
+        return not how_many(self.state, ~self.solution().converged)
 
     def squared_lengths(self) -> Array:
         """r^2 at all points, (elements, points); infinite where there are no cells for these unknowns."""
@@ -160,15 +154,12 @@ class ImplicitCells:
 
     def unsolved(self, locking_length: Array) -> bool:
         """Whether the present unknowns are refused for points, on any rank, that have no solution with r < L."""
-        return self._anywhere(self._refused() & (self.solution().squared_lengths < locking_length.reshape(-1) ** 2))
+        short = self.solution().squared_lengths < locking_length.reshape(-1) ** 2
+        return how_many(self.state, self._refused() & short) > 0
 
     def _refused(self) -> Flags:
         """Points without a solution, after so many iterations that none is expected."""
         return ~self.solution().converged & (self._iterations > BEFORE_REFUSAL)
-
-    def _anywhere(self, points: Flags) -> bool:
-        owned = self.quadrature.owned(points.reshape(self.quadrature.shape))
-        return bool(self.state.comm.allreduce(int(owned.any())))
 
 
 class ImplicitEquilibrium(Equilibrium):

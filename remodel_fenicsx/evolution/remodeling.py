@@ -35,6 +35,10 @@ TYPICAL_SHARE = 1e-2  # of the body's stress: the most that the residual counts 
 WORTH_A_WORD = 0.1
 STRESS_ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
 
+LOOSE_SOLVER = (
+    "solver tolerance: the out-of-balance forces may be stresses of up to %.2g, the stresses of the body are %.2g. "
+    "Stresses up to %.2g do not count as tension; lower solver.relative_tolerance or solver.absolute_tolerance"
+)
 AWAKE = 0.5  # of the speed of remodeling under tension alone
 
 
@@ -168,14 +172,7 @@ class RemodelingPass:
         if unbalanced > max(WORTH_A_WORD * typical, most) and not self._numbers["said"]:
             self._numbers["said"] = 1
             if self.state.comm.rank == 0:
-                log.warning(
-                    "solver tolerance: the out-of-balance forces may be stresses of up to %.2g, the stresses of "
-                    "the body are %.2g. Stresses up to %.2g do not count as tension; lower "
-                    "solver.relative_tolerance or solver.absolute_tolerance",
-                    unbalanced,
-                    typical,
-                    most,
-                )
+                log.warning(LOOSE_SOLVER, unbalanced, typical, most)
         noise = Noise(rounded + min(unbalanced, most), rounding)
         if typical > self._numbers["stress"]:
             self._numbers["stress"], self._numbers["floor"] = typical, floor_above(*noise)
@@ -222,7 +219,7 @@ class RemodelingPass:
         """Of all points in one row: those without tension, or with hardly any beside compression. Cells there stay."""
         drive = self.drive(residual)
         if self.law.target is not None:
-            return np.asarray(self.target(residual).share < AWAKE)
+            return np.asarray(self.target(residual).switch < AWAKE)
         values = np.linalg.eigvalsh(drive.tensor)
         return ~spectral.positive_direction(values, threshold=drive.noise)[1]
 

@@ -58,6 +58,9 @@ Flags = NDArray[np.bool_]
 
 FOLDER = Path(__file__).parent
 NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
+NOT_FINITE = 2  # mark of a point with NaN or infinity
+HEADER = "suitesparse/cholmod.h"
+FIRST = 5  # CHOLMOD's version that has single precision
 
 
 def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
@@ -141,8 +144,6 @@ def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
 
 
 # ---------------------------------------------------------------- what a pass and its limits compute at every point
-
-NOT_FINITE = 2  # mark of a point with NaN or infinity
 
 
 class PointKernels:
@@ -251,9 +252,6 @@ def point_kernels(comm: MPI.Intracomm) -> PointKernels:
 
 
 # ---------------------------------------------------------------- factors in single precision, where CHOLMOD 5 is
-
-HEADER = "suitesparse/cholmod.h"
-FIRST = 5  # CHOLMOD's version that has single precision
 
 
 @functools.cache

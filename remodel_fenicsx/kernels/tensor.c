@@ -301,23 +301,23 @@ static void evaluate(point *p, state *s)
 }
 
 /* 1 - dD/dS dS/dA dA/dD, and dS/dA dA/dD and dS/dC with it. */
-static void equation(point *p, state *s, matrix result, matrix answers, matrix direct)
+static void equation(point *p, state *s, matrix result, matrix through_cells, matrix direct)
 {
     matrix by_cells, by_tensor;
     stress(p, s, &by_cells, (matrix *)direct);
     cells_by_tensor(p, s, by_tensor);
-    product(by_cells, by_tensor, answers);
-    MANDEL(a) MANDEL(b) result[a][b] = (a == b) - by_stress(p, ROW[a], COLUMN[a]) * answers[a][b];
+    product(by_cells, by_tensor, through_cells);
+    MANDEL(a) MANDEL(b) result[a][b] = (a == b) - by_stress(p, ROW[a], COLUMN[a]) * through_cells[a][b];
 }
 
 /* local_problem.LocalProblem._better: a step not longer than D, halved where it leads to r >= L. */
 static void iterate(point *p, state *s)
 {
-    matrix left, answers, direct;
+    matrix left, through_cells, direct;
     vector change;
     tensor step;
     state next;
-    equation(p, s, left, answers, direct);
+    equation(p, s, left, through_cells, direct);
     to_vector(s->missing, change);
     divide(left, change, 1);
     to_tensor(change, step);
@@ -395,16 +395,16 @@ void tangent(int64_t n, const double *F, const double *tensors, const double *ol
         point p;
         state s;
         tensor global;
-        matrix left, answers, direct, right, change;
+        matrix left, through_cells, direct, right, change;
         prepare(&p, n, at, F, old, parameters, floor, solved, kappa_dt, driver, repulsion);
         memcpy(global, tensors + 9 * at, sizeof(tensor));
         rotated(global, p.basis, 0, s.D);
         evaluate(&p, &s);
-        equation(&p, &s, left, answers, direct);
+        equation(&p, &s, left, through_cells, direct);
         drive_by_strain(&p, s.S, right);
         MANDEL(a) MANDEL(b) right[a][b] += by_stress(&p, ROW[a], COLUMN[a]) * direct[a][b];
         divide(left, &right[0][0], 6);
-        product(answers, right, change);
+        product(through_cells, right, change);
         MANDEL(a) MANDEL(b) direct[a][b] += change[a][b];
         by_gradient(&p, s.S, direct, result + 81 * at);
     }

@@ -50,9 +50,9 @@ class TensorKernels:
         n, turned_back = len(F), not drive.driver.material
         if turned_back and drive.frame.tensor is not rotated_back:
             turned_back, given = False, drive.frame.tensor(F, given)
-        direction, share = np.empty((n, 3, 3)), np.empty(n)
-        self.call("target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, share)
-        return Target(direction, share)
+        direction, switch = np.empty((n, 3, 3)), np.empty(n)
+        self.call("target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, switch)
+        return Target(direction, switch)
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
         """`energy.log_sum`."""
@@ -76,13 +76,8 @@ def problem_of(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells)
     """Of n points: in C, where that knows all of its parts."""
     if kernels is None:
         return LocalProblem(tissue, step)
-    parts: dict[str, Any] = {
-        "law": step.law,
-        "driver": step.drive.driver,
-        "chain": tissue.chain,
-        "matrix": tissue.matrix,
-        "repulsion": tissue.repulsion,
-    }
+    parts: dict[str, Any] = {name: getattr(tissue, name) for name in ("chain", "matrix", "repulsion")}
+    parts |= {"law": step.law, "driver": step.drive.driver}
     unknown = [name for name, part in parts.items() if kernels.call.number(getattr(part, "compiled", "")) is None]
     unknown += ["frame"] * step.is_spatial + ["turnover"] * (step.turnover is not None)
     if not unknown:

@@ -12,12 +12,22 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model.cells import by_component, cylindrical_axes, global_axes
 from remodel_fenicsx.model.spectral import principal
 
+Array = NDArray[np.float64]
+Maker = Callable[[], Array]
+
+# name of what is measured: numbers that a row of it may have
+NATURAL_GRADIENT = "natural_gradient"
+GROWTH = "growth"  # J_g
+MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
+MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}  # beside one of SOURCES
+SOURCES = ("structure_tensor", "fibre", "angle")  # one of these is needed
+FULL_OF_VTK = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
+# eigenvalue below zero, over the trace, that may be rounding of files with 7 digits
+FILE_ROUNDING = 1e-6
+
 
 # ---------------------------------------------------------------- local axes of a body
 # What is circumferential, axial and radial at its points, and how deep they lie.
-
-Array = NDArray[np.float64]
-Maker = Callable[[], Array]
 
 
 class LocalAxes:
@@ -147,16 +157,6 @@ AXES: dict[str, Callable[[LocalAxes], Array]] = {
 
 # ---------------------------------------------------------------- unit cells that follow from measured fibres
 # Structure tensors, fibre directions or fibre angles.
-
-# name of what is measured: numbers that a row of it may have
-NATURAL_GRADIENT = "natural_gradient"
-GROWTH = "growth"  # J_g
-MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
-MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}  # beside one of SOURCES
-SOURCES = ("structure_tensor", "fibre", "angle")  # one of these is needed
-FULL_OF_VTK = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
-# eigenvalue below zero, over the trace, that may be rounding of files with 7 digits
-FILE_ROUNDING = 1e-6
 
 
 def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:

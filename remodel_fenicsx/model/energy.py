@@ -28,6 +28,9 @@ from remodel_fenicsx.model.tensors import component, det, is_array, ln, sqrt, sq
 ufl = Late("ufl")
 Array = NDArray[np.float64]
 Term = Callable[..., Any]  # of F or J, lambda and mu; those of a matrix with parameters of its own take them too
+TURNED_OVER = ("content", "natural_length")  # what turnover changes at every point
+PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")  # of every tissue
+LOCAL_PROBLEM = "remodel_fenicsx.model.local_problem"  # which most runs do not import
 
 
 class Matrix:
@@ -316,7 +319,6 @@ class Repulsion(WithParameters):
     functions = ("sum", "derivatives", "terms")
 
 
-LOCAL_PROBLEM = "remodel_fenicsx.model.local_problem"  # which most runs do not import
 REPULSIONS: dict[str, Repulsion] = {
     "axes": Repulsion(axes_sum, terms=f"{LOCAL_PROBLEM}.axes_terms", sees_axes=True),
     "log": Repulsion(log_sum, log_derivatives, terms=f"{LOCAL_PROBLEM}.log_terms", compiled="LOG"),
@@ -367,10 +369,6 @@ class Stresses(NamedTuple):
         P = ufl.dot(F, S)
         first, second, cauchy = self
         return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F))
-
-
-TURNED_OVER = ("content", "natural_length")  # what turnover changes at every point
-PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")  # of every tissue
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,13 @@ from remodel_fenicsx.model.energy import LOCAL_PROBLEM, Tissue
 from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
+RankedFunction = Callable[[Array, Array, Array, Any, float, float], Array]
+Weights = Sequence[float]
+
+STRETCH_ITERATIONS = 60  # of Newton's method for one number; halved brackets alone reach a last digit from any start
+COMPLEX_STEP = 1e-30  # its square vanishes beside 1: derivatives are exact to rounding
+LOCKING_MARGIN = 1e-9  # of ln lambda_e: nearer to the locking stretch nothing is looked for
+STEEPNESS_DIFFERENCE = 1e-6  # of ln lambda_e, for the derivative of a, which only a tangent needs
 
 
 class Drive(NamedTuple):
@@ -111,9 +118,6 @@ def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
     before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
     squared, axes = spectral.continued(before + np.reshape(factor, (-1, 1, 1)) * (after - before), new.axes)
     return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
-
-
-RankedFunction = Callable[[Array, Array, Array, Any, float, float], Array]
 
 
 @dataclass(frozen=True)
@@ -375,7 +379,7 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
     found = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
         return found
-    return found._replace(share=found.share * tensor_law.awake(drive.tensor, drive.least_tension))
+    return found._replace(switch=found.switch * tensor_law.awake(drive.tensor, drive.least_tension))
 
 
 def follow_tensor(
@@ -420,9 +424,6 @@ LAWS: dict[str, Law] = {
 # each driving tensor to material space. Remodeling takes days and a cycle a second, so that cells see the mean of
 # many cycles.
 
-Drives = Sequence[Drive]
-Weights = Sequence[float]
-
 
 def material_tensor(drive: Drive) -> Array:
     """The driving tensor in material space, (n, 3, 3)."""
@@ -431,7 +432,7 @@ def material_tensor(drive: Drive) -> Array:
     return drive.frame.tensor(drive.deformation_gradient, drive.tensor)
 
 
-def mean_tensor(drives: Drives, weights: Weights) -> Drive:
+def mean_tensor(drives: Sequence[Drive], weights: Weights) -> Drive:
     """The first state's drive with the weighted mean of all driving tensors, and of what may be an error in them."""
     tensor = _weighted([material_tensor(drive) for drive in drives], weights)
     return _with(
@@ -442,7 +443,7 @@ def mean_tensor(drives: Drives, weights: Weights) -> Drive:
     )
 
 
-def largest_tension(drives: Drives, weights: Weights) -> Drive:
+def largest_tension(drives: Sequence[Drive], weights: Weights) -> Drive:
     """At each point the driving tensor of the state whose largest principal value is the largest one."""
     tensors = np.array([material_tensor(drive) for drive in drives])
     chosen = np.linalg.eigvalsh(tensors)[..., -1].argmax(axis=0)
@@ -456,9 +457,9 @@ def largest_tension(drives: Drives, weights: Weights) -> Drive:
 
 def mean_target(targets: Sequence[Target], weights: Weights) -> Target:
     """The weighted mean of sE: what acts on A is linear in it (`Target.towards`)."""
-    pulled = _weighted([target.share[:, None, None] * target.direction for target in targets], weights)
-    share = np.einsum("nii->n", pulled)
-    return Target(pulled / np.where(share > 0.0, share, 1.0)[:, None, None], share)
+    pulled = _weighted([target.switch[:, None, None] * target.direction for target in targets], weights)
+    switch = np.einsum("nii->n", pulled)
+    return Target(pulled / np.where(switch > 0.0, switch, 1.0)[:, None, None], switch)
 
 
 def _with(drive: Drive, tensor: Array, noise: Any, rounding: Any) -> Drive:
@@ -475,7 +476,7 @@ class Mean:
     """What becomes of several drives."""
 
     meaning: str
-    drive: Callable[[Drives, Weights], Drive] = mean_tensor
+    drive: Callable[[Sequence[Drive], Weights], Drive] = mean_tensor
     of_targets: bool = False
 
 
@@ -497,11 +498,6 @@ MEANS_OF_CASES: dict[str, Mean] = {
 # The rates `tension` are those of version 0.3.0: with tau(lambda) = g(lambda r0) lambda, proportional to its force,
 #     dm/dt / m = k/T (tau(lambda_e)/tau(lambda_h) - 1), limited to k/T,
 #     drho/dt / rho = (1/T + (dm/dt / m)^+) (lambda_e/lambda_h - 1).
-
-STRETCH_ITERATIONS = 60  # of Newton's method for one number; halved brackets alone reach a last digit from any start
-COMPLEX_STEP = 1e-30  # its square vanishes beside 1: derivatives are exact to rounding
-LOCKING_MARGIN = 1e-9  # of ln lambda_e: nearer to the locking stretch nothing is looked for
-STEEPNESS_DIFFERENCE = 1e-6  # of ln lambda_e, for the derivative of a, which only a tangent needs
 
 
 class TurnoverRates(NamedTuple):

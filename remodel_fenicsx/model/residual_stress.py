@@ -14,12 +14,25 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import COMPLEX_STEP
 
+Array = NDArray[np.float64]
+
+DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
+MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls of 1 to 7 and thicker have some
+MOST_POLYNOMIALS = 8  # of one layer
+LARGEST_TURN = 0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too; half of it
+ITERATIONS = 30
+CLOSED = 1e-9  # of the residual over lambda + 2 mu; the differences of the energy are good to about 1e-11
+STRETCH_DIFFERENCE = 1e-3  # of a logarithm in the five-point rules: their error is of fourth order
+UNSTRETCHED = (1.0, 1.0, 1.0)
+MODULI = ("lame_lambda", "lame_mu", "network_modulus")
+PARTS_OF_A_LAYER, CUT_DEGREE = 6, 12
+"""Polynomials of rho(R) in a layer, and their degree. Angles of remodeled walls, whose cells have fronts, are good to
+0.3 degrees; one of degree 32 is off by 1.3 in a thick wall that has grown, and one of 64 ends at rounding."""
+
 
 # ---------------------------------------------------------------- functions of the radius on panels
 # Values at Chebyshev points, with derivative and integral.
 # A panel is a layer or a part of one: within it a function is smooth, from one to the next its derivative may jump.
-
-Array = NDArray[np.float64]
 
 
 class Panels:
@@ -75,15 +88,6 @@ class Panels:
 #     G = diag(k r/R, g_z, dr/dR) P,    k = 360/(360 - opening angle),
 # where R(r) is the sector's radius of what lies at r in the ring, and P the prestretch of the layer. R and g_z are
 # such that the ring is in equilibrium: as the unloaded tube without pressure and without axial force.
-
-DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
-MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls of 1 to 7 and thicker have some
-MOST_POLYNOMIALS = 8  # of one layer
-LARGEST_TURN = 0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too; half of it
-ITERATIONS = 30
-CLOSED = 1e-9  # of the residual over lambda + 2 mu; the differences of the energy are good to about 1e-11
-STRETCH_DIFFERENCE = 1e-3  # of a logarithm in the five-point rules: their error is of fourth order
-UNSTRETCHED = (1.0, 1.0, 1.0)
 
 
 class Layer(NamedTuple):
@@ -267,11 +271,6 @@ def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | Non
 # cylindrical axes
 #     F = diag(k rho/R, e, drho/dR),    F_e = F G,
 # without pressure, axial force and bending moment; its opening angle is 360 (1 - k). The cells stay.
-
-MODULI = ("lame_lambda", "lame_mu", "network_modulus")
-PARTS_OF_A_LAYER, CUT_DEGREE = 6, 12
-"""Polynomials of rho(R) in a layer, and their degree. Angles of remodeled walls, whose cells have fronts, are good to
-0.3 degrees; one of degree 32 is off by 1.3 in a thick wall that has grown, and one of 64 ends at rounding."""
 
 
 class Cut(NamedTuple):

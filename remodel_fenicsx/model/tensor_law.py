@@ -34,26 +34,27 @@ def floor_above(noise: Any, rounding: Any) -> Any:
 
 
 class Target(NamedTuple):
-    """What A tends to, and how much of it."""
+    """What A tends to, E, and how much of kappa acts, s."""
 
     direction: Array
-    share: Array
+    switch: Array
 
     def towards(self, other: Target, weight: Array | float) -> Target:
         """sE + weight (s'E' - sE), of another target s'E'; weights below 0 or above 1 extrapolate."""
         # What acts on A is kappa (r0^2 sE - sA): it is sE that changes linearly, and s is its trace. So a target that
         # does not count takes no part, and E has trace one. An s below 0 is 0, one above 1 is 1.
-        ends = (self.share[:, None, None] * self.direction, other.share[:, None, None] * other.direction)
+        ends = (self.switch[:, None, None] * self.direction, other.switch[:, None, None] * other.direction)
         changed = ends[0] + np.reshape(weight, (-1, 1, 1)) * (ends[1] - ends[0])
-        share = np.einsum("nii->n", changed)
-        some = share > 0.0
-        direction = changed / np.where(some, share, 1.0)[:, None, None]
-        return Target(direction, np.where(some, np.minimum(share, 1.0), 0.0))
+        switch = np.einsum("nii->n", changed)
+        some = switch > 0.0
+        direction = changed / np.where(some, switch, 1.0)[:, None, None]
+        return Target(direction, np.where(some, np.minimum(switch, 1.0), 0.0))
 
     def where(self, chosen: NDArray[np.bool_], other: Target) -> Target:
         """Itself, and at the chosen points another target."""
         return Target(
-            np.where(chosen[:, None, None], other.direction, self.direction), np.where(chosen, other.share, self.share)
+            np.where(chosen[:, None, None], other.direction, self.direction),
+            np.where(chosen, other.switch, self.switch),
         )
 
 
@@ -118,13 +119,13 @@ def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Arra
     total = positive + against
     slope = 2 * (tension * against[:, None] - COMPRESSION * positive[:, None] * compression)
     slope /= (np.where(total > 0, total, 1.0) ** 2 * unit)[:, None]
-    share: Array = np.einsum("nab,nb->na", to_axes, tensors.on_diagonal(slope))
-    return direction, share
+    by_tensor: Array = np.einsum("nab,nb->na", to_axes, tensors.on_diagonal(slope))
+    return direction, by_tensor
 
 
 def follow(structure: Array, towards: Target, end_to_end_length: Array | float, kappa_dt: Array | float) -> Array:
     """A after a time in which the target does not change: exact."""
     squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
-    weight = -np.expm1(-kappa_dt * towards.share)[:, None, None]
+    weight = -np.expm1(-kappa_dt * towards.switch)[:, None, None]
     change: Array = weight * (squared * towards.direction - structure)
     return structure + change

@@ -26,6 +26,11 @@ from numpy.typing import NDArray
 from remodel_fenicsx._lazy import Late
 
 ufl = Late("ufl")
+Array = NDArray[np.float64]
+
+CLOSE_EIGENVALUES = 1e-3
+"""Relative distance of two or three eigenvalues below which a series stands for a quotient of differences: the quotient
+loses eps / CLOSE, the series CLOSE^5."""
 
 
 # ---------------------------------------------------------------- the few tensor operations of the model, on UFL
@@ -98,8 +103,6 @@ def component(vector: Any, index: int) -> Any:
     """Component of a UFL vector, or of vectors in the last dimension of an array."""
     return vector[..., index] if is_array(vector) else vector[index]
 
-
-Array = NDArray[np.float64]
 
 # ---------------------------------------------------------------- Mandel components
 
@@ -196,11 +199,6 @@ def logarithm(tensors: Array) -> Array:
     """ln C, (n, 3, 3)."""
     values, vectors = eigen(tensors)
     return (vectors * np.log(values)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-
-
-CLOSE_EIGENVALUES = 1e-3
-"""Relative distance of two or three eigenvalues below which a series stands for a quotient of differences: the quotient
-loses eps / CLOSE, the series CLOSE^5."""
 
 
 def first_divided_difference(a: Array, b: Array) -> Array:

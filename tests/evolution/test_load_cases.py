@@ -234,7 +234,7 @@ def test_the_mean_of_targets_has_their_shares() -> None:
     nothing = Target(np.zeros((1, 3, 3)), np.zeros(1))
     mean = mean_target([pulled, nothing], (0.25, 0.75))
     np.testing.assert_allclose(mean.direction, pulled.direction, atol=1e-15)
-    assert mean.share == pytest.approx(0.25 * pulled.share)
+    assert mean.switch == pytest.approx(0.25 * pulled.switch)
 
 
 # ---------------------------------------------------------------- runs

@@ -56,6 +56,6 @@ def test_the_target_of_any_exponent() -> None:
         expected = (axes * (powers / powers.sum())) @ axes.T
         found = tensor_law.target(tensor[None], 0.0, exponent)
         assert np.abs(found.direction[0] - expected).max() < 1e-12
-        assert found.share == pytest.approx(tensor_law.target(tensor[None], 0.0).share)
+        assert found.switch == pytest.approx(tensor_law.target(tensor[None], 0.0).switch)
     zero = tensor_law.target(-np.eye(3)[None], 0.0, 1.0)
-    assert not zero.direction.any() and np.isfinite(zero.share).all()
+    assert not zero.direction.any() and np.isfinite(zero.switch).all()

@@ -208,10 +208,10 @@ def test_the_target_of_a_first_step_is_not_extrapolated() -> None:
     simulation = short_tube(2.0, coupling="extrapolated", ramp=[[1.0, 0.0], [2.0, 0.04]])
     run(simulation)
     coupling: Any = simulation.stepper.coupling
-    share = coupling._newest["share"]
+    share = coupling._newest["switch"]
     some = (share > 0.01) & (share < 0.95)
     assert some.any()
-    np.testing.assert_allclose(coupling._extrapolated(3.0).share[some], share[some], atol=1e-13)
+    np.testing.assert_allclose(coupling._extrapolated(3.0).switch[some], share[some], atol=1e-13)
 
 
 def test_late_tension_is_the_same_in_a_run_that_goes_on(tmp_path: Path) -> None:
@@ -232,13 +232,13 @@ def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts
     dimensions[0], axes[0] = [0.0, 0.0, 1.0], np.eye(3)
     cells.set(dimensions, axes)
     for targets, along in ((coupling._newest, [0.0, 0.0, 1.0]), (coupling._older, [0.0, 1.0, 0.0])):
-        targets["direction"][:points], targets["share"][:points] = np.diag(along), 1.0
+        targets["direction"][:points], targets["switch"][:points] = np.diag(along), 1.0
     before, target = cells.structure_tensor(), coupling._extrapolated(state.time + 1.0)
     with caplog.at_level("INFO"):
         coupling._follow(target, state.time + 1.0)
     assert f"time 5: {points} points follow the last stress" in caplog.text
     A = cells.structure_tensor()
     np.testing.assert_allclose(A[0], np.broadcast_to(np.diag([0.0, 0.0, 1.0]), A[0].shape), atol=1e-14)
-    share = -np.expm1(-KAPPA * target.share)[:, None, None]
+    share = -np.expm1(-KAPPA * target.switch)[:, None, None]
     expected = before.reshape(-1, 3, 3) + share * (target.direction - before.reshape(-1, 3, 3))
     np.testing.assert_allclose(A.reshape(-1, 3, 3)[points:], expected[points:], atol=1e-13)

@@ -61,7 +61,7 @@ def test_the_target(kernels: TensorKernels, driver: str, frame: str) -> None:
         asked = drive._replace(noise=threshold, rounding=rounding)
         expected, found = tensor_target(asked), kernels.target(asked)
         np.testing.assert_allclose(found.direction, expected.direction, atol=1e-12)
-        np.testing.assert_allclose(found.share, expected.share, atol=1e-12)
+        np.testing.assert_allclose(found.switch, expected.switch, atol=1e-12)
 
 
 def compiled_twin(kernels: TensorKernels, some: LocalProblem) -> CompiledProblem:

@@ -140,7 +140,6 @@ def in_unit(some: LocalProblem, unit: float) -> LocalProblem:
                 end_to_end_length=unit * drive.end_to_end_length,
             ),
             cells=UnitCell(unit * step.cells.dimensions, step.cells.axes),
-            structure=unit**2 * step.structure,
         ),
     )
 

@@ -50,9 +50,7 @@ def points(
     cells = UnitCell(lengths, Rotation.random(number, random_state=rng).as_matrix())
     nothing = np.zeros((number, 3, 3))
     drive = Drive(nothing, nothing, DRIVERS[driver], FRAMES[frame], 1e-13, lengths.copy(), np.ones(number), 0.025)
-    step = local_problem.StepOfCells(
-        LAWS[law], drive._replace(rounding=1e-13), cells, structure_tensor(*cells[:2]), 8.0, 12.0
-    )
+    step = local_problem.StepOfCells(LAWS[law], drive._replace(rounding=1e-13), cells, 8.0, 12.0)
     step = step._replace(drive=step.drive._replace(**changes))
     return local_problem.LocalProblem(tissue.map(lambda name, value: np.full(number, value)), step)
 

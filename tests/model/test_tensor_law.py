@@ -169,14 +169,14 @@ def test_the_target_is_that_of_eq_9_to_11_in_the_principal_axes() -> None:
     found = target((R * values @ R.T)[None], 1e-14)
     expected = np.array([9.0, 1.0, 0.0]) / 10
     np.testing.assert_allclose(R.T @ found.direction[0] @ R, np.diag(expected), atol=1e-14)
-    assert found.share[0] == pytest.approx(10 / (10 + 0.01 * 4), rel=1e-12)
+    assert found.switch[0] == pytest.approx(10 / (10 + 0.01 * 4), rel=1e-12)
 
 
 def test_what_is_out_of_balance_counts_once() -> None:
     """The rounding is widened for Newton's method; a residual, which may be large, is not: half there, and no more."""
     tension = np.diag([1e-3, 0.0, 0.0])[None]
-    assert target(tension, floor_above(1e-3, 0.0)).share[0] == pytest.approx(0.5)
-    assert target(tension, floor_above(0.0, 1e-3 / ABOVE_ROUNDING)).share[0] == pytest.approx(0.5)
+    assert target(tension, floor_above(1e-3, 0.0)).switch[0] == pytest.approx(0.5)
+    assert target(tension, floor_above(0.0, 1e-3 / ABOVE_ROUNDING)).switch[0] == pytest.approx(0.5)
 
 
 def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is_one() -> None:
@@ -188,19 +188,19 @@ def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is
     )
     middle = first.towards(second, 0.5)
     np.testing.assert_allclose(middle.direction[0], (ends[0] + 0.6 * ends[1]) / 1.6, atol=1e-14)
-    assert middle.share[0] == pytest.approx(0.8, rel=1e-13)
+    assert middle.switch[0] == pytest.approx(0.8, rel=1e-13)
     for weight, share in ((1.5, 1.0), (0.5, 0.5), (-0.5, 0.0), (0.0, 0.0)):
         found = none.towards(first, weight)
-        assert found.share[0] == pytest.approx(share, abs=1e-14)
-        np.testing.assert_allclose(found.share[0] * (found.direction[0] - ends[0]), 0.0, atol=1e-14)
+        assert found.switch[0] == pytest.approx(share, abs=1e-14)
+        np.testing.assert_allclose(found.switch[0] * (found.direction[0] - ends[0]), 0.0, atol=1e-14)
 
 
 def test_the_switch() -> None:
     """One under tension, nothing under compression or noise; no jump between."""
     floor = floor_above(0.0, 1e-14)
     tensors = np.array([np.diag(v) for v in ([1, 0, 0], [-1, -1, -1], [1e-14, -1, 0], [1e-15, 0, 0], [0.0, 0, 0])])
-    np.testing.assert_allclose(target(tensors, floor).share, [1, 0, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(target(tensors, floor).switch, [1, 0, 0, 0, 0], atol=1e-6)
     sizes = np.logspace(-13, 0, 400)
-    shares = target(np.array([np.diag([size, -1.0, -1.0]) for size in sizes]), floor).share
+    shares = target(np.array([np.diag([size, -1.0, -1.0]) for size in sizes]), floor).switch
     assert np.all(np.diff(shares) > 0) and np.diff(shares).max() < 0.04
-    assert np.isfinite(target(np.diag([1e300, -1e300, 0])[None], floor).share).all()
+    assert np.isfinite(target(np.diag([1e300, -1e300, 0])[None], floor).switch).all()
