@@ -119,8 +119,6 @@ class Loading:
             return
         tolerance = 1e-9 * self.domain.size
         subspace = self.kinematics.subspace(self.space, component)
-        if subspace is None:
-            return
         collapsed, _ = subspace.collapse()
         dofs = dolfinx.fem.locate_dofs_geometrical(
             (subspace, collapsed), lambda x: np.linalg.norm(x - np.reshape(point, (3, 1)), axis=0) < tolerance

@@ -229,7 +229,7 @@ class FileBody(WithRegions, FromFile):
     @property
     def number_of_elements(self) -> int:  # type: ignore[override]
         """Of the file."""
-        return len(self._with_regions(self._read()).cells)
+        return len(self._mesh().cells)
 
     def check_size(self, mesh: Mesh) -> None:
         """Edges are halved, as often as asked for."""
@@ -247,7 +247,7 @@ class FileBody(WithRegions, FromFile):
 
     def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, mesh_faces.Boundary, dict[str, int]]:
         """The mesh, its boundary, and its regions' numbers by name; on rank 0."""
-        file = self._with_regions(self._read())
+        file = self._mesh()
         scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
         file = replace(file, points=scale * file.points)
         extent = float(np.ptp(file.points, axis=0).max())
@@ -269,13 +269,12 @@ class FileBody(WithRegions, FromFile):
 
     def _refined(self, file: MeshFile, mesh: Mesh) -> tuple[MeshFile, mesh_faces.Boundary]:
         """With smaller elements, or those of degree 2."""
+        if file.degree != 1:
+            asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}: {self._name}"
+            raise SceneError(f"{asked} has elements of degree {file.degree}: they are taken as they are")
         if (number := len(file.cells) * mesh.refinement**3) > LARGEST_MESH:
             raise SceneError(f"mesh.refinement = {mesh.refinement}: {number} elements; at most {LARGEST_MESH} are made")
-        try:
-            file = refined(file, mesh.refinement, mesh.degree)
-        except UnreadableFile as error:
-            asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}"
-            raise SceneError(f"{asked}: {self._name} {error}") from None
+        file = refined(file, mesh.refinement, mesh.degree)
         words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
         return file, mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
@@ -329,8 +328,9 @@ class FileBody(WithRegions, FromFile):
         names |= {self._volumes(file, name, entries[:1])[0]: name for name, entries in self.regions.items()}
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
 
-    def _with_regions(self, file: MeshFile) -> MeshFile:
-        """Volumes of one region under one number, without others that have the same elements."""
+    def _mesh(self) -> MeshFile:
+        """That of the file: volumes of one region under one number, without others that have the same elements."""
+        file = self._read()
         if not self.regions:
             return file
         groups, taken = file.cell_groups.copy(), set()
@@ -363,7 +363,7 @@ class FileBody(WithRegions, FromFile):
 
     def fills(self, regions: Collection[str]) -> bool:
         """Whether they are all volumes of the file."""
-        return bool(regions) and set(self._regions(self._with_regions(self._read()))) <= set(regions)
+        return bool(regions) and set(self._regions(self._mesh())) <= set(regions)
 
     def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
         """All but those that are free."""
@@ -591,10 +591,6 @@ SPLIT: dict[str, dict[int, tuple[Any, ...]]] = {
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     """A mesh of plane elements, split into halves along each edge, as often as asked for."""
-    if (refinement, degree) == (1, file.degree):
-        return file
-    if file.degree != 1:
-        raise UnreadableFile(f"has elements of degree {file.degree}: they are taken as they are")
     with gmsh_model("file") as gmsh:
         mesh, parts = gmsh.model.mesh, {3: (file.cells, file.cell_groups), 2: (file.facets, file.facet_groups)}
         entities = {

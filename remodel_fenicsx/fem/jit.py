@@ -82,11 +82,8 @@ def cache_folder() -> Path:
     # Below XDG_CACHE_HOME or ~/.cache; where that cannot be written or is another user's, in a private temporary
     # folder, with a warning.
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        processor = next((line for line in lines if line.startswith("flags")), "")
-    except OSError:
-        processor = platform.processor()
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    processor = next((line for line in lines if line.startswith(("flags", "Features"))), "")  # the latter of ARM
     name = f"remodel-{hashlib.sha256((platform.machine() + processor).encode()).hexdigest()[:8]}"
     folder = base / "fenics" / name
     with suppress(OSError):

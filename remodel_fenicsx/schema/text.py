@@ -50,15 +50,13 @@ def read_toml(path: Path) -> dict[str, Any]:
             raise SceneError(f"{path}: line {number}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
     try:
         values = tomllib.loads(text)
-        if _depth_exceeds(values, MOST_PARTS):
-            raise SceneError(f"{path}: tables or lists in more than {MOST_PARTS} others; a scene has up to 4")
-        return values
-    except SceneError:
-        raise
     except (ValueError, RecursionError) as error:
         place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
         where = f"line {place[2] or len(text.splitlines())}: " if place else ""
         raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}") from None
+    if _depth_exceeds(values, MOST_PARTS):
+        raise SceneError(f"{path}: tables or lists in more than {MOST_PARTS} others; a scene has up to 4")
+    return values
 
 
 def _depth_exceeds(value: Any, most: int) -> bool:
