@@ -387,10 +387,10 @@ def _in_words(scene: Scene, found: Scene) -> str:
     return f"{len(after)} nodes, moved by {np.linalg.norm(after - before, axis=1).max():.6g} at most"
 
 
-def write_axes(scene: Scene, path: Path, comm: MPI.Intracomm = MPI.COMM_WORLD) -> str:
+def write_axes(scene: Scene, path: Path) -> str:
     """Write local axes, depth, station, thickness, and where the axes are undefined, by element. Collective."""
     scene = with_choices(scene)
-    domain, shape = checked_domain(mesh_of(scene, comm), scene), scene.geometry
+    domain, shape = checked_domain(mesh_of(scene, MPI.COMM_WORLD), scene), scene.geometry
     mesh = domain.mesh
     weight = KINEMATICS[scene.model.kinematics].on(mesh, shape).weight(mesh)
     quadrature = Quadrature(mesh, scene.mesh.degree, weight)

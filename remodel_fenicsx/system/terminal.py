@@ -149,10 +149,10 @@ def _is_terminal() -> bool:
     return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
-def announce(line: str, end: str = "\n") -> None:
+def announce(line: str) -> None:
     """Print a line on stderr; if whoever read it is gone (a closed pipe), that is no reason to lose a long run."""
     with suppress(OSError):
-        print(line, end=end, file=sys.stderr, flush=True)
+        print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager
