@@ -34,12 +34,11 @@ TYPICAL_SHARE = 1e-2  # of the body's stress: the most that the residual counts 
 # radii are within 0.1 %, at 0.4 they are 2 % off
 WORTH_A_WORD = 0.1
 STRESS_ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
-
+AWAKE = 0.5  # of the speed of remodeling under tension alone
 LOOSE_SOLVER = (
     "solver tolerance: the out-of-balance forces may be stresses of up to %.2g, the stresses of the body are %.2g. "
     "Stresses up to %.2g do not count as tension; lower solver.relative_tolerance or solver.absolute_tolerance"
 )
-AWAKE = 0.5  # of the speed of remodeling under tension alone
 
 
 class Noise(NamedTuple):
