@@ -17,7 +17,6 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from scipy.optimize import NoConvergence, broyden1
 from ufl.algorithms.map_integrands import map_integrands
 
 from remodel_fenicsx.body.domain import dof_of_node
@@ -158,6 +157,8 @@ PASSIVE: dict[str, Any] = {
 
 def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
     """By Broyden's method, from inverse elastostatics."""
+    from scipy.optimize import NoConvergence, broyden1  # which no run needs
+
     shape: Any = scene.geometry
     inside = [radius for radius in _outer_radii(scene).values() if radius < shape.outer_radius]
     given = np.array([shape.inner_radius, *inside, shape.outer_radius, shape.length])

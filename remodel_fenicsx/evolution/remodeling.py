@@ -173,7 +173,7 @@ class RemodelingPass:
             if self.state.comm.rank == 0:
                 log.warning(LOOSE_SOLVER, unbalanced, typical, most)
         noise = Noise(rounded + min(unbalanced, most), rounding)
-        if typical > self._numbers["stress"]:
+        if self.law.target is not None and typical > self._numbers["stress"]:
             self._numbers["stress"], self._numbers["floor"] = typical, floor_above(*noise)
         return noise
 

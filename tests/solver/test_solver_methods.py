@@ -14,7 +14,7 @@ from remodel_fenicsx import Simulation
 from remodel_fenicsx.fem import solver_methods as methods
 from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.solver import linear, newton
+from remodel_fenicsx.solver import linear
 from remodel_fenicsx.solver.newton import Limits
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants
 from remodel_fenicsx.watch.warnings import VolumeResponse
