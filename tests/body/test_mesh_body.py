@@ -184,6 +184,21 @@ def test_a_run_goes_on_with_its_copy_on_other_ranks(tmp_path: Path) -> None:
     assert "tube.msh': has changed" in refused.stderr
 
 
+def test_multigrid_of_degree_two_goes_on_with_one_two_and_four_ranks(tmp_path: Path) -> None:
+    (tmp_path / "mesh").mkdir()
+    write_tube(tmp_path / "mesh" / "tube.msh", "tetrahedron", 2)
+    scene = tmp_path / "vessel.toml"
+    scene.write_text(RUN.replace('method = "direct"', 'method = "iterative"'))
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert run("run", str(scene), "-o", str(whole), "--no-report").returncode == 0
+    until = ["--set", "time.end=2", "--no-report"]
+    assert run("run", str(scene), "-o", str(parts), *until, ranks=4).returncode == 0
+    for ranks, end in ((2, 3), (1, 4)):
+        done = run("run", "--resume", str(parts), "--set", f"time.end={end}", "--no-report", ranks=ranks)
+        assert done.returncode == 0, done.stderr
+    np.testing.assert_allclose(_history(parts), _history(whole), rtol=1e-8, atol=1e-10)
+
+
 # ---------------------------------------------------------------- pressures on other faces
 
 
