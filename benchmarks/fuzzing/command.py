@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from random import Random
@@ -109,10 +110,7 @@ def _one(seed: int, limit: float) -> int:
         for key, value in values.items() if scene.get(table, {}).get(key) != value
     }  # fmt: skip
     print("\n".join(f"#     {key} = {value}" for key, value in changed.items()))
-    runner = running.Runner(limit)
-    try:
+    with closing(running.Runner(limit)) as runner:
         record = evaluated(seed, runner)
-    finally:
-        runner.close()
     print(said(record))
     return int(record["outcome"] == "wrong")
