@@ -56,13 +56,13 @@ def rigid_motions(space: Any, matrix: Any) -> Any:
 class DegreeOne:
     """Multigrid for elements of degree 2 whose next level is degree 1: all others then cost little. Collective."""
 
-    def __init__(self, pc: Any, space: Any, matrix: Any):
+    def __init__(self, pc: Any, space: Any, matrix: Any, elastic: bool):
         below = lagrange(space.mesh, 1, tuple(space.value_shape)).function_space
         self._prolongation = dolfinx.fem.petsc.interpolation_matrix(below, space)
         self._prolongation.assemble()
         self._coarse = matrix.PtAP(self._prolongation)
         self._coarse.setBlockSize(below.dofmap.bs)
-        if below.dofmap.bs == 3:
+        if elastic:
             self._coarse.setNearNullSpace(rigid_motions(below, self._coarse))
         self._options = ProblemOptions(multigrid_options(), {})
         pc.setType("mg")
@@ -125,7 +125,7 @@ class Positive:
         solver.getPC().setType("gamg" if multigrid else "jacobi")
         levels = None
         if multigrid and self.space.ufl_element().degree > 1:
-            levels = DegreeOne(solver.getPC(), self.space, matrix)
+            levels = DegreeOne(solver.getPC(), self.space, matrix, elastic=False)
         solver.setInitialGuessNonzero(True)
         solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
         solver.solve(load, answer)
