@@ -22,7 +22,7 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Traits, between, how_many
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.assembly import Remembered, over_ranks
-from remodel_fenicsx.fem.solver_methods import AUTO
+from remodel_fenicsx.fem.solver_methods import LAGGED
 from remodel_fenicsx.kernels.tensor import problem_of, tensor_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
@@ -207,9 +207,10 @@ def newton_of_still_cells(equilibrium: Equilibrium, settings: Solver) -> Guarded
 class ImplicitNewton(GuardedNewton):
     """Newton's method for unknowns that their cells follow."""
 
+    methods = {LAGGED: "direct"}  # tangents are unsymmetric, and iterations dear: nothing is gained by old factors
+
     def __init__(self, equilibrium: ImplicitEquilibrium, still: Equilibrium, settings: Solver):
-        # steps are far more nonlinear, and tangents unsymmetric: nothing is gained by old factors
-        super().__init__(equilibrium, settings, robust=settings.method == AUTO)
+        super().__init__(equilibrium, settings)
         self.cells, self.state, self.still = equilibrium.cells, equilibrium.state, still
 
     def solve(self, origin: Array | None = None) -> Solution:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -239,6 +239,8 @@ def failure_text(reason: int, iterations: int, extension: Extension) -> str:
 class GuardedNewton:
     """Solves an equilibrium from the present unknowns; use `close` when it is needed no more."""
 
+    methods: Mapping[str, str] = {}  # in place of those that `auto` chooses
+
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
         self.equilibrium, self.settings, self._robust = equilibrium, settings, robust
         self.unknown = equilibrium.state.unknown
@@ -255,7 +257,8 @@ class GuardedNewton:
         """PETSc's objects of the method, which a body has for all of its steps."""
         equilibrium, settings, kinematics = self.equilibrium, self.settings, self.equilibrium.state.kinematics
         unknowns, ranks, narrow = self._x.getSize(), equilibrium.comm.size, not kinematics.three_dimensional
-        self.method = method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
+        method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
+        self.method = method = method if method == settings.method else self.methods.get(method, method)
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
