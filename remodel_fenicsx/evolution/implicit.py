@@ -210,7 +210,7 @@ class ImplicitNewton(GuardedNewton):
     methods = {LAGGED: "direct"}  # tangents are unsymmetric, and iterations dear: nothing is gained by old factors
 
     def __init__(self, equilibrium: ImplicitEquilibrium, still: Equilibrium, settings: Solver):
-        super().__init__(equilibrium, settings)
+        super().__init__(equilibrium, settings, robust=True)  # a named `lagged` too: an old factor leads astray
         self.cells, self.state, self.still = equilibrium.cells, equilibrium.state, still
 
     def solve(self, origin: Array | None = None) -> Solution:
