@@ -122,8 +122,8 @@ class Simulation:
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Solve and remodel step by step, from where the state is; what is yielded has been accepted.
 
-        The state seen at a yield is one pass ahead of the row: the row and the fields belong to the solved state,
-        before the remodeling pass (docs/theory.md, Couplings).
+        The row and the fields belong to the solved state. With the couplings "staggered" and "relaxed" the cells seen
+        at a yield are one pass ahead of them (docs/theory.md, Couplings).
 
         Parameters
         ----------

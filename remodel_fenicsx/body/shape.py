@@ -190,7 +190,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "remodeling_power",
             "stress length^3 / time",
-            "energy per time that the pass after this row releases (docs/theory.md, Power of remodeling)",
+            "energy per time that the pass of this step releases (docs/theory.md, Power of remodeling)",
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),

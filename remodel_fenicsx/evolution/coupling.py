@@ -133,12 +133,17 @@ class Traits(NamedTuple):
 class Coupling(Protocol):
     """One step in two halves, inside the stepper's transaction. What is between them is the step's row.
 
+    Cells are changed by `RemodelingPass.apply` or `replace`, which know the power. What goes on from step to step is
+    remembered in the state (`State.remember`, `state.Numbers`). Whoever takes turnover tells it where a step is:
+    `lag`, `extrapolate` or `begin`, then `settle` or `take`, at last `complete`. Further load cases are solved by the
+    coupling too (`RemodelingPass.cases`).
+
     Attributes
     ----------
     equilibrium
-        The forms of the solved state.
+        The forms of the solved state, with its cells.
     newton
-        What solved it.
+        What solved it; with forms of its own where cells belong to the unknowns.
     traits
         What is known of its errors in time.
 
@@ -172,7 +177,7 @@ class Coupling(Protocol):
         """
 
     def remodel(self, time: float) -> float:
-        """Make the cells that the next step starts with; returns the power of remodeling.
+        """Make the cells that the next step starts with, where `solve` has not; returns the power of remodeling.
 
         Parameters
         ----------
@@ -188,7 +193,7 @@ class Staggered:
     """The paper's coupling: solve with the cells of the step before, then one remodeling pass.
 
     Where Newton's method cannot go to the new state in one piece, the change of the cells and then the change of the
-    loads are applied in parts (docs/theory.md, "Steps that are too large"): the state at the end is the same.
+    loads are applied in parts (docs/theory.md, "Steps that are too large").
 
     Parameters
     ----------
@@ -252,7 +257,7 @@ class Staggered:
         """
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
         step = LoadStep.between(time - self.state.time, old_loads, loads)
-        if not self._solved_as_expected(step, loads, work):
+        if again or not self._solved_as_expected(step, loads, work):
             self._solve_from_the_last(time, old_loads, loads, work)
         self._whole(time, old_loads, loads).look_back(before, work, again)
         if self.predictor is not None:

@@ -86,7 +86,7 @@ class RemodelingPass:
         if self._target is tensor_target and not settings.has_set_point and not in_numpy():
             from remodel_fenicsx.kernels.tensor import TensorKernels
 
-            self._target = TensorKernels(state.comm).target  # of the paper's alone
+            self._target = TensorKernels(state.comm).target  # with the exponent 2 and no threshold
 
     def join(self, cases: Sequence[Any], weights: Sequence[float]) -> None:
         """From now on further load cases drive the cells too, with these weights: of the first case, and of them."""

@@ -159,7 +159,7 @@ class Stepper:
     coupling
         Makes a coupling in place of the one that `remodeling` names.
     kappa
-        Of `RemodelingPass`.
+        A number, or a DG0 Function, in place of that of `remodeling`.
 
     Examples
     --------

@@ -1,9 +1,9 @@
 """Evolution laws: what the unit cells become while a drive acts on them. Pure functions on arrays.
 
 A law is `update(cells, drive, time_old, time_new) -> cells` with cells of shape (n, 3) and (n, 3, 3). The paper's laws
-(one for each way to integrate its eq. 10) change the dimensions towards a target while the axes turn at once: `ranked`
-makes a law of such a function. `rotation` is the older law that the paper argues against: the axes turn gradually and
-the dimensions stay.
+(eq. 11, eq. 10 over a step, and a form of it without the time) change the dimensions towards a target while the axes
+turn at once: `ranked` makes a law of such a function. `rotation` is the older law that the paper argues against: the
+axes turn gradually and the dimensions stay. `tensor` is consistent: one equation for A (`tensor_law`).
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ which is not symmetric (`LocalProblem.tangent`; docs/theory.md, "Implicit coupli
     C, S -> D, D_S, D_C        `Driver.derivatives`
     F, D -> y, y_D, y_F        `Law.response`: `tensor_response`, `ranked_response`
 
-Plain arrays of n points. Symmetric tensors are Mandel vectors, their derivatives 6 x 6 matrices (`tensors`).
+Plain arrays of n points. Tensors are (n, 3, 3), their derivatives 6 x 6 matrices in Mandel components (`tensors`).
 """
 
 from __future__ import annotations
@@ -415,7 +415,7 @@ def put(points: Any, chosen: Any, better: Any) -> None:
 
 
 class LocalSolution(NamedTuple):
-    """Points whose cells belong to their stress, in the global basis."""
+    """Cells that belong to their stress, at the points that have converged; in the global basis."""
 
     gradient: Array
     driving_tensor: Array

@@ -568,7 +568,7 @@ class CouplingKind:
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
     solves_cells
-        Whether cells are unknowns of the solve: then it takes steps of any length.
+        Whether a solve finds the cells too: then it takes steps of any length.
     missing
         What a scene lacks for it, from the scene, in words; None where nothing.
 
@@ -615,7 +615,7 @@ def _missing_for_implicit(scene: Scene) -> str | None:
 
 
 def missing_for_steps_of_cells(scene: Scene) -> str | None:
-    """What a scene lacks for cells that are unknowns of a solve, of whatever cells it starts from; None: nothing."""
+    """What a scene lacks for cells that a solve finds, of whatever cells it starts from; None: nothing."""
     from remodel_fenicsx.model.local_problem import refused  # six modules that most runs need not load
 
     material, remodeling = scene.material, scene.remodeling

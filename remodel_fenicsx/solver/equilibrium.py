@@ -145,7 +145,7 @@ class Extension:
 
 
 class Look(NamedTuple):
-    """At a state: how far it is from its limits."""
+    """At a state: how far it is from its limits; r/L at all points, and r^2, J and F (n, 11)."""
 
     extension: Extension
     stretches: Array

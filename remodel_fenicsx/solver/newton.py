@@ -1,4 +1,4 @@
-"""Newton's method for one equilibrium: PETSc SNES with the consistent tangent, and the guards r < L, J > 0."""
+"""Newton's method for one equilibrium: PETSc SNES, with the tangent or an older one, and the guards r < L, J > 0."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ class Solution(Counted):
 
     residual: float = 0.0
     extension: Extension | None = None
-    reach: float = 0.0
+    reach: float = 0.0  # how far it is from its origin, over how far the first iterate was; 0 where that says nothing
 
 
 class SolveFailure(RuntimeError, Counted):
