@@ -473,7 +473,7 @@ class Extrapolated(Staggered):
 def how_many(state: State, points: Flags) -> int:
     """Of all points in one row that are chosen, on all ranks."""
     quadrature = state.cells.quadrature
-    return int(state.comm.allreduce(int(quadrature.owned(points.reshape(quadrature.shape)).sum())))
+    return int(over_ranks(state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM))
 
 
 def known(records: Any) -> Target:

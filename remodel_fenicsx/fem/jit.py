@@ -82,8 +82,11 @@ def cache_folder() -> Path:
     # Below XDG_CACHE_HOME or ~/.cache; where that cannot be written or is another user's, in a private temporary
     # folder, with a warning.
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    processor = next((line for line in lines if line.startswith(("flags", "Features"))), "")  # the latter of ARM
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = next((line for line in lines if line.startswith(("flags", "Features"))), "")  # the latter of ARM
+    except OSError:  # on macOS
+        processor = platform.processor()
     name = f"remodel-{hashlib.sha256((platform.machine() + processor).encode()).hexdigest()[:8]}"
     folder = base / "fenics" / name
     with suppress(OSError):

@@ -105,8 +105,7 @@ SINGLE_ERROR = 0.5  # relative, of the answer to the softest motion: 0.36 (40,80
 # L-BFGS learns such motions; above 1 a factor may even have another sign there
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; Newton's method goes on, as often again
 
-# relative, of a linear solve: as Newton's method needs it far away; where that is more than LAST one solve ends it all
-KRYLOV_TOLERANCE, LAST, SURELY = 1e-3, 1e-5, 0.3
+LAST, SURELY = 1e-5, 0.3  # relative, of a linear solve that ends it all: tried down to LAST; share of what is needed
 
 
 def worth(unknowns: int) -> float:
@@ -403,6 +402,7 @@ class Multigrid(EveryTangent):
     def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
         self._solver, self._space = snes.getKSP(), equilibrium.state.unknown.function_space
+        self._far = self._solver.getTolerances()[0]  # of the method: as Newton's method needs it far away
         self._below: DegreeOne | None = None
         if equilibrium.state.kinematics.reduced:
             return
@@ -419,7 +419,7 @@ class Multigrid(EveryTangent):
         super().tangent(norm, tolerance)
         if self._below is not None and self._chooses:
             last = SURELY * tolerance / norm
-            self._solver.setTolerances(rtol=last if last > LAST else KRYLOV_TOLERANCE)
+            self._solver.setTolerances(rtol=last if last > LAST else self._far)
 
     def renew(self) -> None:
         super().renew()
@@ -442,7 +442,7 @@ class Multigrid(EveryTangent):
         if self._chooses:
             self._solver.setPCSide(PETSc.PC.Side.LEFT)
             self._solver.setNormType(PETSc.KSP.NormType.PRECONDITIONED)
-            self._solver.setTolerances(rtol=KRYLOV_TOLERANCE)
+            self._solver.setTolerances(rtol=self._far)
         return "with levels of the matrix, from now on", nullcontext()
 
     def close(self) -> None:

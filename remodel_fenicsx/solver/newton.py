@@ -258,7 +258,7 @@ class GuardedNewton:
         equilibrium, settings, kinematics = self.equilibrium, self.settings, self.equilibrium.state.kinematics
         unknowns, ranks, narrow = self._x.getSize(), equilibrium.comm.size, not kinematics.three_dimensional
         method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
-        self.method = method = method if method == settings.method else self.methods.get(method, method)
+        self.method = method = self.methods.get(method, method) if settings.method == AUTO else method
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
