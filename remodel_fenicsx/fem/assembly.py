@@ -7,6 +7,7 @@ energies in few operations, matrices in memory that dolfinx and PETSc share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from numbers import Real
 from typing import Any, Generic, TypeVar, cast
 
@@ -53,13 +54,19 @@ def rigid_motions(space: Any, matrix: Any) -> Any:
     return motions
 
 
-class DegreeOne:
-    """Multigrid for elements of degree 2 whose next level is degree 1: all others then cost little. Collective."""
+def degree_one(space: Any) -> tuple[Any, Any]:
+    """The same functions of degree 1, and the matrix that interpolates them. Collective."""
+    below = lagrange(space.mesh, 1, tuple(space.value_shape)).function_space
+    prolongation = dolfinx.fem.petsc.interpolation_matrix(below, space)
+    prolongation.assemble()
+    return below, prolongation
 
-    def __init__(self, pc: Any, space: Any, matrix: Any, elastic: bool):
-        below = lagrange(space.mesh, 1, tuple(space.value_shape)).function_space
-        self._prolongation = dolfinx.fem.petsc.interpolation_matrix(below, space)
-        self._prolongation.assemble()
+
+class DegreeOne:
+    """Multigrid for elements of degree 2 whose next level is `degree_one`: all others then cost little. Collective."""
+
+    def __init__(self, pc: Any, next_level: tuple[Any, Any], matrix: Any, elastic: bool):
+        below, self._prolongation = next_level
         self._coarse = matrix.PtAP(self._prolongation)
         self._coarse.setBlockSize(below.dofmap.bs)
         if elastic:
@@ -85,7 +92,6 @@ class DegreeOne:
         """Free PETSc's objects."""
         self._options.close()
         self._coarse.destroy()
-        self._prolongation.destroy()
 
 
 class SolveStopped(ArithmeticError):
@@ -99,6 +105,11 @@ class Positive:
         form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
         self._matrix = create_matrix(form)
         assemble_matrix(self._matrix, [form], [])
+
+    @cached_property
+    def _degree_one(self) -> tuple[Any, Any]:
+        """For all solves. Collective."""
+        return degree_one(self.space)
 
     def solve(self, linear: Any, conditions: Sequence[Any] = (), multigrid: bool = False) -> Any:
         """The function u with bilinear(u, v) = linear(v) for all v; linear is 0 where it is None. Collective."""
@@ -125,7 +136,7 @@ class Positive:
         solver.getPC().setType("gamg" if multigrid else "jacobi")
         levels = None
         if multigrid and self.space.ufl_element().degree > 1:
-            levels = DegreeOne(solver.getPC(), self.space, matrix, elastic=False)
+            levels = DegreeOne(solver.getPC(), self._degree_one, matrix, elastic=False)
         solver.setInitialGuessNonzero(True)
         solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
         solver.solve(load, answer)

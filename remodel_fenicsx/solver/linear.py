@@ -13,7 +13,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from remodel_fenicsx import kernels
-from remodel_fenicsx.fem.assembly import DegreeOne, rigid_motions
+from remodel_fenicsx.fem.assembly import DegreeOne, degree_one, rigid_motions
 from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
@@ -409,7 +409,7 @@ class Multigrid(EveryTangent):
         given = {name.split("_")[0] for name in options.given}
         self._chooses = "ksp" not in given and "snes_ksp_ew" not in options.given
         if self._space.ufl_element().degree > 1 and not given & {"pc", "mg"}:
-            self._below = DegreeOne(self._solver.getPC(), self._space, matrix, elastic=True)
+            self._below = DegreeOne(self._solver.getPC(), degree_one(self._space), matrix, elastic=True)
             if self._chooses:
                 self._solver.setPCSide(PETSc.PC.Side.RIGHT)  # its tolerance is then that of the residual itself
         else:
