@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -22,14 +22,14 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Traits, between, how_many
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.fem.assembly import Remembered, over_ranks
-from remodel_fenicsx.fem.solver_methods import LAGGED
+from remodel_fenicsx.fem.solver_methods import LAGGED, PRECONDITIONED
 from remodel_fenicsx.kernels.tensor import problem_of, tensor_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, StepOfCells
 from remodel_fenicsx.model.tensor_law import weight_of_the_end
-from remodel_fenicsx.model.tensors import det
+from remodel_fenicsx.model.tensors import det, from_mandel
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Look
@@ -43,10 +43,27 @@ Flags = NDArray[np.bool_]
 
 RESIDUAL = "residual of the last step"
 BEFORE_REFUSAL = 5  # Newton iterations after which states are refused where some point has no cells
+NEAR = 0.1  # of D: a change up to which its slope says more of the next D than the last D does
 PASSES = 8  # before a second try
 SETTLES = 0.5  # of the largest change of the unknowns over a pass: what the last may be
 ROOM_PASSES, ROOM_ACCURACY = 30, 1e-8  # a tenth to a thirtieth of the change of J_g is left by each; of J_g
 MOST_SOLVES = 20  # of all Newton iterations that one may have, for a step with its parts; then it is refused
+
+
+class Guess(NamedTuple):
+    """D of a state, and where they are known its F with the slope of D there (n, 6, 9)."""
+
+    tensor: Array
+    known: tuple[Array, Array] | None = None
+
+    def at(self, gradient: Array) -> Array:
+        """D at an F near that one, where it changes little: else that of the state."""
+        if self.known is None:
+            return self.tensor
+        before, slope = self.known
+        way = from_mandel((slope @ (gradient - before).reshape(-1, 9, 1))[:, :, 0])
+        near = np.linalg.norm(way, axis=(1, 2)) < NEAR * np.linalg.norm(self.tensor, axis=(1, 2))
+        return self.tensor + np.where(near[:, None, None], way, 0.0)
 
 
 class ImplicitCells:
@@ -57,13 +74,13 @@ class ImplicitCells:
         self.quadrature = state.cells.quadrature
         self.stress = self.quadrature.function("implicit_stress", (3, 3))
         self.tangent = self.quadrature.function("implicit_tangent", (9, 9))
-        self._kernels = tensor_kernels(state.comm) if remodeling.law.target is not None else None
+        self._kernels = tensor_kernels(state.comm)
         F = state.kinematics.elastic_gradient(state.unknown)
         self._solutions: Remembered[LocalSolution] = Remembered(None, F)
         self._tangents: Remembered[None] = Remembered(None, F)
         self._problem: LocalProblem
         self._accepted: Array  # D of the last solved state
-        self._guess: Array  # D from which cells are looked for
+        self._guess: Guess  # from where cells are looked for
         self._iterations = 0
 
     # ------------------------------------------------------------ a step
@@ -84,7 +101,7 @@ class ImplicitCells:
 
     def restart(self, guess: Array | None = None) -> None:
         """Cells are looked for from a D, or from that of the last accepted state."""
-        self._guess, self._iterations = self._accepted if guess is None else guess, 0
+        self._guess, self._iterations = Guess(self._accepted if guess is None else guess), 0
         self._solutions.forget()
 
     def accept(self) -> None:
@@ -113,16 +130,18 @@ class ImplicitCells:
     def _solved(self) -> LocalSolution:
         F = self.state.elastic_gradient()
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            found = self._problem.solve(np.where((det(F) > 0)[:, None, None], F, np.eye(3)), self._guess)
+            F = np.where((det(F) > 0)[:, None, None], F, np.eye(3))
+            found = self._problem.solve(F, self._guess.at(F))
         stress = found.first_piola_kirchhoff.reshape(*self.quadrature.shape, 3, 3)
         self.quadrature.values(self.stress, (3, 3))[:] = stress
         self._tangents.forget()
         return found
 
     def _differentiated(self, found: LocalSolution) -> None:
-        self._iterations, self._guess = self._iterations + 1, found.driving_tensor
-        values = self._problem.tangent(found).reshape(*self.quadrature.shape, 9, 9)
-        self.quadrature.values(self.tangent, (9, 9))[:] = values
+        slopes = self._problem.tangent(found)
+        self._iterations += 1
+        self._guess = Guess(found.driving_tensor, (found.gradient, slopes.by_gradient))
+        self.quadrature.values(self.tangent, (9, 9))[:] = slopes.tangent.reshape(*self.quadrature.shape, 9, 9)
 
     def unit_cells(self) -> UnitCell:
         """Those that belong to the present unknowns."""
@@ -207,7 +226,7 @@ def newton_of_still_cells(equilibrium: Equilibrium, settings: Solver) -> Guarded
 class ImplicitNewton(GuardedNewton):
     """Newton's method for unknowns that their cells follow."""
 
-    methods = {LAGGED: "direct"}  # tangents are unsymmetric, and iterations dear: nothing is gained by old factors
+    methods = {LAGGED: PRECONDITIONED}  # tangents are unsymmetric, and each of them is worth its iteration
 
     def __init__(self, equilibrium: ImplicitEquilibrium, still: Equilibrium, settings: Solver):
         super().__init__(equilibrium, settings, robust=True)  # a named `lagged` too: an old factor leads astray

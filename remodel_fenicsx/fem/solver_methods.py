@@ -14,6 +14,7 @@ from remodel_fenicsx.schema.tables import SceneError
 
 AUTO = "auto"
 LAGGED = "lagged"  # whose factor may be of an earlier tangent (`solver.linear`)
+PRECONDITIONED = "preconditioned"
 
 
 @dataclass(frozen=True)
@@ -57,25 +58,39 @@ class SolverMethod:
 
 
 NEWTON = {"snes_type": "newtonls", "snes_linesearch_type": "basic"}
+BY_MUMPS = {
+    "pc_type": "lu",
+    "pc_factor_mat_solver_type": "mumps",
+    "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
+}
+ON_ONE_RANK = {
+    "pc_type": "telescope",
+    "telescope_ksp_type": "preonly",
+    "telescope_pc_type": "lu",
+    "telescope_pc_factor_mat_solver_type": "mumps",
+}
 SOLVER_METHODS = {
     # MUMPS: robust for indefinite tangents too, one factorisation pattern for all steps. On several ranks it adds up in
     # the order in which messages come: its last digits differ from run to run. So one rank has the whole matrix and
     # factorises it, which for the sizes that are factorised at all costs little
     "direct": SolverMethod(
+        NEWTON | {"ksp_type": "preonly", **BY_MUMPS},
+        "Newton's method; MUMPS factorises each system, and runs repeat to the last digit",
+        on_several_ranks=ON_ONE_RANK,
+    ),
+    # Where tangents are unsymmetric, and dear: three iterations for a system, each a tenth of what a factor costs
+    PRECONDITIONED: SolverMethod(
         NEWTON
         | {
-            "ksp_type": "preonly",
-            "pc_type": "lu",
-            "pc_factor_mat_solver_type": "mumps",
-            "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
+            "snes_lag_preconditioner": -2,  # the first; of the next ones the class says when
+            "ksp_type": "gmres",
+            "ksp_rtol": 1e-5,
+            "ksp_max_it": 30,
+            **BY_MUMPS,
         },
-        "Newton's method; MUMPS factorises each system, and runs repeat to the last digit",
-        on_several_ranks={
-            "pc_type": "telescope",
-            "telescope_ksp_type": "preonly",
-            "telescope_pc_type": "lu",
-            "telescope_pc_factor_mat_solver_type": "mumps",
-        },
+        "Newton's method with GMRES and a factor of an earlier tangent",
+        linear="remodel_fenicsx.solver.linear.Preconditioned",
+        on_several_ranks=ON_ONE_RANK,
     ),
     LAGGED: SolverMethod(
         NEWTON | {"ksp_type": "preonly"},

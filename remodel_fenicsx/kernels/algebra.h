@@ -4,6 +4,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#include "axes.h"
 
 #define ROOT_2 1.4142135623730951
 #define ALL(i) for (int i = 0; i < 3; ++i)
@@ -119,50 +120,27 @@ static void divide(matrix m, double *x, int columns)
         }
 }
 
-/* One rotation of Jacobi's method in the plane of the axes p and q. */
-static inline void rotate(tensor a, tensor v, int p, int q)
+/* tensors.eigen of up to W tensors: ascending values, vectors as columns. */
+static void eigen_of(int n, tensor *t, double (*values)[3], tensor *vectors)
 {
-    if (a[p][q] == 0) return;
-    const int r = 3 - p - q;
-    const double difference = a[q][q] - a[p][p], twice = 2 * a[p][q];
-    const double distance = sqrt(difference * difference + twice * twice);
-    const double t = copysign(1, difference) * twice / (fabs(difference) + distance);
-    const double c = 1 / sqrt(1 + t * t), s = t * c, rp = a[r][p], rq = a[r][q];
-    a[p][p] -= t * a[p][q];
-    a[q][q] += t * a[p][q];
-    a[p][q] = a[q][p] = 0;
-    a[r][p] = a[p][r] = c * rp - s * rq;
-    a[r][q] = a[q][r] = s * rp + c * rq;
-    ALL(i) {
-        const double x = v[i][p], y = v[i][q];
-        v[i][p] = c * x - s * y;
-        v[i][q] = s * x + c * y;
+    lanes a[6], axes[3][3];
+    double scale[W];
+    EACH {
+        const int at = k < n ? k : n - 1;
+        scale[k] = 0;
+        ALL(i) ALL(j) scale[k] = fmax(scale[k], fabs(t[at][i][j]));
+        if (!(scale[k] > 0)) scale[k] = 1;
+        MANDEL(i) a[i][k] = (t[at][ROW[i]][COLUMN[i]] + t[at][COLUMN[i]][ROW[i]]) / 2 / scale[k];
+    }
+    jacobi(a, axes);
+    for (int k = 0; k < n; ++k) ALL(i) {
+        values[k][i] = scale[k] * a[2 - i][k];
+        ALL(j) vectors[k][j][i] = axes[2 - i][j][k];
     }
 }
 
-/* tensors.eigen: ascending values, vectors as columns. */
 static void eigen(tensor t, double *values, tensor vectors)
 {
-    tensor a;
-    double scale = 0;
-    ALL(i) ALL(j) {
-        scale = fmax(scale, fabs(t[i][j]));
-        vectors[i][j] = i == j;
-    }
-    if (!(scale > 0)) scale = 1;
-    ALL(i) ALL(j) a[i][j] = (t[i][j] + t[j][i]) / 2 / scale;
-    for (int sweep = 0; sweep < 20 && fabs(a[0][1]) + fabs(a[0][2]) + fabs(a[1][2]) > 1e-20; ++sweep)
-        rotate(a, vectors, 0, 1), rotate(a, vectors, 0, 2), rotate(a, vectors, 1, 2);
-    ALL(i) values[i] = scale * a[i][i];
-    for (int pass = 0; pass < 3; ++pass) {
-        const int i = pass == 1, j = i + 1;
-        if (values[i] <= values[j]) continue;
-        const double swap = values[i];
-        values[i] = values[j], values[j] = swap;
-        ALL(k) {
-            const double component = vectors[k][i];
-            vectors[k][i] = vectors[k][j], vectors[k][j] = component;
-        }
-    }
+    eigen_of(1, (tensor *)t, (double (*)[3])values, (tensor *)vectors);
 }
 #endif

@@ -1,56 +1,9 @@
 /* What a pass and its limits compute at every point. Plain arrays in, plain arrays out; the Python functions that these
    stand for are listed in kernels/__init__.py and named below. Where a tensor does not decide (values that agree, signs
-   that are weak) nothing is decided here: the point is marked, and spectral.py does it. Eight points go side by side, so
-   that the compiler takes vector instructions. */
+   that are weak) nothing is decided here: the point is marked, and spectral.py does it. */
 #include <math.h>
 #include <stdint.h>
-
-#if defined(__AVX512F__) && defined(__GNUC__) && !defined(__clang__)
-#pragma GCC target("prefer-vector-width=512")
-#endif
-
-#define W 8
-#define EACH for (int k = 0; k < W; ++k)
-#define DIAGONAL 1e-18  /* what may be left off the diagonal: the axes are then exact to this over the gap */
-typedef double lanes[W];
-
-/* One rotation of Jacobi's method in the plane of the axes p and q: apq becomes zero. */
-static inline void rotate(double *app, double *aqq, double *apq, double *arp, double *arq, lanes *vp, lanes *vq)
-{
-    lanes c, s;
-    EACH {
-        const double d = aqq[k] - app[k], b = 2.0 * apq[k];
-        const double t = copysign(1.0, d) * b / (fabs(d) + sqrt(d * d + b * b) + 1e-300);
-        c[k] = 1.0 / sqrt(1.0 + t * t);
-        s[k] = t * c[k];
-        app[k] -= 0.5 * t * b;
-        aqq[k] += 0.5 * t * b;
-        apq[k] = 0.0;
-        const double rp = arp[k], rq = arq[k];
-        arp[k] = c[k] * rp - s[k] * rq;
-        arq[k] = s[k] * rp + c[k] * rq;
-    }
-    for (int i = 0; i < 3; ++i) EACH {
-        const double x = vp[i][k], y = vq[i][k];
-        vp[i][k] = c[k] * x - s[k] * y;
-        vq[i][k] = s[k] * x + c[k] * y;
-    }
-}
-
-/* The larger of two values first, with its axis. */
-static inline void order(double *a, double *b, lanes *u, lanes *v)
-{
-    EACH {
-        const double x = a[k], y = b[k];
-        a[k] = x < y ? y : x;
-        b[k] = x < y ? x : y;
-        for (int i = 0; i < 3; ++i) {
-            const double p = u[i][k], q = v[i][k];
-            u[i][k] = x < y ? q : p;
-            v[i][k] = x < y ? p : q;
-        }
-    }
-}
+#include "axes.h"
 
 static inline double largest_of(const double *x, int count)
 {
@@ -60,15 +13,6 @@ static inline double largest_of(const double *x, int count)
         sum += fabs(x[i]);
     }
     return sum - sum == 0.0 || largest > 1e300 ? largest : NAN;  /* NaN and infinity do not get lost in comparisons */
-}
-
-static inline void normalise(const double *x, double *unit)
-{
-    double size = fmax(fmax(fabs(x[0]), fabs(x[1])), fabs(x[2]));
-    size = size > 0.0 ? 1.0 / size : 1.0;
-    const double a = x[0] * size, b = x[1] * size, c = x[2] * size;
-    const double length = sqrt(a * a + b * b + c * c), scale = length > 0.0 ? 1.0 / length : 1.0;
-    unit[0] = a * scale, unit[1] = b * scale, unit[2] = c * scale;
 }
 
 /* Cosines of unit vectors with others of any length: these are divided by their largest component first. */
@@ -88,41 +32,22 @@ int64_t principal(int64_t n, const double *tensors, const double *previous, doub
 {
     int64_t count = 0;
     for (int64_t first = 0; first < n; first += W) {
-        lanes a00, a11, a22, a01, a02, a12, u[3], v[3], w[3], scale;
+        lanes a[6], frame[3][3], scale;
         uint8_t bad[W];
         for (int k = 0; k < W; ++k) {
             const int64_t at = first + k < n ? first + k : n - 1;
             const double *t = tensors + 9 * at;
-            const double m[6] = {t[0], t[4], t[8], 0.5 * t[1] + 0.5 * t[3], 0.5 * t[2] + 0.5 * t[6],
-                                 0.5 * t[5] + 0.5 * t[7]};
+            const double m[6] = {t[0], t[4], t[8], 0.5 * t[5] + 0.5 * t[7], 0.5 * t[2] + 0.5 * t[6],
+                                 0.5 * t[1] + 0.5 * t[3]};
             const double size = largest_of(m, 6);
             bad[k] = !isfinite(size) || !isfinite(largest_of(previous + 9 * at, 9)) ? 2
                    : size > 1e-290 && size < 1e290 ? 0 : 1;
             const double inverse = bad[k] ? 0.0 : 1.0 / size;
             scale[k] = size;
-            a00[k] = bad[k] ? 3.0 : m[0] * inverse, a11[k] = bad[k] ? 2.0 : m[1] * inverse;
-            a22[k] = bad[k] ? 1.0 : m[2] * inverse, a01[k] = bad[k] ? 0.0 : m[3] * inverse;
-            a02[k] = bad[k] ? 0.0 : m[4] * inverse, a12[k] = bad[k] ? 0.0 : m[5] * inverse;
+            for (int i = 0; i < 6; ++i) a[i][k] = bad[k] ? (i < 3 ? 3.0 - i : 0.0) : m[i] * inverse;
         }
-        for (int i = 0; i < 3; ++i) EACH {
-            u[i][k] = i == 0;
-            v[i][k] = i == 1;
-            w[i][k] = i == 2;
-        }
-        double left = 1.0;
-        for (int sweep = 0; sweep < 12 && left > DIAGONAL; ++sweep) {
-            rotate(a00, a11, a01, a02, a12, u, v);
-            rotate(a00, a22, a02, a01, a12, u, w);
-            rotate(a11, a22, a12, a01, a02, v, w);
-            lanes size;
-            EACH size[k] = fabs(a01[k]) + fabs(a02[k]);  /* the last rotation has made a12 zero */
-            left = 0.0;
-            EACH left = size[k] > left ? size[k] : left;
-        }
-        order(a00, a11, u, v);
-        order(a11, a22, v, w);
-        order(a00, a11, u, v);
-        lanes *frame[3] = {u, v, w}, cosine[3], weakest, gap;
+        const double left = jacobi(a, frame);
+        lanes cosine[3], weakest, gap;
         for (int rank = 0; rank < 3; ++rank) {
             lanes p[3];
             for (int i = 0; i < 3; ++i)
@@ -132,13 +57,13 @@ int64_t principal(int64_t n, const double *tensors, const double *previous, doub
         }
         EACH {
             const double x = fabs(cosine[0][k]), y = fabs(cosine[1][k]), z = fabs(cosine[2][k]);
-            const double xy = x < y ? x : y, upper = a00[k] - a11[k], lower = a11[k] - a22[k];
+            const double xy = x < y ? x : y, upper = a[0][k] - a[1][k], lower = a[1][k] - a[2][k];
             weakest[k] = xy < z ? xy : z;
             gap[k] = upper < lower ? upper : lower;
         }
         for (int k = 0; k < W && first + k < n; ++k) {
             const int64_t at = first + k;
-            const double size = scale[k], largest = fabs(a00[k]) > fabs(a22[k]) ? fabs(a00[k]) : fabs(a22[k]);
+            const double size = scale[k], largest = fmax(fabs(a[0][k]), fabs(a[2][k]));
             const double relative = tolerance * largest * size, equal = threshold[at];
             /* what is within 1 % of a limit is left to the code that knows the limit */
             if (!bad[k] && !(size * gap[k] > 1.01 * (relative > equal ? relative : equal)
@@ -147,7 +72,7 @@ int64_t principal(int64_t n, const double *tensors, const double *previous, doub
                 const double sign = cosine[rank][k] < 0.0 ? -1.0 : 1.0;
                 for (int i = 0; i < 3; ++i) axes[9 * at + 3 * rank + i] = sign * frame[rank][i][k];
             }
-            values[3 * at] = size * a00[k], values[3 * at + 1] = size * a11[k], values[3 * at + 2] = size * a22[k];
+            for (int i = 0; i < 3; ++i) values[3 * at + i] = size * a[i][k];
             open[at] = bad[k];
             count += bad[k] != 0;
         }
@@ -176,34 +101,9 @@ int64_t positive_direction(int64_t n, const double *values, const double *thresh
 }
 
 /* spectral.without_noise. */
-void without_noise(int64_t n, const double *tensors, const double *axes, const double *noise, double *steady)
+void without_noise(int64_t n, const double *tensors, const double *axes, const double *noise, double *result)
 {
-    for (int64_t at = 0; at < n; ++at) {
-        const double *t = tensors + 9 * at;
-        double f[3][3], across[3], tf[3][3], part[3], value[3];
-        normalise(axes + 9 * at, f[0]);
-        const double *second = axes + 9 * at + 3;
-        const double along = second[0] * f[0][0] + second[1] * f[0][1] + second[2] * f[0][2];
-        for (int i = 0; i < 3; ++i) part[i] = second[i] - along * f[0][i];
-        normalise(part, f[1]);
-        f[2][0] = f[0][1] * f[1][2] - f[0][2] * f[1][1];
-        f[2][1] = f[0][2] * f[1][0] - f[0][0] * f[1][2];
-        f[2][2] = f[0][0] * f[1][1] - f[0][1] * f[1][0];
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j)
-                tf[i][j] = t[3 * j] * f[i][0] + t[3 * j + 1] * f[i][1] + t[3 * j + 2] * f[i][2];
-        for (int i = 0; i < 3; ++i) {
-            const int j = (i + 1) % 3;
-            value[i] = f[i][0] * tf[i][0] + f[i][1] * tf[i][1] + f[i][2] * tf[i][2];
-            across[i] = fabs(f[i][0] * tf[j][0] + f[i][1] * tf[j][1] + f[i][2] * tf[j][2]);
-        }
-        const double limit = noise[at];
-        const int keep = across[0] <= limit && across[1] <= limit && across[2] <= limit;
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j)
-                steady[9 * at + 3 * i + j] = !keep ? t[3 * i + j] : value[0] * f[0][i] * f[0][j]
-                    + value[1] * f[1][i] * f[1][j] + value[2] * f[2][i] * f[2][j];
-    }
+    for (int64_t at = 0; at < n; ++at) steady(tensors + 9 * at, axes + 9 * at, noise[at], result + 9 * at);
 }
 
 /* energy.squared_end_to_end_length: r^2 = sum l_I^2 I_I. */

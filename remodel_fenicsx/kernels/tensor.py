@@ -1,4 +1,4 @@
-"""The law `tensor` and the repulsion `log` in C (tensor.c); what C leaves open numpy solves (`tissue`)."""
+"""Implicit steps, the law `tensor` and the repulsion `log` in C (tensor.c); numpy solves what C leaves open."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.kernels import Library, in_numpy
-from remodel_fenicsx.model import local_problem, tensor_law, tensors
+from remodel_fenicsx.model import local_problem, spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import rotated_back
 from remodel_fenicsx.model.energy import PARAMETERS, Tissue, whole_structure_tensor
-from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, StepOfCells, at, put
-from remodel_fenicsx.model.laws import Drive
+from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, Slopes, StepOfCells, at, put
+from remodel_fenicsx.model.laws import COMPLEX_STEP, Drive
 from remodel_fenicsx.model.tensor_law import Target
 
 log = logging.getLogger(__name__)
@@ -32,6 +32,8 @@ NUMBERS = {
     "ITERATIONS": local_problem.LOCAL_ITERATIONS,
     "HALVINGS": local_problem.LOCAL_HALVINGS,
     "TOLERANCE": local_problem.TOLERANCE,
+    "AGREE": local_problem.AGREE,
+    "ROUNDING": spectral.ROUNDING,
     "CLOSE": tensors.CLOSE_EIGENVALUES,
     "COMPRESSION": tensor_law.COMPRESSION,
 }
@@ -42,7 +44,7 @@ class TensorKernels:
     """Functions in C on arrays of n points."""
 
     def __init__(self, comm: MPI.Intracomm):
-        self.call = Library(comm, "tensor.c", "the law for the structure tensor", 5, NUMBERS)
+        self.call = Library(comm, "tensor.c", "the law for the structure tensor and implicit steps", 6, NUMBERS)
 
     def target(self, drive: Drive) -> Target:
         """`laws.tensor_target`."""
@@ -79,47 +81,70 @@ def problem_of(kernels: TensorKernels | None, tissue: Tissue, step: StepOfCells)
     parts: dict[str, Any] = {name: getattr(tissue, name) for name in ("chain", "matrix", "repulsion")}
     parts |= {"law": step.law, "driver": step.drive.driver}
     unknown = [name for name, part in parts.items() if kernels.call.number(getattr(part, "compiled", "")) is None]
-    unknown += ["frame"] * step.is_spatial + ["turnover"] * (step.turnover is not None)
+    unknown += ["pairing"] * (step.law.dimensions is not None and step.drive.pairing is not spectral.principal)
+    unknown += ["turnover"] * (step.turnover is not None)
     if not unknown:
         return CompiledProblem(tissue, step, kernels)
-    _say_of_tensor(", ".join(unknown))
+    _say_of_numpy(", ".join(unknown))
     return LocalProblem(tissue, step)
 
 
 @functools.cache
-def _say_of_tensor(parts: str) -> None:
+def _say_of_numpy(parts: str) -> None:
     log.info("numpy finds the cells of an implicit step, slower: C does not have this %s", parts)
 
 
 @dataclass(frozen=True)
 class CompiledProblem(LocalProblem):
-    """As `LocalProblem`, for the law `tensor`. Points that the kernel does not solve are solved by numpy."""
+    """As `LocalProblem`. Points that the kernel does not solve are solved by numpy."""
 
     kernels: TensorKernels
 
+    @functools.cached_property
+    def _given(self) -> Array:
+        """What C's `given` has of each point, (n, numbers)."""
+        drive, cells = self.step.drive, self.step.cells
+        n = len(cells.dimensions)
+        tuning = (drive.floor, drive.noise, drive.rounding, self.step.kappa_dt)
+        numbers = [getattr(self.tissue, name) for name in PARAMETERS] + [np.broadcast_to(some, n) for some in tuning]
+        others = cells.dimensions, cells.axes, self.step.structure, *self._by_target(n)
+        return np.concatenate([np.stack(numbers, axis=1), *(some.reshape(n, -1) for some in others)], axis=1)
+
+    def _by_target(self, n: int) -> tuple[Array, Array]:
+        """Of a law by rank, whose lengths are an affine function of the target: those at zero, and the slope."""
+        law, step = self.step.law.dimensions, self.step
+        if law is None:
+            return np.zeros((n, 3)), np.zeros(n)
+        given = step.cells.dimensions, step.drive.initial_dimensions, np.full((n, 3), 1j * COMPLEX_STEP)
+        lengths: Any = law(*given, step.drive.kappas, step.time_old, step.time_new)
+        return lengths.real, lengths.imag[:, 0] / COMPLEX_STEP
+
     def _call(self, name: str, F: Array, tensor: Array, *results: Array | Flags) -> None:
-        """A function in C with F, D, the cells at the start, parameters, and what else it takes of tissue and step."""
-        drive, tissue = self.step.drive, self.tissue
-        numbers = (self.kernels.call.number(part.compiled) for part in (drive.driver, tissue.repulsion))
-        parameters = np.stack([getattr(tissue, name) for name in PARAMETERS])
-        kappa_dt = np.broadcast_to(self.step.kappa_dt, len(F))
-        given = self.step.structure, parameters, drive.floor, drive.rounding, kappa_dt, *numbers
-        self.kernels.call(name, len(F), F, tensor, *given, *results)
+        """A function in C with F, D, what it takes of tissue and step, and the parts of the model."""
+        step, number = self.step, self.kernels.call.number
+        frame = "TO_SPACE" if step.is_spatial else "PULLED_BACK" if step.carries_axes else "STAYS"
+        parts = step.law.compiled, step.drive.driver.compiled, self.tissue.repulsion.compiled, frame
+        self.kernels.call(name, len(F), F, tensor, self._given, *map(number, parts), *results)
 
     def solve(self, F: Array, guess: Array) -> LocalSolution:
         """As `LocalProblem.solve`."""
         tensor, structure, stress = np.empty((3, len(F), 3, 3))
-        squared, converged = np.empty(len(F)), np.empty(len(F), np.bool_)
-        self._call("solve", F, guess, tensor, structure, stress, squared, converged)
-        found, lost = LocalSolution(F, tensor, structure, stress, squared, converged), np.flatnonzero(~converged)
+        squared, (converged, left_open) = np.empty(len(F)), np.empty((2, len(F)), np.bool_)
+        self._call("solve", F, guess, tensor, structure, stress, squared, converged, left_open)
+        found = LocalSolution(F, tensor, structure, stress, squared, converged)
+        if self.step.law.dimensions is None:  # numpy knows one more way there
+            left_open |= ~converged
+        lost = np.flatnonzero(left_open)
         if lost.size:
             put(found, lost, self.at(lost).solve(F[lost], guess[lost]))
         return found
 
-    def tangent(self, found: LocalSolution) -> Array:
+    def tangent(self, found: LocalSolution) -> Slopes:
         """As `LocalProblem.tangent`."""
-        lost, result = ~found.converged, np.empty((len(found.gradient), 3, 3, 3, 3))
-        self._call("tangent", found.gradient, found.driving_tensor, result)
-        if lost.any():
-            result[lost] = self.at(lost).tangent(at(found, lost))
+        n = len(found.gradient)
+        result, left_open = Slopes(np.empty((n, 3, 3, 3, 3)), np.empty((n, 6, 9))), np.empty(n, np.bool_)
+        self._call("tangent", found.gradient, found.driving_tensor, *result, left_open)
+        lost = np.flatnonzero(left_open | ~found.converged)
+        if lost.size:
+            put(result, lost, self.at(lost).tangent(at(found, lost)))
         return result

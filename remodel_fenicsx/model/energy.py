@@ -320,7 +320,7 @@ class Repulsion(WithParameters):
 
 
 REPULSIONS: dict[str, Repulsion] = {
-    "axes": Repulsion(axes_sum, terms=f"{LOCAL_PROBLEM}.axes_terms", sees_axes=True),
+    "axes": Repulsion(axes_sum, terms=f"{LOCAL_PROBLEM}.axes_terms", sees_axes=True, compiled="AXES"),
     "log": Repulsion(log_sum, log_derivatives, terms=f"{LOCAL_PROBLEM}.log_terms", compiled="LOG"),
     "length": Repulsion(length_sum, terms=f"{LOCAL_PROBLEM}.length_terms", compiled="LENGTH"),
 }

@@ -198,7 +198,9 @@ class Law:
     compiled: str = ""
 
 
-def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
+def ranked(
+    function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False, affine: bool = False
+) -> Law:
     """A law of the paper's kind (eqs. 8 to 11): axes at the drive's principal directions, dimensions by rank.
 
     Parameters
@@ -209,6 +211,9 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         kappa a number, or (n, 1) where regions differ. Points without a positive value, or kappa, keep their cells.
     has_limit, of_absolute_time
         As in `Law`.
+    affine
+        Whether l_new is an affine function of the target whose slope is the same for all ranks: the coupling
+        "implicit" is computed in C then.
 
     Returns
     -------
@@ -241,6 +246,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         keeps_symmetry=True,
         asks_kappa=True,
         response=f"{LOCAL_PROBLEM}.ranked_response",
+        compiled="AFFINE" if affine else "",
     )
 
 
@@ -399,9 +405,9 @@ def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> U
 
 
 LAWS: dict[str, Law] = {
-    "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
-    "rate": replace(ranked(rate), over_corrects=True),
-    "relaxation": ranked(relaxation, has_limit=True),
+    "explicit": ranked(explicit, has_limit=True, of_absolute_time=True, affine=True),
+    "rate": replace(ranked(rate, affine=True), over_corrects=True),
+    "relaxation": ranked(relaxation, has_limit=True, affine=True),
     "tensor": Law(
         tensor,
         has_limit=True,

@@ -345,7 +345,7 @@ def _drive(step: StepOfCells, strain: Strain, tensor: Array, old: UnitCell) -> D
     U[:, range(3), range(3)] = strain.stretches
     axes = carried_axes(U, old.axes) if step.carries_axes else old.axes
     steady = spectral.without_noise(tensor, axes, step.drive.rounding)  # more of it would be a jump of its own
-    return step.drive._replace(deformation_gradient=U, tensor=steady, kernels=spectral)
+    return step.drive._replace(deformation_gradient=U, tensor=steady)
 
 
 def _lengths_by_values(step: StepOfCells, found: Ranked) -> Array:
@@ -423,8 +423,14 @@ class LocalSolution(NamedTuple):
     first_piola_kirchhoff: Array
     squared_lengths: Array
     converged: Flags
-    cells: UnitCell | None = None
     turnover: Array | None = None
+
+
+class Slopes(NamedTuple):
+    """dP/dF (n, 3, 3, 3, 3), and that of D (n, 6, 9), in Mandel components of the global basis."""
+
+    tangent: Array
+    by_gradient: Array
 
 
 class Trial(NamedTuple):
@@ -484,8 +490,11 @@ class LocalProblem:
 
     def unit_cells(self, found: LocalSolution) -> UnitCell:
         """Lengths and axes, in the order of the cells at the start of the step."""
-        if found.cells is not None:
-            return found.cells
+        if self.step.law.dimensions is not None:
+            strain = Strain.of(found.gradient)
+            inside = self._respond(strain, strain.inside(found.driving_tensor), derivatives=False).cells.cell
+            assert inside is not None
+            return UnitCell(inside.dimensions, inside.axes @ np.swapaxes(strain.basis, 1, 2))
         squared, axes = spectral.continued(found.structure, self.step.cells.axes)
         return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
@@ -494,15 +503,13 @@ class LocalProblem:
         parts = trial.tensor, trial.cells.structure, trial.stress.value
         D, A, S = (strain.outside(tensor) for tensor in parts)
         squared = np.einsum("nii,ni->n", trial.cells.structure, strain.squared)
-        cells, turnover = trial.cells.cell, None
-        if cells is not None:
-            cells = UnitCell(cells.dimensions, cells.axes @ np.swapaxes(strain.basis, 1, 2))
+        turnover = None
         if self.step.turnover is not None:
             content, length, *_ = trial.stress.turned_over
             turnover = np.log(np.stack([content, length], axis=1))
             squared = squared * (self.tissue.natural_length / length) ** 2
         F = strain.gradient
-        return LocalSolution(F, D, A, F @ S, squared, trial.converged, cells, turnover)
+        return LocalSolution(F, D, A, F @ S, squared, trial.converged, turnover)
 
     # ------------------------------------------------------------ the functions of eq. (i1)
     def _driving(self, strain: Strain, stress: Array) -> Array:
@@ -581,8 +588,8 @@ class LocalProblem:
         return trial
 
     # ------------------------------------------------------------ the tangent
-    def tangent(self, found: LocalSolution) -> Array:
-        """dP/dF of eqs. (i2) and (i3), (n, 3, 3, 3, 3); the cells of points that have not converged stay."""
+    def tangent(self, found: LocalSolution) -> Slopes:
+        """Of eqs. (i2) and (i3); the cells of points that have not converged stay."""
         strain = Strain.of(found.gradient)
         tensor, C_F = strain.inside(found.driving_tensor), strain.by_gradient
         linear = self._linearised(strain, tensor)
@@ -596,12 +603,13 @@ class LocalProblem:
             linear.by_stretch[~found.converged] = 0.0
             at_fixed_tensor += linear.by_stretch @ strain.stretch_by_strain @ C_F
         right = linear.by_strain @ C_F + linear.by_stress @ at_fixed_tensor
-        by_gradient = at_fixed_tensor + linear.through_cells @ np.linalg.solve(linear.left, right)
+        slope: Array = np.linalg.solve(linear.left, right)
+        by_gradient = at_fixed_tensor + linear.through_cells @ slope
         # F dS is half of dC/dF, transposed, times dS
         result = (np.swapaxes(C_F, 1, 2) @ by_gradient / 2).reshape(-1, 3, 3, 3, 3)
         for i in range(3):
             result[:, i, :, i, :] += strain.outside(linear.stress.value)
-        return result
+        return Slopes(result, tensors.congruence(strain.basis) @ slope)
 
 
 # ---------------------------------------------------------------- parts of the model without derivatives

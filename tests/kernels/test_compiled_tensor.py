@@ -1,4 +1,4 @@
-"""The compiled law `tensor` and repulsion `log` do what numpy's do, without a mesh."""
+"""What tensor.c computes at points is what numpy does, without a mesh."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from mpi4py import MPI
 from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx.kernels.tensor import CompiledProblem, TensorKernels, problem_of
-from remodel_fenicsx.model import energy, local_problem
+from remodel_fenicsx.model import energy, local_problem, spectral
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import CHAINS, Chain
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.local_problem import LocalProblem
-from remodel_fenicsx.model.laws import Drive, tensor_target
-from tests.model.test_local_problem import deformations, points
+from remodel_fenicsx.model.laws import Drive, explicit, ranked, tensor_target
+from tests.model.test_local_problem import COMBINATIONS, deformations, points
 from tests.model.test_tensor_law import cells_of, right_cauchy_green, structures
 
 COUNT = 60
@@ -70,24 +70,30 @@ def compiled_twin(kernels: TensorKernels, some: LocalProblem) -> CompiledProblem
     return twin
 
 
-@pytest.mark.parametrize("name", [name for name, part in energy.REPULSIONS.items() if part.compiled])
-@pytest.mark.parametrize("driver", [name for name, part in DRIVERS.items() if part.compiled])
-def test_solution_and_tangent(kernels: TensorKernels, name: str, driver: str) -> None:
-    """Random cells, a stress that is partly compression; the last points with equal stretches."""
+@pytest.mark.parametrize(("law", "repulsion", "driver", "frame"), COMBINATIONS)
+def test_solution_and_slopes(kernels: TensorKernels, law: str, repulsion: str, driver: str, frame: str) -> None:
+    """Random cells. Of the law for A a stress that is partly compression, and equal stretches at the last points."""
     rng = np.random.default_rng(11)
-    F = deformations(COUNT, rng) + 0.05 * rng.standard_normal((COUNT, 3, 3))
-    F[-4:] = np.array([1.2, 1.2, 1.2, 1.2, 1.2, 0.8, 0.9, 1.3, 1.3, 0.9, 0.9, 0.9]).reshape(4, 3, 1) * np.eye(3)
-    kappa = np.linspace(0.02, 0.2, COUNT)  # of points in several regions
-    some = points("tensor", name, driver, "material", COUNT, "random", kappa=kappa)
+    F, kappa = deformations(COUNT, rng), np.linspace(0.0, 0.05, COUNT)  # of points in several regions
+    if law == "tensor":  # by rank such points have several solutions, or none
+        F += 0.05 * rng.standard_normal((COUNT, 3, 3))
+        F[-4:] = np.array([1.2, 1.2, 1.2, 1.2, 1.2, 0.8, 0.9, 1.3, 1.3, 0.9, 0.9, 0.9]).reshape(4, 3, 1) * np.eye(3)
+        kappa = 4 * kappa
+    some = points(law, repulsion, driver, frame, COUNT, "random", kappa=kappa)
     twin, start = compiled_twin(kernels, some), some.tensor_of(F, some.step.cells)
-    assert (np.linalg.eigvalsh(start) < 0).any() or driver == "finger"
+    assert law != "tensor" or driver == "finger" or (np.linalg.eigvalsh(start) < 0).any()
     expected, found = some.solve(F, start), twin.solve(F, start)
-    assert expected.converged.all() and found.converged.all()
-    for quantity in ("driving_tensor", "structure", "first_piola_kirchhoff", "squared_lengths"):
-        value = getattr(expected, quantity)
-        np.testing.assert_allclose(getattr(found, quantity), value, atol=1e-10 * np.abs(value).max(), err_msg=quantity)
-    tangent = some.tangent(expected)
-    np.testing.assert_allclose(twin.tangent(found), tangent, atol=1e-9 * np.abs(tangent).max())
+    few = 0 if law == "tensor" else COUNT // 20  # by rank there are folds, where rounding decides
+    assert (found.converged != expected.converged).sum() <= few
+    ok = expected.converged & found.converged
+    assert ok.mean() > (0.4 if driver == "pk2" and law != "tensor" else 0.85)  # it leaves many points without a state
+    names = "driving_tensor", "structure", "first_piola_kirchhoff", "squared_lengths"
+    pairs = {name: (getattr(found, name), getattr(expected, name)) for name in names}
+    pairs |= {str(at): pair for at, pair in enumerate(zip(twin.tangent(found), some.tangent(expected), strict=True))}
+    pairs["lengths"] = twin.unit_cells(found).dimensions, some.unit_cells(expected).dimensions
+    for name, (of_c, of_numpy) in pairs.items():
+        error = np.abs(of_c - of_numpy).reshape(COUNT, -1).max(axis=1) / np.abs(of_numpy[ok]).max()
+        assert (error[ok] > 1e-8).sum() <= few and np.median(error[ok]) < 1e-12, name
 
 
 def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,8 +115,8 @@ def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monke
     np.testing.assert_array_equal(found.converged, expected.converged)
     solved = found.converged
     np.testing.assert_allclose(found.structure[solved], expected.structure[solved], atol=1e-9)
-    tangent = some.tangent(expected)[1:]
-    np.testing.assert_allclose(twin.tangent(found)[1:], tangent, atol=1e-7 * np.abs(tangent).max())
+    tangent = some.tangent(expected).tangent[1:]
+    np.testing.assert_allclose(twin.tangent(found).tangent[1:], tangent, atol=1e-7 * np.abs(tangent).max())
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
@@ -121,21 +127,44 @@ def test_points_without_a_solution_have_the_tangent_of_their_cells(kernels: Tens
     twin, lost = compiled_twin(kernels, some), np.arange(COUNT) < share * COUNT
     found = twin.solve(F, some.tensor_of(F, some.step.cells))
     found.converged[lost] = False
-    tangent, kept = twin.tangent(found), some.tangent(found._replace(converged=np.zeros(COUNT, dtype=bool)))
+    tangent = twin.tangent(found).tangent
+    kept = some.tangent(found._replace(converged=np.zeros(COUNT, dtype=bool))).tangent
     np.testing.assert_allclose(tangent[lost], kept[lost], atol=1e-12 * np.abs(kept).max())
     assert lost.all() or np.abs(tangent[~lost] - kept[~lost]).max() > 1e-3
 
 
+def test_where_principal_values_agree_numpy_decides(kernels: TensorKernels, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of laws by rank alone, whose axes are then those that were; points without a solution are not tried again."""
+    rng = np.random.default_rng(4)
+    F = deformations(COUNT, rng)
+    F[: COUNT // 3] = np.diag([0.95, 0.95, 1.3])
+    some = points("explicit", "axes", "cauchy", "material", COUNT, "isotropic", kappa=0.05)
+    twin, start = compiled_twin(kernels, some), some.tensor_of(F, some.step.cells)
+    asked: list[int] = []
+    solve = LocalProblem.solve
+    monkeypatch.setattr(LocalProblem, "solve", lambda self, F, *given: asked.append(len(F)) or solve(self, F, *given))
+    expected, found = some.solve(F, start), twin.solve(F, start)
+    assert expected.converged.all() and found.converged.all() and asked == [COUNT, COUNT // 3]
+    np.testing.assert_allclose(found.structure, expected.structure, atol=1e-10)
+    tangent = some.tangent(expected).tangent
+    np.testing.assert_allclose(twin.tangent(found).tangent, tangent, atol=1e-9 * np.abs(tangent).max())
+    torn = np.tile(np.diag([0.9, 1.0, 2.5]), (COUNT, 1, 1)) + 0.01 * rng.standard_normal((COUNT, 3, 3))
+    asked.clear()
+    assert not twin.solve(torn, start).converged.any() and not asked
+
+
 def test_parts_that_the_kernel_does_not_know_are_numpys(kernels: TensorKernels) -> None:
-    """Another law, frame or chain: no silent stand-in."""
-    some = points("tensor", "log", "cauchy", "material", 2)
-    for tissue, step in (
-        (some.tissue, points("explicit", "log", "cauchy", "material", 2).step),
-        (some.tissue, points("tensor", "log", "cauchy", "spatial", 2).step),
-        (replace(some.tissue, chain=SPRING), some.step),
+    """Another chain, pairing or law: no silent stand-in."""
+    some = points("explicit", "log", "cauchy", "material", 2)
+    tissue, step = some.tissue, some.step
+    curved = ranked(lambda l, l0, target, *rest: explicit(l, l0, target**2, *rest))
+    for other, another in (
+        (tissue, step._replace(law=curved)),
+        (tissue, step._replace(drive=step.drive._replace(pairing=spectral.continued))),
+        (replace(tissue, chain=SPRING), step),
     ):
-        assert type(problem_of(kernels, tissue, step)) is LocalProblem
-    assert type(problem_of(None, some.tissue, some.step)) is LocalProblem
+        assert type(problem_of(kernels, other, another)) is LocalProblem
+    assert type(problem_of(None, tissue, step)) is LocalProblem
 
 
 SPRING = Chain(lambda r, L: 0.35 * r**2, lambda r, L: 0.7 + 0.0 * r, locks=False)
