@@ -4,7 +4,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#include "axes.h"
+#include "principal.h"
 
 #define ROOT_2 1.4142135623730951
 #define ALL(i) for (int i = 0; i < 3; ++i)

@@ -3,7 +3,7 @@
    that are weak) nothing is decided here: the point is marked, and spectral.py does it. */
 #include <math.h>
 #include <stdint.h>
-#include "axes.h"
+#include "principal.h"
 
 static inline double largest_of(const double *x, int count)
 {

@@ -1,6 +1,6 @@
 /* Principal values and axes of symmetric tensors, and what is done with axes. */
-#ifndef AXES_H
-#define AXES_H
+#ifndef PRINCIPAL_H
+#define PRINCIPAL_H
 #include <math.h>
 #define DIAGONAL 1e-18  /* what may be left off the diagonal: the axes are then exact to this over the gap */
 #if defined(__AVX512F__) && defined(__GNUC__) && !defined(__clang__)
