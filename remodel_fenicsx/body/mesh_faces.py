@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, as_rows, distinct, in_place
 from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.model.tensors import det
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
 
@@ -242,7 +243,8 @@ def jacobian_determinants(file: MeshFile) -> Array:
     table: Any = element.tabulate(1, np.asarray(points))
     slopes = table[1:, :, :, 0]  # (3, points, nodes)
     nodes = file.points[file.cells[:, node_order(file)]]
-    return np.asarray(np.linalg.det(np.einsum("dpn,cni->cpdi", slopes, nodes)))
+    jacobians = np.tensordot(nodes, slopes, axes=(1, 2))  # (elements, coordinates, directions, points)
+    return np.asarray(det(np.moveaxis(jacobians, 3, 1)))
 
 
 def node_order(file: MeshFile) -> NDArray[np.int64]:
