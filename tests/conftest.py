@@ -19,7 +19,7 @@ import pytest
 
 from remodel_fenicsx import cli
 from remodel_fenicsx.system import children
-from tests.forks import ForkedChild, end_forks, forked
+from tests.forks import ForkedChild, end_forks, forked, readers_are_forks
 
 CASE = Path(__file__).with_name("run_case.py")
 Case = Callable[..., dict[str, Any]]
@@ -41,7 +41,7 @@ def slowly(*cases: Any) -> list[Any]:
 def forked_children() -> Iterator[None]:
     """Within, the runs that figures, ensembles and trades start are forked, one after the other."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(children, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": ForkedChild}))
+        patch.setattr(children, "subprocess", SimpleNamespace(**vars(children.subprocess) | {"Popen": ForkedChild}))
         yield
 
 
@@ -62,6 +62,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
 @pytest.fixture(scope="session", autouse=True)
 def forks_end_with_the_session() -> Iterator[None]:
     """Whoever asked for them."""
+    readers_are_forks()
     yield
     end_forks()
 

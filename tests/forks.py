@@ -12,17 +12,22 @@ import gc
 import importlib
 import importlib.metadata
 import json
+import logging
 import os
+import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 import traceback
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+from remodel_fenicsx.system import children
 from remodel_fenicsx.system.children import SERVE
 
 # before a program: a mesh of few elements for every tube
@@ -135,6 +140,35 @@ class ForkedChild:
         """It has ended."""
 
 
+def read_in_a_fork(command: Sequence[str], **_: Any) -> subprocess.CompletedProcess[bytes]:
+    """Stands for subprocess.run in `remodel_fenicsx.system.children`: a reader with its limits, in a fork."""
+    reader, *words, memory = command[command.index("remodel_fenicsx.system.children") + 1 :]
+    for module in ("meshio", reader.partition(":")[0]):
+        importlib.import_module(module)
+    with tempfile.TemporaryFile() as said, warnings.catch_warnings(action="ignore"):
+        child = os.fork()
+        if not child:
+            logging.root.handlers.clear()
+            sys.stdout = sys.stderr = open(os.dup(said.fileno()), "w", buffering=1)
+            for stream in (1, 2):
+                os.dup2(said.fileno(), stream)
+            here = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            try:
+                children.read_as_child(reader, *words, str(int(memory) + here))
+            except SystemExit as end:
+                print(end.code)
+                os._exit(1)
+            os._exit(0)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        said.seek(0)
+        return subprocess.CompletedProcess(command, status, b"", said.read())
+
+
+def readers_are_forks() -> None:
+    """From here on in this process and its children; tests/body/test_guarded.py has readers that start."""
+    children.subprocess = SimpleNamespace(**vars(subprocess) | {"run": read_in_a_fork})  # type: ignore[assignment]
+
+
 # ---------------------------------------------------------------- the process itself
 def four_layers(words: list[str]) -> int:
     """remodel-fenicsx with another mesh of the tube: around, through, along."""
@@ -228,6 +262,7 @@ if __name__ == "__main__":
     for module in (
         "gmsh",
         "h5py",
+        "meshio",
         "remodel_fenicsx.body.tube",
         "remodel_fenicsx.body.domain",
         "remodel_fenicsx.running",
@@ -235,6 +270,7 @@ if __name__ == "__main__":
     ):
         importlib.import_module(module)
     what_is_imported_stays()
+    readers_are_forks()
     gc.freeze()  # children share what is there: no collection goes through it
     if sys.argv[1:]:
         sys.exit(four_layers(sys.argv[1:]))

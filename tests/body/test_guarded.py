@@ -6,6 +6,7 @@ import base64
 import os
 import resource
 import struct
+import subprocess
 import sys
 import time
 import zlib
@@ -108,6 +109,12 @@ def of_type(number: int) -> Callable[[Path], None]:
         path.write_text(f"{text[:start]}{number}{text[text.index('</DataArray>', start) :]}")
 
     return change
+
+
+@pytest.fixture(autouse=True)
+def readers_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In processes of their own, as for users."""
+    monkeypatch.setattr(guarded, "subprocess", subprocess)
 
 
 CASES: dict[str, tuple[str, Callable[[Path], None], str]] = {
