@@ -14,14 +14,22 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.body import tendon
-from remodel_fenicsx.scene.scene import scene_from_dict
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
+from remodel_fenicsx.unloading import as_unloaded
+from tests.forks import readers_are_forks
 from tests.parts import tube
 
 
 def main(out: str, request: dict) -> None:
     """Run and save; everything is gathered in the mesh file's order."""
-    scene = scene_from_dict(request["scene"])
+    readers_are_forks()
+    with as_unloaded(scene_from_dict(request["scene"]), MPI.COMM_WORLD) as scene:
+        run(out, request, scene)
+
+
+def run(out: str, request: dict, scene: Scene) -> None:
+    """Of the unloaded body, where the scene has a loaded one."""
     domain = None
     body = scene.geometry
     if body.shape == "tendon":

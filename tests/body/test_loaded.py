@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +13,9 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, read_scene, run, unloaded
 from remodel_fenicsx.body.mesh_file import read_mesh
 from remodel_fenicsx.unloading import NoUnloadedShape
-from tests.conftest import Refused
+from tests.conftest import Cases, Refused
 from tests.body.test_natural import scene
-from tests.mesh_files import write_tube
+from tests.mesh_files import TUBE, write_tube
 from tests.runs import last_row, made, simulated
 from tests.values import isotropic, ramped
 
@@ -74,16 +72,19 @@ def test_the_scan_of_a_tube_that_has_remodeled() -> None:
 
 
 # ---------------------------------------------------------------- bodies from a file
-def own_scene(folder: Path, pressure: float = 2.4) -> Path:
+def own_values(file: str, pressure: float = 2.4) -> dict[str, Any]:
     """A tube from a file that is the loaded one."""
-    file = write_tube(folder / "loaded.msh", counts=(8, 2, 4))
-    values = isotropic(
-        None, "auto", geometry={"shape": "mesh", "file": file.name, "is": "loaded"}, remodeling={"law": "none"},
+    return isotropic(
+        None, "auto", geometry={"shape": "mesh", "file": file, "is": "loaded"}, remodeling={"law": "none"},
         loads=ramped(5.0, pressure=pressure, elongation=0.1), time={"end": 5.0, "step": 1.0},
         solver={"method": "direct"},
     )  # fmt: skip
+
+
+def own_scene(folder: Path, pressure: float = 2.4) -> Path:
+    file = write_tube(folder / "loaded.msh", counts=(8, 2, 4))
     path = folder / "scene.toml"
-    path.write_text(tomlkit.dumps(values))
+    path.write_text(tomlkit.dumps(own_values(file.name, pressure)))
     return path
 
 
@@ -117,13 +118,14 @@ def test_every_node_of_an_own_body_comes_back(
     assert len(loads) == 8
 
 
-def test_two_ranks_find_the_same(tmp_path: Path) -> None:
-    of = own_scene(tmp_path)
-    for ranks in (1, 2):
-        line = ["mpirun", "-n", str(ranks), sys.executable, "-m", "remodel_fenicsx", "run", str(of), "-q"]
-        subprocess.run([*line, "-o", str(tmp_path / str(ranks))], check=True, timeout=200, capture_output=True)
-    found = [read_mesh(tmp_path / name / "unloaded.msh").points for name in ("1", "2")]
-    np.testing.assert_allclose(*found, rtol=0, atol=1e-9)
+ON_ONE_AND_TWO_RANKS = [{"scene": own_values(str(TUBE))}]
+
+
+def test_two_ranks_find_the_same(cases: Cases) -> None:
+    """Nodes of the body, and where its points lie before."""
+    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    for name in ("x", "u"):
+        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-9)
 
 
 def test_what_has_no_unloaded_shape_says_at_which_share(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
