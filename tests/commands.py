@@ -15,10 +15,12 @@ from mpi4py import MPI
 
 import remodel_fenicsx.body.tube
 from remodel_fenicsx import cli
+from tests.forks import readers_are_forks
 
 
 def main(folder: Path) -> None:
     """All of them; what they do not say goes to the streams that this process had at first."""
+    readers_are_forks()
     remodel_fenicsx.body.tube.PAPER = (8, 4, 1)
     codes, own = {}, [os.dup(1), os.dup(2)]
     for name, words in json.loads((folder / "commands.json").read_text()).items():
