@@ -1,13 +1,7 @@
-"""Bodies with an inner and an outer face, an inlet and an outlet, with their directions known or made by Gmsh.
-
-    mpirun -n 2 python3 -m mpi4py tests/own_bodies.py FILE
-
-writes the local axes of a bend, found on all ranks, in the order of its elements.
-"""
+"""Bodies with an inner and an outer face, an inlet and an outlet, with their directions known or made by Gmsh."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -204,9 +198,3 @@ def gathered_bend(comm: Any) -> dict[str, Array] | None:
     whole = {name: domain.gather_elements(array) for name, array in values.items()}
     whole["nodal_depth"] = domain.gather_nodes(made.nodal_depth)
     return whole if comm.rank == 0 else None
-
-
-if __name__ == "__main__":
-    result = gathered_bend(MPI.COMM_WORLD)
-    if result is not None:
-        np.savez(sys.argv[1], **result)

@@ -5,10 +5,7 @@ Limits in degrees are 1.2 times what the method was measured to reach when it wa
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +16,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.axes import MOST_UNDEFINED, UndefinedAxes
 from tests import own_bodies, parts
+from tests.conftest import Cases
 from tests.own_bodies import KnownBody, apart, bent, elliptic, fork, found, ring, straight
 
 TORUS = bent((1.0, 2.0), bend=6.0, angle=np.pi / 3)
@@ -116,18 +114,14 @@ def test_axes_are_a_right_handed_frame_and_a_turned_body_has_turned_ones() -> No
     np.testing.assert_allclose(second.thickness, 1000.0 * first.thickness, rtol=1e-6)
 
 
-def test_two_ranks_give_the_same(tmp_path: Path) -> None:
-    expected = own_bodies.gathered_bend(MPI.COMM_SELF)
-    assert expected is not None
-    program = [sys.executable, "-m", "mpi4py", own_bodies.__file__, str(tmp_path / "two.npz")]
-    own = ("OMPI_COMM_", "PMIX_", "PRTE_JOB")
-    alone = {name: text for name, text in os.environ.items() if not name.startswith(own)}
-    words = ["mpirun", "-n", "2", "--oversubscribe", *program]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=alone)
-    assert done.returncode == 0, done.stderr
-    with np.load(tmp_path / "two.npz") as two:
-        for name, values in expected.items():
-            np.testing.assert_allclose(two[name], values, atol=1e-8, err_msg=name)
+ON_ONE_AND_TWO_RANKS = [{"scene": "a bend with legs"}]
+
+
+def test_two_ranks_give_the_same(cases: Cases) -> None:
+    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    assert {"axes", "depth", "station", "thickness", "nodal_depth"} == set(one)
+    for name, values in one.items():
+        np.testing.assert_allclose(two[name], values, atol=1e-8, err_msg=name)
 
 
 # ---------------------------------------------------------------- forks

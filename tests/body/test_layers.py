@@ -115,7 +115,7 @@ def test_two_layers_in_three_dimensions_are_those_of_the_reference() -> None:
 def write_layers(path: Path, radii: tuple[float, ...] = (1.0, INTERFACE, 3.0), turn: Any = None) -> Path:
     """The same tube as a mesh file by the script of a demo, whose numbers are set and whose bend is left out."""
     script: Any = runpy.run_path(str(Path(__file__).parents[2] / "demos" / "bent_vessel" / "mesh.py"))
-    numbers = {"RADII": radii, "LENGTH": 0.5, "AROUND": 32, "THROUGH": 4, "ALONG": 1}
+    numbers = {"RADII": radii, "LENGTH": 0.5, "AROUND": 24, "THROUGH": 2, "ALONG": 1}
     script["straight"].__globals__.update(numbers)
     with gmsh_model("layers") as gmsh:
         script["straight"]()
