@@ -178,7 +178,10 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
     begin, go_on = (lambda name: ["run", str(scene), "-o", folders[name]]), ["--no-report", "--set", "time.end=2"]
     assert run(*begin("whole"), "--no-report").returncode == 0
     assert run(*begin("one"), *go_on).returncode == 0
-    commands = {"three": [*begin("three"), *go_on], "one": ["run", "--resume", folders["one"], *go_on[:2], "time.end=3"]}
+    commands = {
+        "three": [*begin("three"), *go_on],
+        "one": ["run", "--resume", folders["one"], *go_on[:2], "time.end=3"],
+    }
     (tmp_path / "commands.json").write_text(json.dumps(commands))
     program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(tmp_path)]
     done = subprocess.run(mpirun(3, *program), capture_output=True, text=True, timeout=300)

@@ -138,23 +138,23 @@ def rows(**changes: Any) -> list[dict[str, float]]:
 def test_couplings_see_the_residual_stress() -> None:
     """Staggered, extrapolated and implicit steps tend to one way; the tangent of implicit steps sees G."""
     ends, iterations = {}, {}
-    for coupling, step in (("staggered", 0.25), ("extrapolated", 1.0), ("implicit", 0.5)):
+    for coupling, step in (("staggered", 0.25), ("extrapolated", 1.0), ("implicit", 1.0)):
         run = rows(**{"remodeling.coupling": coupling, "time.step": step, "time.end": 40.0})
         ends[coupling], iterations[coupling] = run[-1], sum(row["newton_iterations"] for row in run)
     for column, close in (("inner_radius", 3e-3), ("fibre_angle_inner", 0.25), ("fibre_angle_outer", 0.15)):
         for coupling in ("staggered", "implicit"):
             assert ends[coupling][column] == pytest.approx(ends["extrapolated"][column], abs=close), (coupling, column)
     without = rows(
-        **{"remodeling.coupling": "implicit", "time.step": 0.5, "time.end": 40.0, "natural.opening_angle": 0.0}
+        **{"remodeling.coupling": "implicit", "time.step": 1.0, "time.end": 40.0, "natural.opening_angle": 0.0}
     )
     assert iterations["implicit"] <= 1.2 * sum(row["newton_iterations"] for row in without)
 
 
 def test_the_equilibrium_is_the_end_of_time() -> None:
-    """A march to t = 2000 and `time.end = "equilibrium"` come to the same tube."""
+    """A march to t = 1000 and `time.end = "equilibrium"` come to the same tube."""
     common = {"remodeling.coupling": "extrapolated"}
     limit = rows(**common, **{"time.end": "equilibrium"})[-1]
-    march = rows(**common, **{"time.end": 2000.0, "time.step": 5.0})[-1]
+    march = rows(**common, **{"time.end": 1000.0, "time.step": 5.0})[-1]
     for column, close in (("inner_radius", 1e-4), ("outer_radius", 1e-4), ("fibre_angle_outer", 0.05)):
         assert limit[column] == pytest.approx(march[column], abs=close), column
 
@@ -202,12 +202,12 @@ def test_a_tube_of_stretched_layers_keeps_its_shape_without_loads() -> None:
         assert axial[radius > 2].min() > 0.3 > -0.3 > axial[radius < 2].max()
 
 
-def ends_of_layers(axial: float) -> tuple[float, float]:
+def ends_of_layers(axial: float, **more: Any) -> tuple[float, float]:
     """Angles where the inner two thirds of a thin wall end and where its outer third begins, t = 150."""
     changes = {"natural.opening_angle": 0.0, "natural.layers": layers((2 / 3, {"axial": axial})), "time.end": 150.0}
     thin = {"geometry.outer_radius": 1.3, "loads.pressure.value": 1.2, "mesh.refinement": 3}
     with made(
-        scene("radial", **changes, **thin, **{"remodeling.law": "tensor", "material.repulsion": "log"})
+        scene("radial", **changes, **thin, **more, **{"remodeling.law": "tensor", "material.repulsion": "log"})
     ) as simulation:
         last = list(simulation.steps())[-1]
         angle = Measurement(simulation.observer, last).fibre_angle.ravel()
@@ -218,18 +218,19 @@ def ends_of_layers(axial: float) -> tuple[float, float]:
 
 
 def test_stretched_layers_make_a_step_of_the_angle(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The outer third prestretched by 5, 10 and 20 %; an independent solver does not let the layers come to rest.
+    """The outer third prestretched by 5 and 20 %; an independent solver does not let the layers come to rest.
 
     Where they do, the step begins at smaller angles.
     """
-    rested = [ends_of_layers(axial) for axial in (1.05, 1.1, 1.2)]
+    large = {"remodeling.coupling": "extrapolated", "time.step": 5.0}
+    rested = [ends_of_layers(axial, **large) for axial in (1.05, 1.2)]
 
     def held(of: Any, angle: float) -> Closing:
         alone = closing([layer._replace(prestretch=(1.0, 1.0, 1.0)) for layer in of], angle)
         return alone._replace(layers=tuple(of))
 
     monkeypatch.setattr("remodel_fenicsx.model.residual_stress.closing", held)
-    for axial, here, known in zip((1.05, 1.1, 1.2), rested, ((19, 36), (18, 56), (18, 76)), strict=True):
+    for axial, here, known in zip((1.05, 1.2), rested, ((19, 36), (18, 76)), strict=True):
         found = ends_of_layers(axial)
         assert found == pytest.approx(known, abs=0.6)
         assert here[0] < found[0] - 2 and here[1] < found[1] - 3 and here[1] - here[0] > 10
