@@ -111,12 +111,6 @@ def of_type(number: int) -> Callable[[Path], None]:
     return change
 
 
-@pytest.fixture
-def readers_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In processes of their own, as for users."""
-    monkeypatch.setattr(guarded, "subprocess", subprocess)
-
-
 CASES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "utf-16": (".xdmf", utf16, "no XML in UTF-8"),
     "values in HDF5": (".xdmf", in_hdf5, "no XML in UTF-8"),
@@ -135,12 +129,10 @@ CASES: dict[str, tuple[str, Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_is_refused_in_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_it_is_refused_in_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each by its own rule: what the library would say of it is another matter."""
     if name in ("utf-16", "a bomb"):  # whose memory is looked at
-        request.getfixturevalue("readers_start")
+        monkeypatch.setattr(guarded, "subprocess", subprocess)
     monkeypatch.setattr(guarded, "SECONDS", 3.0)
     ending, change, rule = CASES[name]
     path = good(tmp_path / f"mesh{ending}")
@@ -164,9 +156,9 @@ def test_a_long_complaint_is_cut(tmp_path: Path) -> None:
     assert len(str(refusal.value)) < 300
 
 
-@pytest.mark.usefixtures("readers_start")
-def test_what_a_reader_warns_of_is_a_fault(tmp_path: Path) -> None:
+def test_what_a_reader_warns_of_is_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A library that leaves something out says so on its own; a mesh without it is another one."""
+    monkeypatch.setattr(guarded, "subprocess", subprocess)
     path = good(tmp_path / "mesh.vtu")
     with pytest.raises(guarded.UnreadableFile, match="left out"):
         guarded.read_guarded(path, f"{__name__}:reader_that_warns")
@@ -187,9 +179,9 @@ READERS = {
 }
 
 
-@pytest.mark.usefixtures("readers_start")
 @pytest.mark.parametrize("reader", READERS)
 def test_a_new_reader_has_the_limits(reader: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guarded, "subprocess", subprocess)
     monkeypatch.setattr(guarded, "SECONDS", 1.0 if reader == "never_ends" else 2.0)
     path, began = good(tmp_path / "mesh.vtu"), time.monotonic()
     with pytest.raises(guarded.UnreadableFile, match=READERS[reader]):
@@ -197,9 +189,9 @@ def test_a_new_reader_has_the_limits(reader: str, tmp_path: Path, monkeypatch: p
     assert time.monotonic() - began < guarded.WAITING * guarded.SECONDS
 
 
-@pytest.mark.usefixtures("readers_start")
 def test_a_reader_that_waits_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes no processor time."""
+    monkeypatch.setattr(guarded, "subprocess", subprocess)
     monkeypatch.setattr(guarded, "WAITING", 0.2)
     with pytest.raises(guarded.UnreadableFile, match="takes more than"):
         guarded.read_guarded(good(tmp_path / "mesh.vtu"), f"{__name__}:waits")
