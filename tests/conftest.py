@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -43,6 +44,33 @@ def forked_children() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(children, "subprocess", SimpleNamespace(**vars(children.subprocess) | {"Popen": ForkedChild}))
         yield
+
+
+@pytest.fixture(scope="session")
+def display() -> Iterator[dict[str, str]]:
+    """Variables of one window system for all that is drawn in space; none where VTK gets by without."""
+    told = "import json, os, sys; print(json.dumps({**os.environ}), flush=True); sys.stdin.read()"
+    command = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24", sys.executable, "-c", told]
+    if shutil.which("xvfb-run"):
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as shown:
+            inside = json.loads(shown.stdout.readline())  # type: ignore[union-attr]
+            yield {name: inside[name] for name in ("DISPLAY", "XAUTHORITY")}
+            shown.stdin.close()  # type: ignore[union-attr]
+    else:
+        yield {}
+
+
+@pytest.fixture
+def drawn_by_forks(display: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures in space are drawn by children of the process that has imported all."""
+    program = "import sys; from remodel_fenicsx.pictures import bodies; bodies.main(sys.argv[1])"
+    imports = ("remodel_fenicsx.pictures.bodies", "pyvista.plotting", "matplotlib.backends.backend_agg")
+
+    def draw(command: Sequence[str], env: dict[str, str], **_: Any) -> subprocess.CompletedProcess[str]:
+        return forked("python", program, command[-1], variables=env | display, imports=imports)
+
+    drawing = SimpleNamespace(**vars(subprocess) | {"run": draw})
+    monkeypatch.setattr("remodel_fenicsx.pictures.bodies.subprocess", drawing)
 
 
 @pytest.fixture

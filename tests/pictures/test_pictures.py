@@ -26,7 +26,7 @@ Drawn = Callable[..., np.ndarray]
 
 
 @pytest.fixture
-def drawn(recorded: Recorded, tmp_path: Path) -> Drawn:
+def drawn(recorded: Recorded, tmp_path: Path, drawn_by_forks: None) -> Drawn:
     """drawn(name of a run, options) -> the picture in 0..255, (rows, columns, 3)."""
 
     def draw(name: str, *options: str) -> np.ndarray:
@@ -146,6 +146,13 @@ def test_colours_are_those_of_the_scale_and_no_other(drawn: Drawn) -> None:
 
 
 # ---------------------------------------------------------------- files
+@pytest.fixture
+def empty_sheets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of what is drawn, where the file alone is looked at."""
+    monkeypatch.setattr(rendering, "render", lambda sheets, _: [np.zeros((9, 9, 3), np.uint8) for _ in sheets])
+
+
+@pytest.mark.usefixtures("empty_sheets")
 def test_a_picture_says_what_it_is_and_where_it_comes_from(recorded: Recorded, tmp_path: Path) -> None:
     folder = shutil.copytree(recorded("cube"), tmp_path / "run")
     for number in range(2):
@@ -160,6 +167,7 @@ def test_a_picture_says_what_it_is_and_where_it_comes_from(recorded: Recorded, t
         assert stat.S_IMODE((folder / name).stat().st_mode) & 0o044 == 0o044 & ~os.umask(os.umask(0o022))
 
 
+@pytest.mark.usefixtures("drawn_by_forks")
 def test_a_pdf_shows_the_body(recorded: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "cube.PDF"
     assert cli.main(["picture", str(recorded("cube")), "-o", str(path)]) == 0
@@ -167,7 +175,8 @@ def test_a_pdf_shows_the_body(recorded: Recorded, tmp_path: Path) -> None:
     assert content.startswith(b"%PDF") and b"/Image" in content
 
 
-@pytest.mark.parametrize(("ending", "frames", "expected"), [("gif", 5, 5), ("webp", 4, 4), ("gif", 60, 11)])
+@pytest.mark.usefixtures("drawn_by_forks")
+@pytest.mark.parametrize(("ending", "frames", "expected"), [("gif", 5, 5), ("webp", 4, 4)])
 def test_an_animation_has_so_many_frames_that_differ(
     recorded: Recorded, tmp_path: Path, ending: str, frames: int, expected: int
 ) -> None:
@@ -209,13 +218,14 @@ def test_bad_input_is_one_line_and_writes_nothing(
     folder = recorded(name)
     before = sorted(os.listdir(folder))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(rendering.subprocess, "run", lambda *command, **how: pytest.fail("something was drawn"))
+    monkeypatch.setattr(rendering, "render", lambda *_: pytest.fail("something was drawn"))
     message = refused(*(folder if word == "DIR" else word for word in words.split()))
     assert message.startswith(said.replace("DIR", str(folder)))
     assert os.listdir() == [] and sorted(os.listdir(folder)) == before
 
 
 # ---------------------------------------------------------------- what belongs to others
+@pytest.mark.usefixtures("empty_sheets")
 @pytest.mark.parametrize("kind", ["file", "link", "broken link", "folder"])
 def test_nothing_is_overwritten(
     recorded: Recorded, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture, refused: Refused
