@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.body import tendon
-from remodel_fenicsx.scene.scene import Scene, scene_from_dict
+from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.unloading import as_unloaded
 from tests.forks import readers_are_forks
@@ -30,34 +30,25 @@ def main(out: str, request: dict) -> None:
             np.savez(out, **found)  # type: ignore[arg-type]
         return
     with as_unloaded(scene_from_dict(request["scene"]), MPI.COMM_WORLD) as scene:
-        run(out, request, scene)
-
-
-def run(out: str, request: dict, scene: Scene) -> None:
-    """Of the unloaded body, where the scene has a loaded one."""
-    domain = None
-    body = scene.geometry
-    if body.shape == "tendon":
-        tendon.ALONG = (request["divisions"] or [10])[-1]
-    elif request["divisions"]:
-        domain = tube(
-            body.inner_radius, body.outer_radius, body.length, scene.mesh.degree, divisions=request["divisions"]
-        )
-    simulation = Simulation(scene, MPI.COMM_WORLD, domain)
-    domain, cells, quadrature = simulation.domain, simulation.cells, simulation.quadrature
-    rows = [step.row for step in simulation.steps()]
-    saved: dict[str, object] = {"u": simulation.state.gathered_displacement()}
-    for name, values in {
-        "l": cells.dimension_values,
-        "l0": cells.initial_dimensions,
-        "n": cells.axis_values,
-        "x": quadrature.coordinates,
-    }.items():
-        saved[name] = domain.gather_elements(values)
-    if MPI.COMM_WORLD.rank == 0:
-        columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        np.savez(out, **columns, **saved)  # type: ignore[arg-type]
-    simulation.close()
+        domain = None
+        body = scene.geometry
+        if body.shape == "tendon":
+            tendon.ALONG = (request["divisions"] or [10])[-1]
+        elif request["divisions"]:
+            domain = tube(
+                body.inner_radius, body.outer_radius, body.length, scene.mesh.degree, divisions=request["divisions"]
+            )
+        simulation = Simulation(scene, MPI.COMM_WORLD, domain)
+        domain, cells, quadrature = simulation.domain, simulation.cells, simulation.quadrature
+        rows = [step.row for step in simulation.steps()]
+        saved: dict[str, object] = {"u": simulation.state.gathered_displacement()}
+        of_points = {"l": cells.dimension_values, "l0": cells.initial_dimensions, "n": cells.axis_values}
+        for name, values in (of_points | {"x": quadrature.coordinates}).items():
+            saved[name] = domain.gather_elements(values)
+        if MPI.COMM_WORLD.rank == 0:
+            columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+            np.savez(out, **columns, **saved)  # type: ignore[arg-type]
+        simulation.close()
 
 
 if __name__ == "__main__":
