@@ -120,15 +120,6 @@ def test_the_paper_artery_with_residual_stress(angle: float) -> None:
     assert row["fibre_angle_outer"] == pytest.approx(turned, abs=1.5)
 
 
-def test_reduced_kinematics_agree_with_residual_stress() -> None:
-    """One radius and a half-plane have the same elements through the wall: the same rows."""
-    rows = []
-    for kinematics in ("radial", "axisymmetric"):
-        rows.append(last_row(scene(kinematics, **{"time.end": 12.0})))
-    for column in ("inner_radius", "outer_radius", "fibre_angle_outer"):
-        assert rows[0][column] == pytest.approx(rows[1][column], rel=2e-3), column
-
-
 def rows(**changes: Any) -> list[dict[str, float]]:
     """Of the radial tube of 120 degrees with the law `tensor`."""
     values = {"remodeling.law": "tensor", "material.repulsion": "log"}
