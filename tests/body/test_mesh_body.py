@@ -155,7 +155,7 @@ file = "mesh/tube.msh"
 value = 2.0
 ramp = [[0.0, 0.0], [2.0, 1.0]]
 [time]
-end = 4.0
+end = 3.0
 step = 1.0
 [solver]
 method = "iterative"
@@ -175,12 +175,12 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
     scene = tmp_path / "vessel.toml"
     scene.write_text(RUN)
     folders = {name: str(tmp_path / name) for name in ("whole", "three", "one")}
-    begin, go_on = (lambda name: ["run", str(scene), "-o", folders[name]]), ["--no-report", "--set", "time.end=2"]
+    begin, go_on = (lambda name: ["run", str(scene), "-o", folders[name]]), ["--no-report", "--set", "time.end=1"]
     assert run(*begin("whole"), "--no-report").returncode == 0
     assert run(*begin("one"), *go_on).returncode == 0
     commands = {
         "three": [*begin("three"), *go_on],
-        "one": ["run", "--resume", folders["one"], *go_on[:2], "time.end=3"],
+        "one": ["run", "--resume", folders["one"], *go_on[:2], "time.end=2"],
     }
     (tmp_path / "commands.json").write_text(json.dumps(commands))
     program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(tmp_path)]
@@ -190,7 +190,7 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
     assert copy.read_bytes() == file.read_bytes()
     file.unlink()  # the run has its own
     for name in ("three", "one"):
-        assert run("run", "--resume", folders[name], "--set", "time.end=4", "--no-report").returncode == 0
+        assert run("run", "--resume", folders[name], "--set", "time.end=3", "--no-report").returncode == 0
         np.testing.assert_allclose(_history(tmp_path / name), _history(tmp_path / "whole"), rtol=1e-8, atol=1e-10)
     copy.write_text(copy.read_text() + "\n")
     refused = run("run", "--resume", folders["three"], "--set", "time.end=5")

@@ -89,7 +89,9 @@ def test_residual_and_tangent_are_the_slopes_of_the_energy(loaded_cube: Any) -> 
 @pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
 def test_pressure_tangent_is_symmetric_on_the_artery_and_not_with_free_ends(element: str) -> None:
     """The ends slide in planes: the edge terms vanish and the pressure has a potential."""
-    made = parts.body(tube(length=2.0, element=element), Cells(initial="isotropic", axes="cylindrical"))
+    made = parts.body(
+        tube(length=2.0, element=element, divisions=(8, 2, 3)), Cells(initial="isotropic", axes="cylindrical")
+    )
     made.loading.hold_face("bottom", 2)
     made.loading.hold_face("top", 2)
     made.loading.add_follower_pressure("pressure", "inner")

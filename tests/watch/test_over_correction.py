@@ -114,15 +114,21 @@ class Scripted:
         self.simulation.cells.dimension_values[..., 2] = np.sqrt(0.5 + 0.01 * number + swing)
         return Step(float(number), number, {"force": 1.0}, self.stepper.coupling.equilibrium.extension(), Work())
 
+    def passes(self, last: int, rest: int = 0) -> None:
+        """Until the last one; in one of them the cells may rest."""
+        self.watcher.started(self.step(0))
+        for number in range(1, last + 1):
+            step = self.step(number)
+            if number == rest:
+                self.step(number - 1)
+            self.watcher.completed(step)
+            self.watcher.committed(step)
+
 
 @pytest.mark.parametrize("factor", [-3.0, -1.1, -0.5, 0.9])
 def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: float) -> None:
     scripted = Scripted(factor, 4e-5)
-    scripted.watcher.started(scripted.step(0))
-    for number in range(1, 7):
-        step = scripted.step(number)
-        scripted.watcher.completed(step)
-        scripted.watcher.committed(step)
+    scripted.passes(6)
     assert scripted.watcher.swing is not None
     assert scripted.watcher.swing.cells_factor == pytest.approx(factor, rel=1e-6)
     # the third difference of f^k is f^(k-3) (f - 1)^3
@@ -136,24 +142,14 @@ def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(coupling: 
     """Long steps may look like a swing; an explicit rule does swing."""
     law = {"remodeling__law": "tensor", "material__repulsion": "log", "remodeling__coupling": coupling}
     scripted = Scripted(-3.0, 4e-5, **law)
-    scripted.watcher.started(scripted.step(0))
-    for number in range(1, 9):
-        step = scripted.step(number)
-        scripted.watcher.completed(step)
-        scripted.watcher.committed(step)
+    scripted.passes(8)
     assert scripted.watcher.said == said
 
 
 def test_passes_around_a_rest_do_not_count() -> None:
     """Cells that go on after a rest jump. The same swing without one is warned of at 6, as above."""
     scripted = Scripted(-3.0, 4e-5)
-    scripted.watcher.started(scripted.step(0))
-    for number in range(1, 9):
-        step = scripted.step(number)
-        if number == 5:
-            scripted.step(4)  # cells as they were
-        scripted.watcher.completed(step)
-        scripted.watcher.committed(step)
+    scripted.passes(8, rest=5)
     assert not scripted.watcher.said
 
 
