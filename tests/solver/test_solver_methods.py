@@ -400,4 +400,5 @@ def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) ->
     extension = newton.equilibrium.extension()
     assert extension.admissible and extension.max_chain_extension < 0.95
     assert not spare(newton.limits, size)  # it counts what has been travelled already
+    assert newton.limits.look() and spare(newton.limits, 0.2 * size)  # and anew from a state that is looked at
     simulation.close()
