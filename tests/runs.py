@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, Simulation
+from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import scene_from_dict
@@ -57,6 +59,13 @@ def rows_of(scene: Scene | Mapping[str, Any], domain: Any = None, watchers: Sequ
 def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, float]:
     """The row of its end."""
     return rows_of(scene, domain)[-1]
+
+
+def opening_angle(simulation: Simulation) -> float:
+    """Of a cut of the present state of a tube; the column would cut in every row."""
+    state, observer = simulation.state, simulation.observer
+    m = SimpleNamespace(state=state, observer=observer, quadrature=simulation.quadrature, step=SimpleNamespace(time=0))
+    return _opening_angle(m)
 
 
 def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:
