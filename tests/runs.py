@@ -77,10 +77,10 @@ def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str
 def goes_on(scene: Scene | Mapping[str, Any], folder: Path, *stops: float) -> Recording:
     """A run that stops at these times and goes on has the rows of one that does not, to the last digit."""
     asked = scene if isinstance(scene, Scene) else scene_from_dict(dict(scene))
-    whole = Recording(run(asked, folder / "whole", SELF)).history
-    parts = run(asked.with_values({"time.end": stops[0]}), folder / "parts", SELF)
+    whole = Recording(run(asked, folder / "whole", SELF, report=False)).history
+    parts = run(asked.with_values({"time.end": stops[0]}), folder / "parts", SELF, report=False)
     for end in (*stops[1:], asked.time.end):
-        resume(parts, [f"time.end={end}"], SELF)
+        resume(parts, [f"time.end={end}"], SELF, report=False)
     found = Recording(parts)
     assert list(found.history) == list(whole)
     for name in set(whole) - {"seconds"}:

@@ -14,6 +14,7 @@ from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.laws import Drive, largest_tension, mean_target, mean_tensor
 from remodel_fenicsx.model.tensor_law import Target, target
+from remodel_fenicsx.report import write_report
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
@@ -241,7 +242,7 @@ def test_the_mean_of_targets_has_their_shares() -> None:
 # ---------------------------------------------------------------- runs
 def test_a_run_goes_on_with_all_cases(tmp_path: Path) -> None:
     found = goes_on(artery(pulse(0.4), 20.0), tmp_path, 10.0)
-    page = (tmp_path / "whole" / "report.html").read_text()
+    page = write_report(tmp_path / "whole").read_text()
     assert "weight 0.666667, loads pressure 0.6" in page and "weight 0.333333, loads pressure 1.8" in page
     assert "inner_radius@2" in found.history
     with pytest.raises(SceneError):
