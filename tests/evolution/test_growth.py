@@ -73,7 +73,6 @@ RESTS = {
     (0.3, 1.0, 1.1, 1.5): Rest(1.5190, 0.4547, 6.01, 6.122, 1.378, (0.0, 2.2, 7.7), 153.7),
     (0.5, 1.0, 1.1, 1.0): Rest(1.2997, 0.3877, 4.02, 2.624, 1.177, (1.5, 9.2, 14.6), 132.6),
     (1.0, 1.0, 1.1, 1.0): Rest(1.2365, 0.5589, 2.66, 2.673, 1.179, (0.0, 6.0, 11.2), 139.1),
-    (0.3, 2.0, 1.1, 1.0): Rest(1.2390, 0.3333, 4.46, 2.554, 1.109, (3.3, 10.7, 16.8), 113.0),
     (0.5, 1.0, 1.15, 1.0): Rest(1.2457, 0.2833, 5.28, 1.454, 1.048, (4.4, 12.1, 19.2), 106.3),
 }
 THICK_RESTS = {
@@ -81,9 +80,9 @@ THICK_RESTS = {
     (0.3, 1.0, 1.1, 1.0): Rest(1.3878, 1.9024, 3.50, 1.849, 1.087, (0.0, 8.7, 40.7), 114.2),
     (0.3, 1.0, 1.1, 1.5): Rest(1.5733, 2.3244, 4.87, 4.093, 1.267, (0.0, 0.0, 13.5), 168.8),
 }
-LOCAL = {  # hoop stress and content inside, half-way and outside
-    0.3: ((4.9, 5.0, 5.0), (3.36, 2.61, 2.12)),
-    1.0: ((2.2, 2.7, 2.9), (2.19, 2.56, 3.46)),
+LOCAL = {  # hoop stress and content inside, half-way and outside; growth makes the stress uniform
+    (0.3, 1.0, 1.1, 1.0): ((4.9, 5.0, 5.0), (3.36, 2.61, 2.12)),
+    (1.0, 1.0, 1.1, 1.0): ((2.2, 2.7, 2.9), (2.19, 2.56, 3.46)),
 }
 
 
@@ -111,9 +110,14 @@ def compare(row: dict[str, float], expected: Rest, *but: str) -> None:
 
 @pytest.mark.parametrize("case", RESTS, ids=str)
 def test_walls_rest_where_an_independent_program_says(case: Any, caplog: pytest.LogCaptureFixture) -> None:
-    """Radius, thickness, mean hoop stress, content, natural length, angles, and what a cut shows; nothing is said."""
-    row = last_row(at_rest(case))
+    """Radius, thickness, means, angles, what a cut shows, curves continued to the faces; nothing is said."""
+    with simulated(at_rest(case)) as (simulation, (row,)):
+        stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
+        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.turnover._values("content")
     compare(row, RESTS[case])
+    for values, expected, accuracy in zip((stress, content.ravel()), LOCAL.get(case, ()), (0.1, 0.02)):
+        curve = np.polynomial.Polynomial.fit(depth, values, 8)
+        assert curve(np.array([0.0, 0.5, 1.0])) == pytest.approx(expected, rel=0.03, abs=accuracy)
     if case[0]:
         assert row["growth"] == pytest.approx(1 + case[0] * (row["content"] - 1), rel=1e-3)
         assert row["collagen_share"] == pytest.approx(case[0] * row["content"] / row["growth"], abs=0.01)
@@ -145,18 +149,6 @@ def test_the_wall_in_three_dimensions_rests_there_too(volume: float, kinematics:
     compare(row, RESTS[case], *["angles"] * whole)
 
 
-@pytest.mark.parametrize("volume", LOCAL)
-def test_content_and_hoop_stress_through_the_wall(volume: float) -> None:
-    """Continued to the faces; growth makes the stress uniform."""
-    with simulated(at_rest((volume, 1.0, 1.1, 1.0)).with_values({"mesh.refinement": 2})) as (simulation, _):
-        stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
-        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.turnover._values("content")
-    order = np.argsort(depth)
-    for values, expected, accuracy in zip((stress, content.ravel()), LOCAL[volume], (0.1, 0.02), strict=True):
-        curve = np.polynomial.Polynomial.fit(depth[order], values[order], 8)
-        assert curve(np.array([0.0, 0.5, 1.0])) == pytest.approx(expected, rel=0.03, abs=accuracy)
-
-
 @pytest.mark.parametrize(
     ("volume", "thickness", "stress", "opening_angle"),
     [(0.3, 1.189, 1.465, 158.5), *slowly((0.5, 1.411, 1.220, 155.5), (1.0, 1.994, 0.841, 151.5))],
@@ -172,8 +164,8 @@ def test_room_from_rest_on(volume: float, thickness: float, stress: float, openi
 
 def test_a_wall_comes_back_when_the_pressure_falls() -> None:
     """Thickness and content, which remember a little of it."""
-    scene = at_rest((0.3, 1.0, 1.1, 1.5))
-    ramp = [*map(list, scene.loads["pressure"].ramp), [3200.0, 1.5], [3224.0, 1.0]]
+    scene = at_rest((0.3, 1.0, 1.1, 1.5), held=800.0)
+    ramp = [*map(list, scene.loads["pressure"].ramp), [1600.0, 1.5], [1624.0, 1.0]]
     row = last_row(scene.with_values({"loads.pressure.ramp": ramp}))
     assert [row["wall_thickness"], row["content"]] == pytest.approx([0.3252, 2.595], rel=0.01)
 
@@ -224,7 +216,7 @@ def test_growth_does_not_alternate_from_point_to_point(monkeypatch: pytest.Monke
 
     def swing() -> float:
         stiff = {"material": {"lame_lambda": 300.0}, "mesh": {"degree": 2, "formulation": "displacement"}}
-        with simulated(wall(0.5, 400.0, **stiff)) as (simulation, _):
+        with simulated(wall(0.5, 200.0, **stiff)) as (simulation, _):
             J = np.linalg.det(simulation.state.elastic_gradient()).reshape(-1, 3)
         return float(np.abs(J[:, 0] - 2 * J[:, 1] + J[:, 2]).max() / np.ptp(J.mean(axis=1)))
 

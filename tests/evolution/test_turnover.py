@@ -195,7 +195,7 @@ def test_rates_against_their_equation() -> None:
     assert found.content[1] > 0 > found.content[2] and found.content[3] == 1 / time
 
 
-@pytest.mark.parametrize("end", [2400.0, "equilibrium"])
+@pytest.mark.parametrize("end", [1600.0, "equilibrium"])
 def test_a_growth_that_rests_is_no_instability_however_large(
     end: float | str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -211,15 +211,15 @@ def test_a_growth_that_rests_is_no_instability_however_large(
 
 @pytest.mark.parametrize(
     ("coupling", "time"),
-    [("staggered", {}), ("extrapolated", {}), ("extrapolated", {"tolerance": 1.0}), ("implicit", {"tolerance": 12.0})],
+    [("staggered", {}), ("extrapolated", {"tolerance": 1.0}), ("implicit", {"tolerance": 12.0})],
 )
 def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], tmp_path: Path) -> None:
-    room = {"rates": "cauchy", "volume": 0.5} if coupling == "implicit" else {}
-    values = wall(40.0, 4.0, {"time": 40.0, "gain": 1.0} | room, COLUMNS, coupling=coupling)
+    room = {"rates": "cauchy", "volume": 0.5, "time": 40.0} if coupling == "implicit" else {}
+    values = wall(24.0, 4.0, {"time": 10.0, "gain": 1.0} | room, COLUMNS, coupling=coupling)
     values["time"] |= time
     values["mesh"] = {"refinement": 1, "degree": 2}
-    values["output"]["times"] = [20.0]
-    assert goes_on(values, tmp_path, 20.0).history["content"][-1] > 1.1
+    values["output"]["times"] = [12.0]
+    assert goes_on(values, tmp_path, 12.0).history["content"][-1] > 1.05
 
 
 @pytest.mark.parametrize(("gain", "rests"), [(0.5, False), (0.2, False), (1.0, True)])

@@ -159,7 +159,6 @@ def test_what_changes_nothing_is_named(folder: Path) -> None:
 EVERY = (FITS / "every.toml").read_text()
 
 MODELS = {
-    "tensor": {},
     "explicit": {"remodeling.law": "explicit"},
     "extrapolated": {"remodeling.coupling": "extrapolated", "material.repulsion": "log"},
     "exponent": {"remodeling.exponent": 1.0},
