@@ -95,21 +95,15 @@ def test_an_older_table_is_read(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- which recorded runs are valid
 
 
-class Forked:
-    """Stands for subprocess.Popen of a run."""
+def begun_in_a_fork(scene: Scene, folder: Path, begin: Any = figures.begin) -> Any:
+    """A run with the words of the script, which has ended."""
 
-    def __init__(self, command: list[str], env: dict[str, str]):
-        self.returncode = forked(*command, variables=env).returncode
+    def ended(command: list[str], env: dict[str, str]) -> SimpleNamespace:
+        code = forked(*command, variables=env).returncode
+        return SimpleNamespace(returncode=code, poll=lambda: code)
 
-    def poll(self) -> int:
-        """It has ended."""
-        return self.returncode
-
-
-def begun_in_a_fork(scene: Scene, folder: Path, begin: Any = figures.begin) -> Forked:
-    """A run as the script begins it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "subprocess", SimpleNamespace(Popen=Forked))
+        patch.setattr(figures, "subprocess", SimpleNamespace(Popen=ended))
         return begin(scene, folder)
 
 
