@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, Simulation
+from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import scene_from_dict
@@ -59,6 +61,13 @@ def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, 
     return rows_of(scene, domain)[-1]
 
 
+def opening_angle(simulation: Simulation) -> float:
+    """Of a cut of the present state of a tube; the column would cut in every row."""
+    state, observer = simulation.state, simulation.observer
+    m = SimpleNamespace(state=state, observer=observer, quadrature=simulation.quadrature, step=SimpleNamespace(time=0))
+    return _opening_angle(m)
+
+
 def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:
     """Its rows by column."""
     rows = rows_of(scene, domain)
@@ -68,10 +77,10 @@ def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str
 def goes_on(scene: Scene | Mapping[str, Any], folder: Path, *stops: float) -> Recording:
     """A run that stops at these times and goes on has the rows of one that does not, to the last digit."""
     asked = scene if isinstance(scene, Scene) else scene_from_dict(dict(scene))
-    whole = Recording(run(asked, folder / "whole", SELF)).history
-    parts = run(asked.with_values({"time.end": stops[0]}), folder / "parts", SELF)
+    whole = Recording(run(asked, folder / "whole", SELF, report=False)).history
+    parts = run(asked.with_values({"time.end": stops[0]}), folder / "parts", SELF, report=False)
     for end in (*stops[1:], asked.time.end):
-        resume(parts, [f"time.end={end}"], SELF)
+        resume(parts, [f"time.end={end}"], SELF, report=False)
     found = Recording(parts)
     assert list(found.history) == list(whole)
     for name in set(whole) - {"seconds"}:

@@ -209,13 +209,13 @@ def test_the_artery_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
 def test_a_run_that_goes_on_to_the_equilibrium(tmp_path: Path) -> None:
     """From random cells that have remodeled for a while, to where the equilibrium at once is."""
     tables: dict[str, Any] = {"geometry": {"shape": "cube"}, "mesh": {"refinement": 2}, "cells": {"initial": "random"}}
-    tables["output"] = {"columns": ["mean_stretch", "pass_residual"]}
+    tables["output"] = {"columns": ["mean_stretch", "pass_residual"], "report": False}
     at_once = run(scene_from_dict(values("full") | tables), tmp_path / "at_once", SELF)
-    in_parts = run(scene_from_dict(values("full") | tables | {"time": {"end": 40.0}}), tmp_path / "in_parts", SELF)
+    in_parts = run(scene_from_dict(values("full") | tables | {"time": {"end": 20.0}}), tmp_path / "in_parts", SELF)
     resume(in_parts, ["time.end=equilibrium"], SELF)
     first, second = Recording(at_once), Recording(in_parts)
     assert first.scene.time.end == second.scene.time.end == "equilibrium"
-    assert len(first.history["time"]) == 2 and len(second.history["time"]) == 42
+    assert len(first.history["time"]) == 2 and len(second.history["time"]) == 22
     assert second.history["mean_stretch"][-1] == pytest.approx(first.history["mean_stretch"][-1], rel=1e-7)
     assert abs(second.history["mean_stretch"][-2] / second.history["mean_stretch"][-1] - 1) > 1e-4
     assert max(record.history["pass_residual"][-1] for record in (first, second)) < 1e-8
@@ -223,4 +223,4 @@ def test_a_run_that_goes_on_to_the_equilibrium(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.times, [0.0, time])
     np.testing.assert_allclose(first.fields(time)["displacement"], second.fields(time)["displacement"], atol=1e-6)
     resume(in_parts, [], SELF)  # nothing is left to do
-    assert len(Recording(in_parts).history["time"]) == 42
+    assert len(Recording(in_parts).history["time"]) == 22

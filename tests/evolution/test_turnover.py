@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from remodel_fenicsx import Simulation
-from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
-from tests.runs import goes_on, last_row, made, taylor_orders
+from tests.runs import goes_on, last_row, made, opening_angle, taylor_orders
 from tests.values import ANGLES, TENSION, ramped, isotropic
 
 COLUMNS = ["content", "natural_length"]
+GROWS = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
 
 
-def wall(end: float, step: float, turnover: dict[str, float] | None, columns: list[str], **changes: Any) -> Any:
+def wall(end: float | str, step: float, turnover: dict[str, float] | None, columns: list[str], **changes: Any) -> Any:
     """A tube of 1 to 1.3 under a pressure of 1.2 and an elongation of 10 %."""
     return isotropic(
         "consistent",
@@ -34,13 +33,6 @@ def wall(end: float, step: float, turnover: dict[str, float] | None, columns: li
         time={"end": end, "step": step},
         output={"fields": False, "columns": [*ANGLES, "outer_radius", "stored_energy", *columns]},
     )
-
-
-def opening_angle(simulation: Simulation) -> float:
-    """Of a cut of the present state; the column would cut in every row."""
-    state, observer = simulation.state, simulation.observer
-    m = SimpleNamespace(state=state, observer=observer, quadrature=simulation.quadrature, step=SimpleNamespace(time=0))
-    return _opening_angle(m)
 
 
 def simulated(values: dict[str, Any]) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
@@ -56,8 +48,7 @@ def simulated(values: dict[str, Any]) -> tuple[list[dict[str, float]], dict[str,
 
 def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> None:
     """Figures of an independent program on one radius."""
-    values = wall(1440.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}, COLUMNS)
-    rows, known = simulated(values)
+    rows, known = simulated(wall(960.0, 8.0, GROWS, COLUMNS))
     last = rows[-1]
     assert [last[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
     assert known["opening_angle"] == pytest.approx(115.4, abs=3.0)
@@ -67,8 +58,7 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> 
 
 def at_rest(gain: float) -> tuple[Simulation, dict[str, float]]:
     """At the end of the way to the equilibrium."""
-    values = wall(1440.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}, COLUMNS)
-    values["time"]["end"] = "equilibrium"
+    values = wall("equilibrium", 4.0, GROWS | {"gain": gain}, COLUMNS)
     simulation = Simulation(scene_from_dict(values))
     (step,) = simulation.steps()
     return simulation, dict(step.row)
@@ -97,15 +87,13 @@ def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture)
 
 
 @pytest.mark.parametrize(
-    ("end", "stretch", "tube", "angle"),
-    [(1440.0, 1.15, (1.3, 1.2), 82.0), (2400.0, 1.1, (3.0, 4.8), 92.7)],
-    ids=["stretch", "paper's wall"],
+    ("stretch", "tube", "angle"), [(1.15, (1.3, 1.2), 82.0), (1.1, (3.0, 4.8), 92.7)], ids=["stretch", "paper's wall"]
 )
 def test_other_walls_open_as_an_independent_solver_says(
-    end: float, stretch: float, tube: tuple[float, float], angle: float
+    stretch: float, tube: tuple[float, float], angle: float
 ) -> None:
-    """Another stretch of deposition; the paper's wall under its pressure."""
-    values = wall(end, 4.0, {"time": 40.0, "deposition_stretch": stretch, "gain": 1.0}, [])
+    """At rest; another stretch of deposition; the paper's wall under its pressure."""
+    values = wall("equilibrium", 4.0, GROWS | {"deposition_stretch": stretch}, [])
     values["geometry"]["outer_radius"], values["loads"]["pressure"]["value"] = tube
     _, known = simulated(values)
     assert known["opening_angle"] == pytest.approx(angle, abs=1.0)
@@ -116,14 +104,13 @@ def test_other_walls_open_as_an_independent_solver_says(
 def test_without_turnover_it_is_the_law_tensor(coupling: str, time: dict[str, float]) -> None:
     """Gain 0 and a huge time."""
     never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
-    scenes = [wall(40.0, 4.0, turnover, [], coupling=coupling) for turnover in (None, never)]
+    scenes = [wall(20.0, 4.0, turnover, [], coupling=coupling) for turnover in (None, never)]
     plain, turned = (simulated(scene | {"time": scene["time"] | time})[0] for scene in scenes)
     assert len(turned) == len(plain)
     assert turned[-1] == pytest.approx(plain[-1], rel=1e-9, abs=1e-9, nan_ok=True)
 
 
 # ---------------------------------------------------------------- errors in time
-GROWS = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
 
 
 @pytest.fixture(scope="module")
@@ -183,8 +170,8 @@ def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces(room: Any
 def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_steps: list[dict[str, float]]) -> None:
     """Errors fall as the tolerance does, and are below it; the estimate is about the error of the content."""
     found, counts = [], []
-    for tolerance in (2.0, 0.5):
-        values = wall(96.0, 1.0, GROWS, COLUMNS, coupling=coupling)
+    for tolerance in (4.0, 1.0):
+        values = wall(48.0, 1.0, GROWS, COLUMNS, coupling=coupling)
         values["time"]["tolerance"] = tolerance
         rows, _ = simulated(values)
         error, estimate = errors(rows, small_steps), max(row["time_error"] for row in rows)
@@ -208,14 +195,14 @@ def test_rates_against_their_equation() -> None:
     assert found.content[1] > 0 > found.content[2] and found.content[3] == 1 / time
 
 
-@pytest.mark.parametrize("end", [2400.0, "equilibrium"])
+@pytest.mark.parametrize("end", [1600.0, "equilibrium"])
 def test_a_growth_that_rests_is_no_instability_however_large(
     end: float | str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A second load makes the content more than ten times as large, and it rests: no warning."""
-    values = wall(2400.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}, COLUMNS)
+    values = wall(end, 4.0, GROWS, COLUMNS)
     values["loads"]["pressure"]["ramp"] += [[800.0, 1.0], [824.0, 1.6]]
-    values["time"] = {"end": end, "step": 4.0, "tolerance": 3.0}
+    values["time"]["tolerance"] = 3.0
     with caplog.at_level(NOTICE):
         _, known = simulated(values)
     assert known["content"].max() > 10.0
@@ -224,15 +211,15 @@ def test_a_growth_that_rests_is_no_instability_however_large(
 
 @pytest.mark.parametrize(
     ("coupling", "time"),
-    [("staggered", {}), ("extrapolated", {}), ("extrapolated", {"tolerance": 1.0}), ("implicit", {"tolerance": 12.0})],
+    [("staggered", {}), ("extrapolated", {"tolerance": 1.0}), ("implicit", {"tolerance": 12.0})],
 )
 def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], tmp_path: Path) -> None:
-    room = {"rates": "cauchy", "volume": 0.5} if coupling == "implicit" else {}
-    values = wall(80.0, 4.0, {"time": 40.0, "gain": 1.0} | room, COLUMNS, coupling=coupling)
+    room = {"rates": "cauchy", "volume": 0.5, "time": 40.0} if coupling == "implicit" else {}
+    values = wall(24.0, 4.0, {"time": 10.0, "gain": 1.0} | room, COLUMNS, coupling=coupling)
     values["time"] |= time
     values["mesh"] = {"refinement": 1, "degree": 2}
-    values["output"] |= {"times": [40.0], "report": False}
-    assert goes_on(values, tmp_path, 40.0).history["content"][-1] > 1.1
+    values["output"]["times"] = [12.0]
+    assert goes_on(values, tmp_path, 12.0).history["content"][-1] > 1.05
 
 
 @pytest.mark.parametrize(("gain", "rests"), [(0.5, False), (0.2, False), (1.0, True)])
@@ -240,13 +227,13 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
     gain: float, rests: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
-    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}
-    simulated(wall(480.0, 4.0, turnover, COLUMNS))
+    turnover = GROWS | {"gain": gain}
+    simulated(wall(480.0, 8.0, turnover, COLUMNS))
     found = [record.message for record in caplog.records if "has not come to rest" in record.message]
     assert len(found) == (0 if rests else 1)
     assert rests or ("fallen no faster than 1/t" in found[0] and "mechanobiological instability" in found[0])
     caplog.clear()
-    simulated(wall(240.0, 4.0, turnover, COLUMNS))
+    simulated(wall(240.0, 8.0, turnover, COLUMNS))
     assert "come to rest" not in caplog.text
 
 
@@ -309,19 +296,16 @@ def test_cells_that_stay_are_said_to_take_staggered_turnover(caplog: pytest.LogC
     assert "kappa is 0" in caplog.text and "in place of 'implicit'" in caplog.text
 
 
-@pytest.mark.parametrize(("gain", "thickness", "stress"), [(1.0, 0.753, 2.75), (2.0, 0.908, 1.85)])
-def test_the_wall_does_not_thicken_under_more_pressure(gain: float, thickness: float, stress: float) -> None:
+def test_the_wall_does_not_thicken_under_more_pressure() -> None:
     """As before growth had a volume: its thickness and p r_i/h after half as much again, over those before."""
     found = []
     for factor in (1.0, 1.5):
-        values = wall(2400.0, 4.0, {"time": 40.0, "deposition_stretch": 1.1, "gain": gain}, COLUMNS)
+        values = wall("equilibrium", 4.0, GROWS | {"gain": 2.0}, [*COLUMNS, "inner_radius"])
         values["loads"]["pressure"]["ramp"] += [[1400.0, 1.0], [1424.0, factor]]
-        values["time"] = {"end": "equilibrium", "step": 4.0}
-        values["output"]["columns"].append("inner_radius")
         row = last_row(values)
         wall_thickness = row["outer_radius"] - row["inner_radius"]
         found.append((wall_thickness, factor * row["inner_radius"] / wall_thickness))
-    assert np.divide(found[1], found[0]) == pytest.approx([thickness, stress], rel=0.01)
+    assert np.divide(found[1], found[0]) == pytest.approx([0.908, 1.85], rel=0.01)
 
 
 def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instability(

@@ -63,7 +63,13 @@ def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> 
     call(sys.executable, "-m", "build", "--no-isolation", "-o", tmp_path / "dist", source)
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
-    needed = {"py.typed", "kernels/spectral.c", "kernels/algebra.h", "kernels/principal.h", "report/assets/template.html"}
+    needed = {
+        "py.typed",
+        "kernels/spectral.c",
+        "kernels/algebra.h",
+        "kernels/principal.h",
+        "report/assets/template.html",
+    }
     with zipfile.ZipFile(wheel) as archive:
         assert {f"remodel_fenicsx/{name}" for name in needed} <= set(archive.namelist())
         (place,) = (name for name in archive.namelist() if name.endswith("/METADATA"))

@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from docs.making import verification
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import page
 from tests.conftest import Refused
+from tests.forks import forked
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
 DOCS = PACKAGE.parent / "docs"
@@ -93,6 +95,18 @@ def test_an_older_table_is_read(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- which recorded runs are valid
 
 
+def begun_in_a_fork(scene: Scene, folder: Path, begin: Any = figures.begin) -> Any:
+    """A run with the words of the script, which has ended."""
+
+    def ended(command: list[str], env: dict[str, str]) -> SimpleNamespace:
+        code = forked(*command, variables=env).returncode
+        return SimpleNamespace(returncode=code, poll=lambda: code)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "subprocess", SimpleNamespace(Popen=ended))
+        return begin(scene, folder)
+
+
 def tiny(**changes: float | str) -> Scene:
     """Two steps of the tendon."""
     return scene_from_dict(TINY).with_values({key.replace("__", "."): value for key, value in changes.items()})
@@ -119,6 +133,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with figs. 1 and 5, drawn by the script from runs of its own."""
     folder = tmp_path_factory.mktemp("drawn")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "begin", begun_in_a_fork)
         assert draw(patch, "fig1", "fig5", "-o", folder, "--runs", folder / "runs") == 0
     return folder
 

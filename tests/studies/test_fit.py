@@ -14,7 +14,7 @@ import pytest
 
 from remodel_fenicsx import Scene, SceneError, cli, preset_scene, read_scene
 from remodel_fenicsx.schema.settings import STRESS_UNITS
-from remodel_fenicsx.studies.fit import Problem, fit, minimised, read_measurements
+from remodel_fenicsx.studies.fit import Problem, doubts, fit, minimised, read_measurements
 from tests.conftest import Refused
 from tests.runs import rows_of
 from tests.tables import rows
@@ -30,7 +30,8 @@ def tube(**changes: Any) -> Scene:
     """A thin tube of isotropic cells on one radius, with the true numbers."""
     values = {
         "cells.initial": "isotropic", "model.kinematics": "radial", "geometry.outer_radius": 1.3, "mesh.degree": 2,
-        "loads.pressure.value": 1.2, "remodeling.law": "tensor", "time.end": 40.0, "geometry.length_unit": "mm",
+        "loads.pressure.value": 1.2, "remodeling.law": "tensor", "time.end": 40.0, "time.step": 5.0,
+        "geometry.length_unit": "mm",
     }  # fmt: skip
     return preset_scene("kuhl-holzapfel-2007", "tube").with_values(values | TRUTH | changes)
 
@@ -38,7 +39,7 @@ def tube(**changes: Any) -> Scene:
 def inflated() -> list[dict[str, float]]:
     """Virgin tissue under rising pressure at once with the whole elongation."""
     ramp = [[0.0, 0.0], *([number + 1.0, p / 1.2] for number, p in enumerate(PRESSURES))]
-    changes = {"remodeling.law": "none", "time.end": 6.0, "loads.pressure.ramp": ramp}
+    changes = {"remodeling.law": "none", "time.end": 6.0, "time.step": 1.0, "loads.pressure.ramp": ramp}
     return rows_of(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
 
 
@@ -78,13 +79,13 @@ DATA = (FITS / "three.toml").read_text()
 def test_the_numbers_that_made_the_data_are_found(
     folder: Path, capsys: pytest.CaptureFixture[str], refused: Refused
 ) -> None:
-    """From each start; the tables, the picture and a scene that runs are there."""
+    """From most starts; the tables, the picture and a scene that runs are there."""
     out = folder / "out"
     words = ["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(out)]
-    words += ["--starts", "2", "-q", "--no-likelihood-profiles"]
+    words += ["--starts", "3", "-q", "--no-likelihood-profiles"]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
-    assert "2 of 2 starts end in this minimum" in said
+    assert "2 of 3 starts end in this minimum" in said
     with (out / "fit.csv").open() as file:
         table = list(csv.DictReader(file))
     assert [row["key"] for row in table] == list(TRUTH)
@@ -114,6 +115,7 @@ def test_a_fit_goes_on_where_it_was_killed(folder: Path, monkeypatch: pytest.Mon
         return evaluated(self, x)
 
     monkeypatch.setattr(Problem, "_evaluated", counted)
+    (folder / "data.toml").write_text(PAIR)
     fit(scene, folder / "data.toml", folder / "whole", starts=1, profiles=False)
     whole = len(made)
     made.clear()
@@ -157,7 +159,6 @@ def test_what_changes_nothing_is_named(folder: Path) -> None:
 EVERY = (FITS / "every.toml").read_text()
 
 MODELS = {
-    "tensor": {},
     "explicit": {"remodeling.law": "explicit"},
     "extrapolated": {"remodeling.coupling": "extrapolated", "material.repulsion": "log"},
     "exponent": {"remodeling.exponent": 1.0},
@@ -174,10 +175,10 @@ def test_derivatives_are_those_of_the_model(folder: Path, changes: dict[str, Any
     x = np.log([unknown.start for unknown in problem.unknowns])
     found, way = problem.jacobian(x, central=True), np.random.default_rng(2).normal(size=len(x)) / 3
     present = problem.residuals(x)
-    sizes = (0.04, 0.02, 0.01, 0.005)
+    sizes = (0.02, 0.01, 0.005)
     remainders = [np.linalg.norm(problem.residuals(x + h * way) - present - h * found @ way) for h in sizes]
     ratios = np.divide(remainders[:-1], remainders[1:])
-    assert np.abs(ratios[1:] - 4.0).max() < 0.1, ratios
+    assert np.abs(ratios - 4.0).max() < 0.1, ratios
 
 
 @pytest.mark.parametrize(
@@ -192,7 +193,7 @@ def test_derivatives_are_those_of_the_model(folder: Path, changes: dict[str, Any
             '"regions.inside.material.lame_mu" = { start = 2.0 }',
         ),
         ({"remodeling.coupling": "implicit", "material.repulsion": "log"}, ""),
-        ({"time.tolerance": 0.1}, ""),
+        ({"time.tolerance": 1.0}, ""),
         ({}, '"geometry.outer_radius" = { start = 1.3 }'),
     ],
     ids=["closing", "regions", "implicit", "chosen steps", "geometry"],
@@ -213,7 +214,7 @@ def test_a_simulation_that_stays_says_what_a_new_one_does(folder: Path, changes:
 
 def test_a_passive_test_of_remodeled_tissue(folder: Path) -> None:
     """Cells of t = 40 that stay: at the loads of the run's own end it has the radii of the run's own next row."""
-    end = tube(**{"time.end": 41.0})
+    end = tube(**{"time.end": 45.0})
     expected = rows_of(end)[-1]
     (folder / "after.csv").write_text("pressure,outer_radius,inner_radius\n0.6,1.4,1.2\n1.2,1.4,1.2\n")
     sd, state = "outer_radius = 0.01, inner_radius = 0.01", "state = 'after'\ntime = 40.0"
@@ -344,26 +345,29 @@ def test_bounds_are_those_of_the_key(folder: Path, refused: Refused) -> None:
         ("outer_radius", 1.1, ""),
     ],
 )
-def test_numbers_of_another_kind_are_doubted(
-    name: str, factor: float, said: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Judged against the model at the start: a line, which the log of the fit has too."""
+def test_numbers_of_another_kind_are_doubted(name: str, factor: float, said: str, folder: Path) -> None:
+    """Judged against the model at the start."""
     path = folder / ("virgin.csv" if name == "outer_radius" else "history.csv")
     table = list(csv.reader(path.read_text().splitlines()))
     column = table[0].index(name)
     for row in table[1:]:
         row[column] = str(factor * float(row[column]))
     path.write_text("\n".join(map(",".join, table)))
-    unknown, *tables = DATA.split("[[measured]]")
-    one = next(table for table in tables if path.name in table)
-    (folder / "data.toml").write_text(f"{unknown.splitlines()[1]}\n{unknown.splitlines()[2]}\n[[measured]]{one}")
+    scene = read_scene(folder / "scene.toml")
+    problem = Problem(scene, *read_measurements(folder / "data.toml", scene))
+    at_start = problem.models(np.log([unknown.start for unknown in problem.unknowns]))
+    found = [*doubts(problem.tables, at_start, scene)]
+    assert len(found) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in found)
+
+
+def test_what_is_doubted_is_said_and_logged(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The log has one line of each kind."""
+    (folder / "data.toml").write_text(PAIR.replace('"mmHg" }', '"mmHg", outer_radius = "cm" }'))
     words = ["--starts", "1", "-q", "--no-likelihood-profiles"]
     cli.main(["fit", str(folder / "scene.toml"), str(folder / "data.toml"), "-o", str(folder / "o"), *words])
     warned = [line for line in capsys.readouterr().err.splitlines() if ".csv, " in line]
-    assert len(warned) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in warned)
     log = (folder / "o" / "fit.log").read_text()
-    assert all(line.removeprefix("WARNING: ") in log for line in warned)
-    assert f"{path.name}: {len(table) - 1} rows of " in log
+    assert len(warned) == 1 and warned[0].removeprefix("WARNING: ") in log and "virgin.csv: 6 rows of " in log
     kinds = re.findall("INFO ([^:]*):", log)
     assert sorted(kinds) == sorted(set(kinds)), "one line of each kind"
 

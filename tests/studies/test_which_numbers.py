@@ -66,7 +66,7 @@ def test_a_table_of_this_model_gives_its_numbers_back(tmp_path: Path, capsys: py
     stress = SCRIPT["of_chains"](4.0, 1.5, cells, 12.0)
     for across in (True, False):
         lines = ["stretch_x,nominal_stress_x" + (",stretch_y,nominal_stress_y" if across else "")]
-        for x in np.linspace(1.02, 1.3, 15):
+        for x in np.linspace(1.02, 1.3, 6):
             P = SCRIPT["nominal"](stress, x, 1.1 if across else None)
             lines.append(f"{x},{P[0]}" + (f",1.1,{P[1]}" if across else ""))
         (tmp_path / "test.csv").write_text("\n".join(lines))
