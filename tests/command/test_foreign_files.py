@@ -377,7 +377,11 @@ def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> Non
     for name, text in put_there.items():
         (tmp_path / name).write_text(text)
     (tmp_path / "scene.toml").write_text(pulled_cube(1.0).to_toml())
-    command = [sys.executable, PROJECT / "bin" / "remodel-fenicsx", *"ensemble scene.toml --seeds 2 -o out".split()]
+    command = [
+        sys.executable,
+        PROJECT / "bin" / "remodel-fenicsx",
+        *"ensemble scene.toml --seeds 2 --jobs 1 -o out".split(),
+    ]
     own = {"PETSC_OPTIONS": "-remodel_snes_monitor ascii:the-users-own::append"}
     done = subprocess.run([*command, "-q"], cwd=tmp_path, env=os.environ | own, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
