@@ -71,7 +71,7 @@ def test_every_command_knows_it(place: Path) -> None:
 
 def test_the_runs_of_a_study_know_it(place: Path) -> None:
     """They are processes of their own, in folders of their own."""
-    words = "sweep cube.toml loads.force.value=5:10:2 -q -o sweep --with mine.py"
+    words = "sweep cube.toml loads.force.value=5:10:2 --jobs 1 -q -o sweep --with mine.py"
     done = run(*words.split(), "--with", DEMO, cwd=place)
     assert done.returncode == 0, done.stderr
     with (place / "sweep" / "sweep.csv").open() as file:

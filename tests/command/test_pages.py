@@ -12,14 +12,15 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from docs.making.tutorials import BLOCK, keep, printed_as
 from remodel_fenicsx import cli, read_scene
+from tests.conftest import forked_children
 from tests.forks import forked
 
 ROOT = Path(__file__).parents[2]
@@ -27,6 +28,7 @@ TUBE = "tutorial_tube"
 OF_PAGES = tomllib.loads((Path(__file__).parent / "pages.toml").read_text(encoding="utf-8"))
 SHORT, NOT_RUN, LEFT_BEHIND = (OF_PAGES[name] for name in ("short", "not_run", "left_behind"))
 REFUSAL = "loads.force"
+SCRIPT = "import runpy, sys; sys.path.insert(0, '.'); del sys.argv[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
 PAGES = [
     "start",
     "fit",
@@ -63,19 +65,31 @@ def obey(line: str, capture: pytest.CaptureFixture[str]) -> str:
     if program == "cp":
         shutil.copy(*words)
         return ""
-    assert program in ("python3", "mpirun"), line
-    command = [sys.executable if program == "python3" else program, *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    if program == "python3":
+        done = forked("python", SCRIPT, *words)
+    else:
+        assert program == "mpirun", line
+        done = subprocess.run([program, *words], capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, line + "\n" + done.stderr[-1000:]
     return done.stdout + done.stderr
 
 
+@pytest.fixture
+def all_forked(drawn_by_forks: None) -> Iterator[None]:
+    """What the commands start is forked: pictures, and the runs of studies."""
+    with forked_children():
+        yield
+
+
+@pytest.mark.usefixtures("all_forked")
 @pytest.mark.parametrize("page", PAGES)
 def test_a_reader_gets_through_the_page(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    if page != "howto_ranks":  # whose ranks are processes of their own
+        monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (8, 4, 1))
     if page != TUBE:
         for _, text in blocks(TUBE):
             keep(text)
@@ -118,6 +132,7 @@ def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(capsys: pytest
     assert capsys.readouterr().err.split() == " ".join(shown).split()
 
 
+@pytest.mark.usefixtures("all_forked")
 def test_the_examples_of_the_readme_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -63,16 +63,11 @@ def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.S
     assert read_history(tmp_path / "out")["time"][-1] == 10
 
 
-@pytest.mark.parametrize(
-    ("module", "number"),
-    [
-        ("pydantic", signal.SIGINT),
-        ("mpi4py", signal.SIGTERM),
-        ("petsc4py.PETSc", signal.SIGINT),
-        ("remodel_fenicsx.running", signal.SIGHUP),  # PETSc is there by then, and has taken it
-        *slowly(("pydantic", signal.SIGTERM), ("dolfinx", signal.SIGTERM)),
-    ],
-)
+@pytest.mark.parametrize(("module", "number"), [
+    ("pydantic", signal.SIGINT), ("mpi4py", signal.SIGTERM), ("petsc4py.PETSc", signal.SIGINT),
+    ("remodel_fenicsx.running", signal.SIGHUP),  # PETSc is there by then, and has taken it
+    *slowly(("pydantic", signal.SIGTERM), ("dolfinx", signal.SIGTERM)),
+])  # fmt: skip
 def test_a_signal_among_the_imports_ends_with_a_line(module: str, number: signal.Signals, tmp_path: Path) -> None:
     program = f"""
 import os, runpy, signal, sys

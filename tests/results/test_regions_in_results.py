@@ -28,7 +28,7 @@ VALUES: dict[str, Any] = {
     "remodeling": {"law": "explicit"}, "solver": {"method": "direct"}, "time": {"end": 4.0},
     "model": {"kinematics": "radial"},
 }  # fmt: skip
-WHOLE = VALUES | {"model": {"kinematics": "full"}, "time": {"end": 3.0},
+WHOLE = VALUES | {"model": {"kinematics": "sector"}, "time": {"end": 3.0},
                   "regions": VALUES["regions"] | {"adventitia": {"cells": {"initial": "random"}}}}  # fmt: skip
 ON_ONE_AND_TWO_RANKS = [{"scene": WHOLE}]
 COLUMNS = [f"{name}_{region}" for region in ("media", "adventitia") for name in ("fibre_angle", "max_chain_extension")]

@@ -62,6 +62,14 @@ def bad(
     return decorate
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_parser() -> Iterator[None]:
+    """Of the command line, made once for all of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "parser", functools.cache(cli.parser))
+        yield
+
+
 def ask(*words: str) -> tuple[int, str, str]:
     """Exit code, output and errors of remodel-fenicsx WORDS, in this process."""
     output, errors = io.StringIO(), io.StringIO()
@@ -178,9 +186,12 @@ def test_a_scene_with_odd_values(shape: str, changes: list[tuple[int, str, Any]]
         assert read_scene(tmp_path / "again.toml") == good
 
 
+WHOLE = preset_scene("kuhl-holzapfel-2007", "tube").to_toml().encode()
+
+
 @bad("scenes of damaged text", 200, "cut off, other bytes, holes of zeros, foreign, empty", data=st.data())
 def test_a_scene_that_is_damaged_text(data: st.DataObject, tmp_path: Path) -> None:
-    (tmp_path / "scene.toml").write_bytes(damaged(data, preset_scene("kuhl-holzapfel-2007", "tube").to_toml().encode()))
+    (tmp_path / "scene.toml").write_bytes(damaged(data, WHOLE))
     answer("validate", str(tmp_path / "scene.toml"))
 
 
