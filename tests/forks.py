@@ -143,17 +143,18 @@ def read_in_a_fork(command: Sequence[str], **_: Any) -> subprocess.CompletedProc
     with tempfile.TemporaryFile() as said, warnings.catch_warnings(action="ignore"):
         child = os.fork()
         if not child:
-            logging.root.handlers.clear()
-            sys.stdout = sys.stderr = open(os.dup(said.fileno()), "w", buffering=1)
-            for stream in (1, 2):
-                os.dup2(said.fileno(), stream)
-            here = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             try:
+                logging.root.handlers.clear()
+                sys.stdout = sys.stderr = open(os.dup(said.fileno()), "w", buffering=1)
+                for stream in (1, 2):
+                    os.dup2(said.fileno(), stream)
+                here = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
                 children.read_as_child(reader, *words, str(int(memory) + here))
+                os._exit(0)
             except SystemExit as end:
                 print(end.code)
+            finally:  # whatever it was: this process is no second session
                 os._exit(1)
-            os._exit(0)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         said.seek(0)
         return subprocess.CompletedProcess(command, status, b"", said.read())
