@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import pkgutil
 from collections.abc import Callable, Mapping
@@ -21,7 +22,12 @@ def on_demand(module: str, places: Mapping[str, str]) -> Callable[[str], Any]:
 
 def resolved(maker: Callable[..., Any] | str) -> Callable[..., Any]:
     """A class or function that a registry names: itself, or what its dotted name stands for."""
-    found: Callable[..., Any] = pkgutil.resolve_name(maker) if isinstance(maker, str) else maker
+    return _named(maker) if isinstance(maker, str) else maker
+
+
+@functools.cache  # points ask for it at every iteration
+def _named(place: str) -> Callable[..., Any]:
+    found: Callable[..., Any] = pkgutil.resolve_name(place)
     return found
 
 

@@ -15,9 +15,11 @@ import json
 import logging
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
@@ -58,6 +60,7 @@ class Forks:
         *words: str | Path,
         cwd: Path | None = None,
         variables: Mapping[str, str] | None = None,
+        seconds: float | None = None,
         imports: tuple[str, ...] = (),
     ) -> subprocess.CompletedProcess[str]:
         """A program of `PROGRAMS` in a child, as subprocess.run.
@@ -66,6 +69,8 @@ class Forks:
         ----------
         program, words, cwd, variables
             What runs where, and the environment; PETSc has read its own long before.
+        seconds
+            Of its processor time, after which it is killed; None: never.
         imports
             What else it shall find imported.
         """
@@ -73,7 +78,7 @@ class Forks:
         with tempfile.TemporaryDirectory() as folder:
             streams = [os.path.join(folder, name) for name in ("output", "errors")]
             environment = dict(os.environ if variables is None else variables)
-            request = [program, [*map(str, words)], str(cwd or Path.cwd()), environment, streams, imports]
+            request = [program, [*map(str, words)], str(cwd or Path.cwd()), environment, streams, imports, seconds]
             print(json.dumps(request), file=self.process.stdin, flush=True)
             answer = self.process.stdout.readline()
             assert answer, f"it has ended: {self.process.wait()}"
@@ -217,6 +222,20 @@ def begin(program: str, words: list[str], folder: str, variables: dict[str, str]
     return status
 
 
+def status_of(child: int, seconds: float | None) -> int:
+    """Exit status of a child, killed when it has worked for so long, however busy the machine is."""
+    if seconds is None:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    while True:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        if int(Path(f"/proc/{child}/schedstat").read_text().split()[0]) > 1e9 * seconds:
+            os.kill(child, signal.SIGKILL)
+            return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        time.sleep(0.002)
+
+
 def what_is_imported_stays() -> None:
     """For a process that goes on for long, and its children: work of libraries that finds nothing new is spared.
 
@@ -231,13 +250,13 @@ def what_is_imported_stays() -> None:
 def serve() -> None:
     """Until there are no more requests."""
     for line in sys.stdin:
-        *request, imports = json.loads(line)
+        *request, imports, seconds = json.loads(line)
         for module in imports:
             importlib.import_module(module)
         child = os.fork()
         if not child:
             os._exit(begin(*request))
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        print(status_of(child, seconds), flush=True)
 
 
 if __name__ == "__main__":

@@ -6,10 +6,10 @@ from collections import UserDict
 from typing import TYPE_CHECKING, Any
 
 from remodel_fenicsx._lazy import on_demand, resolved
-from remodel_fenicsx.body.shape import LoadKind, Shape
 
 if TYPE_CHECKING:
     from remodel_fenicsx.body.cube import Cube
+    from remodel_fenicsx.body.shape import LoadKind, Shape
     from remodel_fenicsx.body.tendon import Tendon
     from remodel_fenicsx.body.tube import Tube
 
@@ -35,4 +35,12 @@ SHAPES = _Shapes(
 )
 """The shapes that a scene may name; a script adds its own."""
 
-__getattr__ = on_demand(__name__, {"Cube": "body.cube", "Tendon": "body.tendon", "Tube": "body.tube"})
+# a reader of files, in a process of its own, needs none of them
+MODULES = {
+    "Cube": "body.cube",
+    "LoadKind": "body.shape",
+    "Shape": "body.shape",
+    "Tendon": "body.tendon",
+    "Tube": "body.tube",
+}
+__getattr__ = on_demand(__name__, MODULES)

@@ -8,6 +8,7 @@ import gc
 import os
 import random
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 
 from remodel_fenicsx import Recording
 from remodel_fenicsx.results import checkpoint
+from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.results.run_folder import FolderTaken, History
 from remodel_fenicsx.results.vtkhdf import PatientFile, TransientGrid
 from remodel_fenicsx.running import resume, run
@@ -112,6 +114,61 @@ def test_a_run_that_is_killed_in_a_write_goes_on(
             assert not (copy / "scene.toml").exists(), moment
         else:
             assert_same(copy, whole)
+
+
+# ---------------------------------------------------------------- kill -9
+
+
+def words_for(folder: Path, scene_file: Path) -> list[str]:
+    """Of the run, or of what goes on with it."""
+    if folder.exists() and not (folder / "scene.toml").exists():  # killed before there was anything
+        shutil.rmtree(folder)
+    begun = ["--resume", folder] if folder.exists() else [scene_file, "-o", folder]
+    return ["run", *map(str, begun), "-q"]
+
+
+def killed_at_random(folder: Path, scene: str, program: str, kills: int) -> None:
+    """Whole runs, killed so many times at random moments and gone on with, are the run that nobody kills."""
+    (folder / "scene.toml").write_text(scene)
+    seed = random.randrange(10**6)
+    print(f"seed {seed}")
+    moments, done, whole = random.Random(seed), 0, 0
+
+    def status(run: str, seconds: float | None) -> int:
+        words = words_for(folder / run, folder / "scene.toml")
+        return forked(program, *words, seconds=seconds).returncode
+
+    assert status("expected", None) == 0
+    while done < kills:
+        ended = status(f"run-{whole}", moments.uniform(0.1, 0.4))
+        assert ended in (0, -signal.SIGKILL)
+        done, whole = done + (ended != 0), whole + (ended == 0)
+    assert status(f"run-{whole}", None) == 0
+    for number in range(whole + 1):
+        assert_same(folder / f"run-{number}", folder / "expected")
+
+
+GROWING = """
+preset = "consistent"
+geometry = {shape = "tube", inner_radius = 1.0, outer_radius = 1.3}
+model = {kinematics = "radial"}
+mesh = {degree = 2}
+cells = {initial = "isotropic"}
+remodeling = {turnover = {time = 10.0}}
+time = {end = 80.0, step = 2.0}
+loads.pressure = {value = 1.2, ramp = [[0.0, 0.0], [8.0, 1.0]]}
+loads.elongation = {value = 0.1, ramp = [[0.0, 0.0], [8.0, 1.0]]}
+output = {fields = ["content", "natural_length"], every = 8, checkpoint = 2, report = false, columns = COLUMNS}
+cases = [{weight = 0.6, loads = {pressure = 0.8}}, {weight = 0.4, loads = {pressure = 1.3}}]
+"""
+
+
+def test_load_cases_and_turnover_survive_kills(tmp_path: Path) -> None:
+    """Content, natural length and the unknowns of each case go on to the last digit."""
+    columns = ["content", "natural_length", "inner_radius", "fibre_angle_outer", "seconds"]
+    killed_at_random(tmp_path, GROWING.replace("COLUMNS", str(columns)), "remodel-fenicsx", kills=5)
+    table = read_history(tmp_path / "expected")
+    assert table["content"][-1] > 1.3 and table["inner_radius@2"][-1] > table["inner_radius"][-1] + 0.05
 
 
 # ---------------------------------------------------------------- a full disk
