@@ -9,8 +9,7 @@ RUN apt-get update \
     && sed -e 's/#.*//' /usr/local/share/remodel-fenicsx/debian-packages.txt \
        | DEBIAN_FRONTEND=noninteractive xargs apt-get install --yes --no-install-recommends \
     && rm -rf /var/lib/apt/lists/*
-ENV LANG=C.UTF-8 OMPI_MCA_btl=self,sm OMPI_MCA_mpi_yield_when_idle=1 OMPI_MCA_threads_pthreads_yield_strategy=nanosleep \
-    OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
+ENV LANG=C.UTF-8 OMPI_MCA_btl=self,sm OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
 
 FROM environment
 LABEL org.opencontainers.image.title="remodel-fenicsx" \

@@ -26,10 +26,6 @@ SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # ask
 
 PAUSE = signal.SIGUSR1  # asks a run to end with the step under way; batch systems send it before they kill
 
-# Ranks that wait sleep, where Open MPI is told so (with-fenicsx): Linux makes that 50 microseconds, in which many
-# messages come. The artery on two ranks takes 5.5 s with 50, 4.6 with 5, 4.3 without sleep; on busy cores 7, 8 and 33
-TIMER_SLACK, SHORTEST_SLEEP = Path("/proc/self/timerslack_ns"), 5000  # nanoseconds
-
 _ONE_SIGNAL = 0.2  # seconds: timeout, for one, sends its signal to the process, and then to the group that this is in
 
 # PETSc aborts on all of these, and on some that a run outlives: a closed pipe, the hang-up that nohup ignores
@@ -71,7 +67,7 @@ class Paused(RemodelError):  # noqa: N818 - no error: somebody asked for it
 
 
 def take_back_signals() -> None:
-    """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set; ranks that wait sleep."""
+    """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set."""
     with blocked(*SIGNALS, PAUSE):  # the libraries' threads inherit it, and never take one
         import mpi4py.MPI  # noqa: F401
         import petsc4py
@@ -80,8 +76,6 @@ def take_back_signals() -> None:
             petsc4py.init([sys.argv[0], "-skip_petscrc"])
         import petsc4py.PETSc
 
-        if mpi4py.MPI.COMM_WORLD.size > 1 and TIMER_SLACK.exists():
-            TIMER_SLACK.write_text(str(SHORTEST_SLEEP))
         for number in _NOT_PETSCS if _is_main_thread() else ():
             handler = signal.getsignal(number)  # what Python remembers: it does not see what libraries put below
             if handler is not None:
