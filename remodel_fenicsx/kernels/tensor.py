@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -108,7 +109,8 @@ class CompiledProblem(LocalProblem):
         tuning = (drive.floor, drive.noise, drive.rounding, self.step.kappa_dt)
         numbers = [getattr(self.tissue, name) for name in PARAMETERS] + [np.broadcast_to(some, n) for some in tuning]
         others = cells.dimensions, cells.axes, self.step.structure, *self._by_target(n)
-        return np.concatenate([np.stack(numbers, axis=1), *(some.reshape(n, -1) for some in others)], axis=1)
+        rows = (some.reshape(n, math.prod(some.shape[1:])) for some in others)  # a rank may have no points
+        return np.concatenate([np.stack(numbers, axis=1), *rows], axis=1)
 
     def _by_target(self, n: int) -> tuple[Array, Array]:
         """Of a law by rank, whose lengths are an affine function of the target: those at zero, and the slope."""

@@ -153,6 +153,14 @@ def test_where_principal_values_agree_numpy_decides(kernels: TensorKernels, monk
     assert not twin.solve(torn, start).converged.any() and not asked
 
 
+@pytest.mark.parametrize("law", ["tensor", "explicit"])
+def test_a_rank_may_have_no_points(kernels: TensorKernels, law: str) -> None:
+    none = np.empty((0, 3, 3))
+    twin = compiled_twin(kernels, points(law, "log", "cauchy", "material", 2).at(np.arange(0)))
+    found = twin.solve(none, none)
+    assert twin.tangent(found).tangent.shape == (0, 3, 3, 3, 3) and not len(twin.unit_cells(found).dimensions)
+
+
 def test_parts_that_the_kernel_does_not_know_are_numpys(kernels: TensorKernels) -> None:
     """Another chain, pairing or law: no silent stand-in."""
     some = points("explicit", "log", "cauchy", "material", 2)
