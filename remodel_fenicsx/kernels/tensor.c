@@ -162,6 +162,14 @@ static inline double stiffness(double r, double L, double *slope)
     return (1 + (2 - x) / (4 * left * left)) / L;
 }
 
+/* energy.Tissue.repulsion_modulus: c g(r0). */
+static inline double repulsion_modulus(point *p)
+{
+    double ignored;
+    const double *q = p->is->parameter;
+    return q[NETWORK_MODULUS] * stiffness(q[END_TO_END_LENGTH], q[CONTOUR_LENGTH], &ignored);
+}
+
 /* n_I . C n_K of the axes of a cell, rows. */
 static inline double strain_between(point *p, state *s, int I, int K)
 {
@@ -211,10 +219,10 @@ static void stress(point *p, state *s, matrix *by_cells, matrix *by_strain)
     const double *q = p->is->parameter, L = q[CONTOUR_LENGTH], r0 = q[END_TO_END_LENGTH];
     const double volumetric = q[LAME_LAMBDA] * log(p->J) - q[LAME_MU];
     const int repulsion = p->of.repulsion;
-    double slope, ignored, squared = 0;
+    double slope, squared = 0;
     ALL(i) squared += s->A[i][i] * p->c[i];
     const double r = sqrt(squared), along = q[NETWORK_MODULUS] * stiffness(r, L, &slope);
-    const double against = q[NETWORK_MODULUS] * stiffness(r0, L, &ignored);
+    const double against = repulsion_modulus(p);
     const double steep = q[NETWORK_MODULUS] * slope / (2 * r);
     tensor quotients, G;
     memset(G, 0, sizeof(tensor));
@@ -527,11 +535,9 @@ static void equation(point *p, state *s, matrix result, matrix through_cells, ma
         structure_by_numbers(s, turn, structure);
         product(by_structure, structure, by_numbers);
         if (p->of.repulsion == AXES) {
-            double ignored;
-            const double *q = p->is->parameter;
-            const double against = q[NETWORK_MODULUS] * stiffness(q[END_TO_END_LENGTH], q[CONTOUR_LENGTH], &ignored);
+            const double modulus = repulsion_modulus(p);
             axes_derivatives(p, s, turn, structure, more);
-            MANDEL(a) MANDEL(b) by_numbers[a][b] -= against * structure[a][b], direct[a][b] -= against * more[a][b];
+            MANDEL(a) MANDEL(b) by_numbers[a][b] -= modulus * structure[a][b], direct[a][b] -= modulus * more[a][b];
         }
         ranks_by_tensor(p, s, by_tensor, by_strain);
         product(by_numbers, by_tensor, through_cells);
@@ -558,7 +564,7 @@ static void newton_step(point *p, state *s, tensor step)
     divide(left, change, 1);
     to_tensor(change, step);
     const double length = norm(step), size = fmax(norm(s->D), norm(s->missing));
-    const double share = !isfinite(length) ? 0 : length > 0 ? fmin(1, size / length) : 1;
+    const double share = length > 0 ? fmin(1, size / length) : 1;
     ALL(i) ALL(j) step[i][j] = isfinite(length) ? share * step[i][j] : 0;
 }
 
@@ -583,11 +589,14 @@ static void iterate(int n, point **p, state **s)
     for (int k = 0; k < n; ++k) *s[k] = next[k];
 }
 
-/* Up to W points and their states, which are there from D, by number. */
-static int first_of(int64_t n, int64_t first, point *p, state *s, point **points, state **states)
+/* Up to W points from the given one on, all that D says of them, and where they are; returns how many. */
+static int begin(int64_t n, int64_t first, point *p, state *s, point **points, state **states, const double *F,
+                 const double *D, const double *all, parts of)
 {
     const int count = n - first < W ? (int)(n - first) : W;
     for (int k = 0; k < count; ++k) points[k] = p + k, states[k] = s + k;
+    prepare(count, p, s, first, F, D, all, of);
+    evaluate(count, points, states);
     return count;
 }
 
@@ -596,12 +605,11 @@ void solve(int64_t n, const double *F, const double *start, const double *given,
            int frame, double *tensors, double *structure, double *stresses, double *squared, uint8_t *converged,
            uint8_t *open)
 {
+    const parts of = {law, driver, repulsion, frame};
     point p[W], *points[W];
     state s[W], *states[W];
     for (int64_t first = 0; first < n; first += W) {
-        const int count = first_of(n, first, p, s, points, states);
-        prepare(count, p, s, first, F, start, given, (parts){law, driver, repulsion, frame});
-        evaluate(count, points, states);
+        const int count = begin(n, first, p, s, points, states, F, start, given, of);
         for (int iteration = 0; iteration < ITERATIONS && driver != FINGER; ++iteration) {
             int left = 0;
             for (int k = 0; k < count; ++k)
@@ -692,12 +700,11 @@ static void slopes(point *p, state *s, double *result, double slope[6][9])
 void tangent(int64_t n, const double *F, const double *tensors, const double *given, int law, int driver,
              int repulsion, int frame, double *result, double *slope, uint8_t *open)
 {
+    const parts of = {law, driver, repulsion, frame};
     point p[W], *points[W];
     state s[W], *states[W];
     for (int64_t first = 0; first < n; first += W) {
-        const int count = first_of(n, first, p, s, points, states);
-        prepare(count, p, s, first, F, tensors, given, (parts){law, driver, repulsion, frame});
-        evaluate(count, points, states);
+        const int count = begin(n, first, p, s, points, states, F, tensors, given, of);
         for (int k = 0; k < count; ++k) {
             slopes(p + k, s + k, result + 81 * (first + k), (double (*)[9])(slope + 54 * (first + k)));
             open[first + k] = s[k].open;

@@ -64,6 +64,14 @@ def test_the_target(kernels: TensorKernels, driver: str, frame: str) -> None:
         np.testing.assert_allclose(found.switch, expected.switch, atol=1e-12)
 
 
+def asked_of_numpy(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """At how many points, each time that numpy solves."""
+    asked: list[int] = []
+    solve = LocalProblem.solve
+    monkeypatch.setattr(LocalProblem, "solve", lambda self, F, *given: asked.append(len(F)) or solve(self, F, *given))
+    return asked
+
+
 def compiled_twin(kernels: TensorKernels, some: LocalProblem) -> CompiledProblem:
     twin = problem_of(kernels, some.tissue, some.step)
     assert isinstance(twin, CompiledProblem)
@@ -106,9 +114,7 @@ def test_what_the_kernel_does_not_solve_numpy_does(kernels: TensorKernels, monke
     F[0] = 3.0 * np.eye(3)
     some = points("tensor", "log", "cauchy", "material", COUNT, "random", kappa=2.5)
     twin, start = compiled_twin(kernels, some), some.tensor_of(F, some.step.cells)
-    asked: list[int] = []
-    solve = LocalProblem.solve
-    monkeypatch.setattr(LocalProblem, "solve", lambda self, F, *given: asked.append(len(F)) or solve(self, F, *given))
+    asked = asked_of_numpy(monkeypatch)
     expected, found = some.solve(F, start), twin.solve(F, start)
     assert asked[0] == COUNT and 0 < asked[1] < COUNT
     assert not expected.converged[0] and expected.converged[1:].all()
@@ -140,9 +146,7 @@ def test_where_principal_values_agree_numpy_decides(kernels: TensorKernels, monk
     F[: COUNT // 3] = np.diag([0.95, 0.95, 1.3])
     some = points("explicit", "axes", "cauchy", "material", COUNT, "isotropic", kappa=0.05)
     twin, start = compiled_twin(kernels, some), some.tensor_of(F, some.step.cells)
-    asked: list[int] = []
-    solve = LocalProblem.solve
-    monkeypatch.setattr(LocalProblem, "solve", lambda self, F, *given: asked.append(len(F)) or solve(self, F, *given))
+    asked = asked_of_numpy(monkeypatch)
     expected, found = some.solve(F, start), twin.solve(F, start)
     assert expected.converged.all() and found.converged.all() and asked == [COUNT, COUNT // 3]
     np.testing.assert_allclose(found.structure, expected.structure, atol=1e-10)
