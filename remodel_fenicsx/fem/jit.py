@@ -52,9 +52,10 @@ COMPILER_FLAGS = [
     "-freciprocal-math", "-fassociative-math", "-w",
 ]  # fmt: skip
 
-# Of tangents on several faces: -O3 takes the compiler 15 to 20 s for the springs of guided ends (hexahedra), -O2 takes
-# 2, and they are assembled as fast (0.28 ms for 288 facets)
-FACE_FLAGS = ["-O2", *COMPILER_FLAGS[1:]]
+# Of tangents: their time is that of sums over pairs of unknowns, which -O2 makes vectors of as -O3 does if it may count
+# the turns of a loop. They run as fast (21 and 357 ms for the artery of degree 1 and 2), and the compiler takes two
+# thirds of the time; for the springs of guided ends, which lie on several faces, 2 s and not 15 to 20.
+TANGENT_FLAGS = ["-O2", "-ftree-vectorize", "-fvect-cost-model=dynamic", *COMPILER_FLAGS[1:]]
 
 # Components of a vector in one kernel: stores this far apart GCC makes from vectors of points, others point by point.
 # Eleven in one kernel took 0.65 ms of 12,288 points, eight and three 0.20.
@@ -63,8 +64,12 @@ SIMD_COMPONENTS = (16, 8, 4, 3, 2, 1)
 # of our own C functions: no sum is taken in another order than it is written in
 LIBRARY_FLAGS = ["-std=c17", "-O3", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wextra"]
 
-# By number of arguments: what a form is, and the seconds that it takes (the energy here, hexahedra, one core)
-_KINDS = {0: ("an integral", 1), 1: ("the residual", 1), 2: ("the tangent", 5)}
+# By number of arguments: what a form is, the seconds that it takes (the energy here, hexahedra, one core), and flags
+_KINDS = {
+    0: ("an integral", 1, COMPILER_FLAGS),
+    1: ("the residual", 1, COMPILER_FLAGS),
+    2: ("the tangent", 3, TANGENT_FLAGS),
+}
 _GRACE = 0.5  # seconds: whatever ended the compiler may be about to end this process too
 
 _compiled: list[str] = []
@@ -160,11 +165,9 @@ def form(ufl_form: Any, name: str | None = None) -> Any:
     >>> round(dolfinx.fem.assemble_scalar(form(ufl.det(F) * simulation.quadrature.dx, "the volume")), 12)
     1.0
     """
-    kind, seconds = _KINDS[len(ufl_form.arguments())]
+    kind, seconds, flags = _KINDS[len(ufl_form.arguments())]
     with _compiler_watched(ufl_form.ufl_domains()[0].ufl_cargo().comm, name or kind, seconds):
-        kinds = [integral.integral_type() for integral in ufl_form.integrals()]
-        on_faces = len(ufl_form.arguments()) == 2 and len(kinds) > 1 and set(kinds) == {"exterior_facet"}
-        return dolfinx.fem.form(ufl_form, jit_options=jit_options(FACE_FLAGS if on_faces else COMPILER_FLAGS))
+        return dolfinx.fem.form(ufl_form, jit_options=jit_options(flags))
 
 
 def expression(ufl_expression: Any, points: Any, name: str | None = None) -> PointValues:
