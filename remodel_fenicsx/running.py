@@ -288,7 +288,7 @@ def _record(
                 reason.kept += ", and run --resume goes on from there"
             else:
                 log.info(STOPPED + "%s", reason)
-            if reason.on_all_ranks:
+            if reason.on_all_ranks or comm.size == 1:
                 checkpoints.write()
             if not isinstance(reason, (interrupts.Interrupted, interrupts.Paused)):  # these shall end soon
                 leave_report()

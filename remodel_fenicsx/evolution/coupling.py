@@ -229,9 +229,8 @@ class Staggered:
         self.turnover = remodeling.turnover
         self.residual = 0.0
         self.tangents = 0  # that were assembled in the last solve of the state itself
-        self.blend: Blend | None = None
-        if remodeling.law.remodels or self.turnover is not None:  # now: no form is compiled in the middle of a run
-            self.blend = Blend(state, tissue, settings)
+        changes = remodeling.law.remodels or self.turnover is not None
+        self.blend = Blend(state, tissue, settings) if changes else None
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium at `time` with the present cells.
@@ -343,14 +342,15 @@ class Staggered:
         loading.set(old_loads)
         if self.blend is not None and self._cells_changed():
             blend = self.blend
-            stage = "the change of the cells"
-            Change(time, stage, self._set_part, blend.newton, halvings, blend.largest_part, roughly=True).advance(work)
+            parts = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
+            Change(*parts, halvings, blend.largest_part, roughly=True).advance(work)
             failure = None  # the loads have not been tried from here
 
         def set_load_fraction(fraction: float) -> None:
             loading.set(between(old_loads, new_loads, fraction))
 
-        Change(time, "the change of the loads", set_load_fraction, self.newton, halvings).advance(work, failure)
+        whole = time, "the change of the loads", set_load_fraction, self.state, lambda: self.newton
+        Change(*whole, halvings).advance(work, failure)
         loading.set(new_loads)
         log.info("time %g solved in %d parts", time, work.substeps)
 
@@ -365,8 +365,8 @@ class Staggered:
 
         halvings = self.settings.maximum_halvings
         if blend is None:
-            return Change(time, "the step", set_fraction, self.newton, halvings)
-        return Change(time, "the step", set_fraction, blend.newton, halvings, blend.largest_part)
+            return Change(time, "the step", set_fraction, self.state, lambda: self.newton, halvings)
+        return Change(time, "the step", set_fraction, self.state, lambda: blend.newton, halvings, blend.largest_part)
 
     def _set_part(self, fraction: float) -> None:
         """Of what the cells have changed since the last solved state, and content and natural length."""

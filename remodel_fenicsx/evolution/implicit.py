@@ -382,7 +382,9 @@ class Implicit:
     ) -> None:
         """Solve after a change, in one piece or in parts."""
         most = MOST_SOLVES * self.settings.maximum_iterations + work.newton_iterations
-        change = Change(time, stage, set_fraction, newton, self.settings.maximum_halvings, most_iterations=most)
+        change = Change(
+            time, stage, set_fraction, self.state, lambda: newton, self.settings.maximum_halvings, most_iterations=most
+        )
         before, again = self.state.unknown.x.array.copy(), work.substeps > 0
         try:
             set_fraction(1.0)

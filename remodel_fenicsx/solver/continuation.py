@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -129,13 +130,19 @@ class Change:
     time: float
     stage: str
     set_fraction: Callable[[float], None]
-    newton: GuardedNewton
+    state: State
+    solves: Callable[[], GuardedNewton]  # asked for when parts are solved: few steps have any
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
     roughly: bool = False
     most_iterations: float = np.inf
     refusal: Refusal | None = field(default=None, init=False)  # what there was no way past but by a jump
     _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
+
+    @functools.cached_property
+    def newton(self) -> GuardedNewton:
+        """Who solves the parts."""
+        return self.solves()
 
     def advance(self, work: Work, failure: SolveFailure | None = None, part: float = 1.0) -> None:
         """Go from 0 to 1."""
@@ -212,7 +219,7 @@ class Change:
     def look_back(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
         """After a step: look into one that has ended far from its tangent or from the step before."""
         # `again`: it was solved once more, with other cells; that is no step of its own
-        unknown, jumps = self.newton.unknown.x.array, self._jumps
+        unknown, jumps = self.state.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
         looked = self.is_another_branch(work.last, moved, expected, tangents) and self._looks()
@@ -226,7 +233,7 @@ class Change:
         """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent."""
         # Where there is no such way, the solution stays, and a warning says so. Where it leads to another solution,
         # this one is taken: the body comes to it.
-        unknown = self.newton.unknown.x.array
+        unknown = self.state.unknown.x.array
         found, parts = unknown.copy(), Work()
         unknown[:] = before
         try:
@@ -257,7 +264,7 @@ class Change:
     def is_another_branch(self, solution: Solution | None, moved: float, expected: float, tangents: int = 0) -> bool:
         """Whether a solve may have ended there: far from its tangent, late, or much further than was expected."""
         # `expected`: what the way before lets expect, 0 where there is none; `tangents`: of a whole step
-        least = POSSIBLE_JUMP * self.newton.equilibrium.state.loading.domain.size
+        least = POSSIBLE_JUMP * self.state.loading.domain.size
         if tangents > MANY or 0.0 < expected < moved / FASTER and moved > least:
             return True
         if solution is None:
@@ -266,7 +273,7 @@ class Change:
 
     def _size(self, change: NDArray[np.float64]) -> float:
         """Largest change of an unknown, over all ranks."""
-        return float(over_ranks(self.newton.equilibrium.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
+        return float(over_ranks(self.state.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
 
     def _looks(self) -> bool:
         """Whether a part that has ended far away is looked into."""
@@ -275,13 +282,13 @@ class Change:
 
     @property
     def _jumps(self) -> Numbers:
-        return Numbers(self.newton.equilibrium.state, "jumps", {"found": 0, "moved": 0})
+        return Numbers(self.state, "jumps", {"found": 0, "moved": 0})
 
     def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
         """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""
         self.refusal = refusal
         self._jumps["found"] += 1
-        state, far = self.newton.equilibrium.state, self._size(solved - self.newton.unknown.x.array)
+        state, far = self.state, self._size(solved - self.state.unknown.x.array)
         if state.comm.rank == 0:
             loads = ", ".join(f"{name} {value:.4g}" for name, value in state.loading.values.items() if value)
             log.warning(
@@ -301,18 +308,26 @@ class Change:
 
 
 class Blend:
-    """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep: the old and the new model at the ends."""
+    """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep: the old and the new model at the ends.
+
+    Few runs have a step that needs it, and its kernels take as long to compile as those of the run itself: it is made
+    when it is asked for.
+    """
 
     def __init__(self, state: State, tissue: Tissue, settings: Solver):
-        self.settings = settings
+        self.state, self.tissue, self.settings = state, tissue, settings
         self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
-        old, new = state.equilibrium_cells, state.cells
+        self._newton: GuardedNewton | None = None
+
+    @functools.cached_property
+    def equilibrium(self) -> Equilibrium:
+        """Compiled."""
+        old, new = self.state.equilibrium_cells, self.state.cells
 
         def at_points() -> list[UnitCell]:
             return shares(old.point_cells, new.point_cells, float(np.real(self.theta.value)))
 
-        self.equilibrium = Equilibrium(state, tissue, shares(old.ufl_cell, new.ufl_cell, self.theta), at_points)
-        self._newton: GuardedNewton | None = None
+        return Equilibrium(self.state, self.tissue, shares(old.ufl_cell, new.ufl_cell, self.theta), at_points)
 
     @property
     def newton(self) -> GuardedNewton:

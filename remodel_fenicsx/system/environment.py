@@ -109,6 +109,7 @@ def reason_undrawable() -> str | None:
     return f"no {missing[0]}" if missing else None
 
 
+@functools.cache
 def blas_library() -> str:
     """Path of the BLAS that this process has loaded (Debian's links resolved), or `unknown`."""
     try:
