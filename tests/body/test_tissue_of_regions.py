@@ -133,10 +133,12 @@ def test_a_region_has_a_matrix_of_its_own(scaled: None, tables: dict[str, Any]) 
     for name in ("a", "b"):
         layers = {"a": {"outer_radius": 1.4}, "b": {}}
         twice, stiffer = ({**layers, name: {**layers[name], "material": own}} for own in (TWICE, STIFFER))
-        asked = tables | {"time": {"end": 6.0}, "output": {"columns": columns}}
+        asked = tables | {"time": {"end": 6.0}, "output": {"columns": [*columns, "newton_iterations"]}}
         rows = [rows_of(scene(regions, **asked)) for regions in (twice, stiffer)]
         for column in columns:
             np.testing.assert_allclose(*([row[column] for row in one] for one in rows), rtol=1e-7)
+        of_twice, of_stiffer = (sum(row["newton_iterations"] for row in one) for one in rows)
+        assert of_twice <= 1.2 * of_stiffer  # its tangent is that of its stress
 
 
 def test_its_numbers_are_keys_of_the_region(scaled: None, tmp_path: Path) -> None:
