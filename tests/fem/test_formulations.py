@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import cache
 from typing import Any
 
 import dolfinx.fem
@@ -242,6 +243,7 @@ def at_the_end(scene: Scene) -> np.ndarray:
     return np.array([row[name] for name in WATCHED])
 
 
+@cache
 def mean_angles(ratio: float) -> np.ndarray:
     """Radii, and the same means over elements of a reference that shares no code."""
     material = RadialMaterial(lame_lambda=3.103 * ratio, lame_mu=3.103)
