@@ -132,6 +132,7 @@ def scene_of(file: Path, **geometry: Any) -> Any:
             "geometry": {"shape": "mesh", "file": str(file)} | geometry,
             "cells": {"initial": "isotropic"},
             "loads": LOADS,
+            "remodeling": {"law": "none"},
             "time": {"end": 2.0, "step": 1.0},
             "solver": {"method": "direct"},
         }

@@ -80,7 +80,8 @@ def test_a_scene_beside_them_is_run_with_copies_and_goes_on(tmp_path: Path) -> N
     (tmp_path / "scene.toml").write_text(
         'geometry.shape = "mesh"\ngeometry.file = ["volume.vtu", "cap_in.vtp", "cap_out.vtp"]\n[geometry.faces]\n'
         'inner = { file = "lumen.vtp" }\nouter = { file = "wall_outer.vtp" }\ninlet = "cap_in"\noutlet = "cap_out"\n'
-        '[cells]\ninitial = "isotropic"\n[time]\nend = 2.0\n[loads.pressure]\nvalue = 0.5\nramp = [[0, 0], [2, 1]]\n'
+        '[cells]\ninitial = "isotropic"\n[time]\nend = 2.0\n[loads]\npressure = { value = 0.5, ramp = [[0, 0], [2, 1]] }\n'
+        "elongation = { value = 0.05, ramp = [[0, 0], [2, 1]] }\n"
     )
     folder = run(read_scene(tmp_path / "scene.toml"), tmp_path / "run", SELF)
     assert {"volume.vtu", *(f"{name}.vtp" for name in FACES.values())} <= {path.name for path in folder.iterdir()}

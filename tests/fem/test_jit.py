@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -63,6 +64,20 @@ def locked_by_this_process(cache: Path) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache with the program's kernel."""
+    cache = tmp_path_factory.mktemp("compiled")
+    assert compile_and_use(cache).returncode == 0
+    return cache
+
+
+@pytest.fixture
+def cache(compiled: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(compiled, tmp_path / "cache"))
+
+
 def test_only_what_is_really_compiled_is_said_and_counted(tmp_path: Path) -> None:
     count = tmp_path / "count"
     first, again = (compile_and_use(tmp_path, REMODEL_FENICSX_COMPILED=str(count)) for _ in range(2))
@@ -74,20 +89,18 @@ def test_only_what_is_really_compiled_is_said_and_counted(tmp_path: Path) -> Non
     assert count.read_text() == one_file(tmp_path, "libffcx_forms_*.c").stem + "\n"
 
 
-def test_what_is_in_the_cache_waits_for_no_compiler(tmp_path: Path) -> None:
-    assert compile_and_use(tmp_path).returncode == 0
-    with locked_by_this_process(tmp_path):
-        warm = compile_and_use(tmp_path)
+def test_what_is_in_the_cache_waits_for_no_compiler(cache: Path) -> None:
+    with locked_by_this_process(cache):
+        warm = compile_and_use(cache)
     assert warm.returncode == 0, warm.stderr[-2000:]
     assert "waiting" not in warm.stderr
 
 
-def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
-    assert compile_and_use(tmp_path).returncode == 0
-    for path in tmp_path.rglob("libffcx_*.*"):  # all but the lock
+def test_who_waits_for_a_compiler_says_for_whose(cache: Path) -> None:
+    for path in cache.rglob("libffcx_*.*"):  # all but the lock
         path.unlink()
-    command, environment = program(tmp_path)
-    with locked_by_this_process(tmp_path):
+    command, environment = program(cache)
+    with locked_by_this_process(cache):
         waiting = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True)
         assert waiting.stderr
         line = next(line for line in waiting.stderr if "compil" in line)
@@ -100,29 +113,27 @@ def test_who_waits_for_a_compiler_says_for_whose(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("ranks", "lost"), [(1, ".c"), (1, ".c.cached"), *slowly((2, ".c.cached"), (2, ".c"), (1, ".so"))]
 )
-def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: str, tmp_path: Path) -> None:
-    assert compile_and_use(tmp_path, ranks).returncode == 0
-    library, source = one_file(tmp_path, "libffcx_forms_*.so"), one_file(tmp_path, "libffcx_forms_*.c")
+def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: str, cache: Path) -> None:
+    library, source = one_file(cache, "libffcx_forms_*.so"), one_file(cache, "libffcx_forms_*.c")
     library.unlink()  # as if the compiler had been killed: mostly .c, the lock, stays without the end mark
     source.with_suffix(lost).unlink(missing_ok=True)
-    again = compile_and_use(tmp_path, ranks)
+    again = compile_and_use(cache, ranks)
     assert again.returncode == 0, again.stderr[-2000:]
     assert "removing a compilation that was cut off" in again.stderr
     assert library.exists()
-    assert "removing" not in compile_and_use(tmp_path, ranks).stderr
+    assert "removing" not in compile_and_use(cache, ranks).stderr
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
-def test_a_cache_of_another_user_is_not_loaded(tmp_path: Path) -> None:
+def test_a_cache_of_another_user_is_not_loaded(cache: Path, tmp_path: Path) -> None:
     """What is there is run."""
     (tmp_path / "temporary").mkdir()
-    assert compile_and_use(tmp_path / "cache", TMPDIR=str(tmp_path / "temporary")).returncode == 0
-    for folder in (tmp_path / "cache" / "fenics").iterdir():
+    for folder in (cache / "fenics").iterdir():
         try:
             os.chown(folder, 12345, 12345)
         except OSError:
             pytest.skip("this root has one user alone")
-    done = compile_and_use(tmp_path / "cache", TMPDIR=str(tmp_path / "temporary"))
+    done = compile_and_use(cache, TMPDIR=str(tmp_path / "temporary"))
     assert done.returncode == 0 and "belongs to another user" in done.stderr, done.stderr[-2000:]
 
 

@@ -153,12 +153,11 @@ def test_parts_of_quasi_newton_steps_are_no_jump() -> None:
     """Quasi-Newton steps stop just below the tolerance of a part: that rest once looked like a change of direction."""
     case = all_cases()["random cells: frame material, force 3000.0"]
     with closing(Runner(limit=60)) as runner:
-        for method in ("direct", "lagged"):
-            scene = case.scene | {"solver": {"method": method}, "time": {"step": 1.0, "end": 6.0}}
-            run = runner.run({"scene": scene, "counts": case.counts, "extended": case.extended})
-            assert run.code == 0 and max(run.column("substeps")) > 4
-            assert run.column("mean_stretch")[-1] == pytest.approx(1.81231133, rel=1e-8)
-            assert not any("jumps" in warning for warning in run.warnings)
+        scene = case.scene | {"solver": {"method": "lagged"}, "time": {"step": 1.0, "end": 6.0}}
+        run = runner.run({"scene": scene, "counts": case.counts, "extended": case.extended})
+        assert run.code == 0 and max(run.column("substeps")) > 4
+        assert run.column("mean_stretch")[-1] == pytest.approx(1.81231133, rel=1e-8)  # so every tangent says
+        assert not any("jumps" in warning for warning in run.warnings)
 
 
 @pytest.mark.parametrize("method", ["direct", "lagged"])
