@@ -118,7 +118,7 @@ def test_every_node_of_an_own_body_comes_back(
     assert len(loads) == 8
 
 
-ON_ONE_AND_TWO_RANKS = [{"scene": own_values(str(TUBE), elongation=0.01)}]
+ON_ONE_AND_TWO_RANKS = [{"scene": own_values(str(TUBE), 0.6, elongation=0.01)}]
 
 
 def test_two_ranks_find_the_same(cases: Cases) -> None:

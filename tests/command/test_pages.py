@@ -26,7 +26,7 @@ from tests.forks import forked
 ROOT = Path(__file__).parents[2]
 TUBE = "tutorial_tube"
 OF_PAGES = tomllib.loads((Path(__file__).parent / "pages.toml").read_text(encoding="utf-8"))
-SHORT, NOT_RUN, LEFT_BEHIND = (OF_PAGES[name] for name in ("short", "not_run", "left_behind"))
+SHORT, LIGHT, NOT_RUN, LEFT_BEHIND = (OF_PAGES[name] for name in ("short", "light", "not_run", "left_behind"))
 REFUSAL = "loads.force"
 SCRIPT = "import runpy, sys; sys.path.insert(0, '.'); del sys.argv[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
 PAGES = [
@@ -50,10 +50,20 @@ def is_left_out(line: str) -> bool:
     return line.startswith(tuple(NOT_RUN))
 
 
+def of_the_demos(name: str) -> Path:
+    """A file of the demos, or a copy that makes less work: a mesh of few elements, a fit that begins near its end."""
+    text = few = (ROOT / name).read_text(encoding="utf-8")
+    for heavy, light in LIGHT.items():
+        few = few.replace(heavy, light)
+    copy = Path(f"few-{Path(name).name}")
+    copy.write_text(few, encoding="utf-8")
+    return ROOT / name if few == text else copy
+
+
 def obey(line: str, capture: pytest.CaptureFixture[str]) -> str:
     """One command of a page; what it prints."""
     program, *words = shlex.split(line.removeprefix("./with-fenicsx "))
-    words = [str(ROOT / word) if word.startswith("demos/") else word for word in words]
+    words = [str(of_the_demos(word)) if word.startswith("demos/") else word for word in words]
     if program == "remodel-fenicsx" and "--with" in words:  # this process does without its parts
         done = forked("remodel-fenicsx", *words)
         assert done.returncode == 0, line + done.stderr
@@ -144,6 +154,7 @@ def test_the_examples_of_the_readme_run(
     for long, short in OF_PAGES["short_readme"].items():
         assert long in text
         text = text.replace(long, short)
+    monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (8, 4, 1))
     lines = [line.partition("    #")[0] for block in re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
              for line in block.splitlines() if not is_left_out(line)]  # fmt: skip
     assert len(lines) == 5

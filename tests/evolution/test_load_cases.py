@@ -290,23 +290,6 @@ def test_what_threatens_one_case_is_said_of_it(caplog: pytest.LogCaptureFixture)
     assert len(found) == 1 and ", load case 2: the whole body would buckle" in found[0]
 
 
-CUBE = {
-    "geometry": {"shape": "cube"}, "time": {"end": 4.0}, "model": {"kinematics": "full"},
-    "loads": {"force": {"value": 2.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
-    "preset": "consistent", "solver": {"method": "direct", "relative_tolerance": 1e-13},
-    "cases": [{"weight": 0.6, "loads": {"force": 0.5}}, {"weight": 0.4, "loads": {"force": 1.75}}],
-}  # fmt: skip
-ON_ONE_AND_TWO_RANKS = [{"scene": CUBE}]
-
-
-def test_one_and_two_ranks_agree(cases: Any) -> None:
-    """Random cells in three dimensions."""
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
-    np.testing.assert_allclose(two["l"], one["l"], atol=1e-9)
-    np.testing.assert_allclose(two["mean_stretch@2"], one["mean_stretch@2"], rtol=1e-9)
-    assert one["mean_stretch@2"][-1] > one["mean_stretch"][-1] + 0.01
-
-
 # ---------------------------------------------------------------- refusals
 
 

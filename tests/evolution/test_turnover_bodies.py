@@ -16,7 +16,6 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases
-from tests.evolution.test_load_cases import CUBE
 from tests.runs import simulated
 from tests.values import TENSION, ramped, isotropic
 
@@ -147,14 +146,20 @@ def test_closed_ends_and_residual_stress() -> None:
 
 
 # ---------------------------------------------------------------- ranks
-GROWING_CUBE = CUBE | {"remodeling": {"turnover": TURNOVER}, "output": {"columns": ["mean_stretch", *TURNED]}}
-ON_ONE_AND_TWO_RANKS = [{"scene": GROWING_CUBE}]
+WHOLE = isotropic(
+    "consistent", "full", geometry=WALL, cells={"initial": "random"}, remodeling={"turnover": {"time": 10.0}},
+    loads=ramped(4.0, pressure=1.2, elongation=0.1), time={"end": 4.0, "step": 2.0},
+    cases=[{"weight": 0.6, "loads": {"pressure": 0.8}}, {"weight": 0.4, "loads": {"pressure": 1.3}}],
+    output={"columns": [*TURNED, "growth", "inner_radius"]},
+)  # fmt: skip
+ON_ONE_AND_TWO_RANKS = [{"scene": WHOLE, "divisions": [8, 1, 1]}]
 
 
 def test_one_and_two_ranks_agree(cases: Cases) -> None:
     """Random cells in three dimensions, with two load cases."""
     (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
     np.testing.assert_allclose(two["l"], one["l"], atol=1e-9)
-    for name in (*TURNED, "mean_stretch@2"):
+    for name in (*TURNED, "growth", "inner_radius@2"):
         np.testing.assert_allclose(two[name], one[name], rtol=1e-9)
+    assert one["inner_radius@2"][-1] > one["inner_radius"][-1] + 0.01
     assert abs(one["content"][-1] - 1.0) > 0.01

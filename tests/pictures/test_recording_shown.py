@@ -138,10 +138,8 @@ def test_without_fields_there_is_no_body(recorded: Recorded) -> None:
     assert "<iframe" in recording._repr_html_()
 
 
-def test_a_screenshot_is_the_picture_of_the_command(
-    recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")  # as in a kernel of Jupyter
+@pytest.mark.usefixtures("drawn_by_forks")
+def test_a_screenshot_is_the_picture_of_the_command(recorded: Recorded, tmp_path: Path) -> None:
     path = Recording(recorded("cube")).screenshot(tmp_path / "cube.png", [0.0, 10.0], view="above")
     assert path.read_bytes().startswith(b"\x89PNG")
     recording = Recording(recorded("cube"))
