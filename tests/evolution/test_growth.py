@@ -112,7 +112,12 @@ def compare(row: dict[str, float], expected: Rest, *but: str) -> None:
 @pytest.mark.parametrize("case", RESTS, ids=str)
 def test_walls_rest_where_an_independent_program_says(case: Any, caplog: pytest.LogCaptureFixture) -> None:
     """Radius, thickness, means, angles, what a cut shows, curves continued to the faces; nothing is said."""
-    with simulated(at_rest(case)) as (simulation, (row,)):
+    scene = at_rest(case)
+    if case[1] == 2.0:  # the last step to its rest is tried in vain, for long: it comes there in time
+        ends = {"time.end": 800.0, "time.step": 4.0, "time.tolerance": 1.0}
+        scene = scene.with_values(ends | {"output.columns": scene.output.columns[:-1]})
+    with simulated(scene) as (simulation, rows):
+        row = rows[-1] | {"opening_angle": opening_angle(simulation)}
         stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
         depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.turnover._values("content")
     compare(row, RESTS[case])
@@ -165,8 +170,8 @@ def test_room_from_rest_on(volume: float, thickness: float, stress: float, openi
 
 def test_a_wall_comes_back_when_the_pressure_falls() -> None:
     """Thickness and content, which remember a little of it."""
-    scene = at_rest((0.3, 1.0, 1.1, 1.5), held=800.0)
-    ramp = [*map(list, scene.loads["pressure"].ramp), [1600.0, 1.5], [1624.0, 1.0]]
+    scene = at_rest((0.3, 1.0, 1.1, 1.5), held=400.0)
+    ramp = [*map(list, scene.loads["pressure"].ramp), [800.0, 1.5], [824.0, 1.0]]
     row = last_row(scene.with_values({"loads.pressure.ramp": ramp}))
     assert [row["wall_thickness"], row["content"]] == pytest.approx([0.3252, 2.595], rel=0.01)
 
@@ -193,8 +198,8 @@ def membrane(volume: float, gain: float, loads: Any, end: float, step: float) ->
 @pytest.mark.parametrize("gain", [1.0, 2.0])
 def test_a_membrane_that_is_all_collagen_keeps_its_hoop_stress(gain: float) -> None:
     """m/rho^2 follows the pressure, the radius rho, and the thickness m: the closed limits of a thin wall."""
-    rows = rows_of(membrane(1.0, gain, raised(1.5, 960.0, 0.04), 1920.0, 12.0))
-    before = next(row for row in rows if row["time"] >= 960.0)
+    rows = rows_of(membrane(1.0, gain, raised(1.5, 720.0, 0.04), 1440.0, 24.0 / gain))
+    before = next(row for row in rows if row["time"] >= 720.0)
     factor = {name: rows[-1][name] / before[name] for name in (*GROWN, "inner_radius")}
     assert factor["content"] / factor["natural_length"] ** 2 == pytest.approx(1.5, rel=0.01)
     assert factor["inner_radius"] == pytest.approx(factor["natural_length"], rel=0.01)
@@ -259,8 +264,9 @@ SHORT: Any = {"turnover": {"time": 10.0}, "loads": ramped(8.0, pressure=1.2, elo
 
 def test_kinematics_agree() -> None:
     """One radius, a half-plane, a piece of the ring in three dimensions."""
+    tables: Any = SHORT | {"remodeling": {"coupling": "staggered"}, "mesh": {"degree": 2}}  # half of the kernels
     rows = [
-        last_row(wall(0.5, 12.0, None, **SHORT, model={"kinematics": name}, mesh={"degree": 2}))
+        last_row(wall(0.5, 12.0, None, **tables, model={"kinematics": name}))
         for name in ("radial", "axisymmetric", "sector")
     ]
     assert rows[0]["growth"] > 1.1
@@ -271,14 +277,11 @@ def test_kinematics_agree() -> None:
 
 def test_linear_elements_know_what_a_cut_shows() -> None:
     """J_g is one number in each of them; the cut takes what the content has at every point."""
-    opened = [
-        last_row(
-            wall(0.5, 12.0, None, **SHORT, model={"kinematics": name}, mesh={"degree": degree}).with_values(
-                {"output.columns": ["opening_angle"]}
-            )
-        )["opening_angle"]
-        for name, degree in (("radial", 2), ("sector", 1))
-    ]
+    opened = []
+    for name, degree in (("radial", 2), ("sector", 1)):
+        tables: Any = SHORT | {"model": {"kinematics": name}, "mesh": {"degree": degree}}
+        with simulated(wall(0.5, 20.0, None, **tables, remodeling={"coupling": "staggered"})) as (simulation, _):
+            opened.append(opening_angle(simulation))
     assert opened[1] == pytest.approx(opened[0], rel=0.2)
 
 
@@ -369,7 +372,7 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
     """E T/(k a - 2) for a membrane without a matrix, from the fall of its rates; a matrix makes it rest sooner."""
     for gain in (1.0, 2.0):
         rates: list[float] = []
-        with made(membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 10.0)) as simulation:
+        with made(membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 20.0 / gain)) as simulation:
             turnover = simulation.stepper.turnover
             for step in simulation.steps():
                 rates += [np.abs(turnover.rates()).max()] if step.time in (600.0, 700.0) else []
