@@ -91,25 +91,37 @@ NEVER_THROUGH = ("run.lock", "history.csv", "run.log")
 REPLACED = "fields.vtkhdf fields_chains.vtkhdf scene.toml.part checkpoint-a.npz.part checkpoint-b.npz.part".split()
 
 
-@pytest.mark.parametrize("kind", ["symbolic", "hard"])
-@pytest.mark.parametrize("name", [*NEVER_THROUGH, *REPLACED])
-def test_nothing_is_written_through_a_link(name: str, kind: str, folder: Path, victim: Path) -> None:
-    path = folder / name
+def given_away(path: Path, victim: Path, kind: str) -> bytes:
+    """What the victim holds, to which a file of a run is a link from now on."""
     with contextlib.suppress(FileNotFoundError):  # the victim is a valid one: what matters is that it is another file
         victim.write_bytes(path.read_bytes())
         path.unlink()
-    before, others = victim.read_bytes(), content(folder)
     if kind == "hard":
         os.link(victim, path)
     else:
         path.symlink_to(victim)
-    if name in REPLACED:
-        resume(folder, LONGER, SELF)
-        assert Recording(folder).history["time"][-1] == 4.0
-    else:
-        assert name in refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
-        assert {other: data for other, data in content(folder).items() if other != name} == others
+    return victim.read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["symbolic", "hard"])
+@pytest.mark.parametrize("name", NEVER_THROUGH)
+def test_nothing_is_written_through_a_link(name: str, kind: str, folder: Path, victim: Path) -> None:
+    before = given_away(folder / name, victim, kind)
+    others = {other: data for other, data in content(folder).items() if other != name}
+    assert name in refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
+    assert {other: data for other, data in content(folder).items() if other != name} == others
     assert victim.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", ["symbolic", "hard"])
+def test_links_give_way_to_files_of_the_run(kind: str, folder: Path, tmp_path: Path) -> None:
+    victims = {name: tmp_path / f"victim of {name}" for name in REPLACED}
+    for victim in victims.values():
+        victim.write_bytes(MINE)
+    before = {name: given_away(folder / name, victim, kind) for name, victim in victims.items()}
+    resume(folder, LONGER, SELF)
+    assert Recording(folder).history["time"][-1] == 4.0
+    assert {name: victim.read_bytes() for name, victim in victims.items()} == before
 
 
 @pytest.mark.parametrize("name", ["seed-1", "ensemble.csv"])
