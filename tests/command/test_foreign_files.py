@@ -91,37 +91,24 @@ NEVER_THROUGH = ("run.lock", "history.csv", "run.log")
 REPLACED = "fields.vtkhdf fields_chains.vtkhdf scene.toml.part checkpoint-a.npz.part checkpoint-b.npz.part".split()
 
 
-def given_away(path: Path, victim: Path, kind: str) -> bytes:
-    """What the victim holds, to which a file of a run is a link from now on."""
-    with contextlib.suppress(FileNotFoundError):  # the victim is a valid one: what matters is that it is another file
-        victim.write_bytes(path.read_bytes())
-        path.unlink()
-    if kind == "hard":
-        os.link(victim, path)
+@pytest.mark.parametrize("kind", ["symbolic", "hard"])
+@pytest.mark.parametrize("names", [*([name] for name in NEVER_THROUGH), REPLACED], ids=" ".join)
+def test_nothing_is_written_through_a_link(names: list[str], kind: str, folder: Path, tmp_path: Path) -> None:
+    before = {}
+    for name in names:
+        path, victim = folder / name, tmp_path / f"victim of {name}"
+        before[victim] = path.read_bytes() if path.exists() else MINE  # a valid one: but it is another file
+        victim.write_bytes(before[victim])
+        path.unlink(missing_ok=True)
+        (path.hardlink_to if kind == "hard" else path.symlink_to)(victim)
+    others = content(folder)
+    if names is REPLACED:
+        resume(folder, LONGER, SELF)
+        assert Recording(folder).history["time"][-1] == 4.0
     else:
-        path.symlink_to(victim)
-    return victim.read_bytes()
-
-
-@pytest.mark.parametrize("kind", ["symbolic", "hard"])
-@pytest.mark.parametrize("name", NEVER_THROUGH)
-def test_nothing_is_written_through_a_link(name: str, kind: str, folder: Path, victim: Path) -> None:
-    before = given_away(folder / name, victim, kind)
-    others = {other: data for other, data in content(folder).items() if other != name}
-    assert name in refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
-    assert {other: data for other, data in content(folder).items() if other != name} == others
-    assert victim.read_bytes() == before
-
-
-@pytest.mark.parametrize("kind", ["symbolic", "hard"])
-def test_links_give_way_to_files_of_the_run(kind: str, folder: Path, tmp_path: Path) -> None:
-    victims = {name: tmp_path / f"victim of {name}" for name in REPLACED}
-    for victim in victims.values():
-        victim.write_bytes(MINE)
-    before = {name: given_away(folder / name, victim, kind) for name, victim in victims.items()}
-    resume(folder, LONGER, SELF)
-    assert Recording(folder).history["time"][-1] == 4.0
-    assert {name: victim.read_bytes() for name, victim in victims.items()} == before
+        assert names[0] in refusal_of("run", "--resume", folder, "--set", LONGER[0], "-q")
+        assert content(folder) == others
+    assert {victim: victim.read_bytes() for victim in before} == before
 
 
 @pytest.mark.parametrize("name", ["seed-1", "ensemble.csv"])
