@@ -25,18 +25,12 @@ FROM_THE_FRONT = "--view=0,-1,0"  # faces that look there have the colours of th
 Drawn = Callable[..., np.ndarray]
 
 
-@pytest.fixture(scope="module")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where each picture is drawn once."""
-    return tmp_path_factory.mktemp("pictures")
-
-
 @pytest.fixture
-def drawn(recorded: Recorded, pictures: Path, drawn_by_forks: None) -> Drawn:
-    """drawn(name of a run, options) -> the picture in 0..255, (rows, columns, 3)."""
+def drawn(recorded: Recorded, drawn_by_forks: None) -> Drawn:
+    """drawn(name of a run, options) -> the picture in 0..255, (rows, columns, 3); each is drawn once."""
 
     def draw(name: str, *options: str) -> np.ndarray:
-        path = pictures / f"{' '.join([name, *options])}.png"
+        path = recorded(name).parent / f"{' '.join([name, *options])}.png"
         if not path.exists():
             assert cli.main(["picture", str(recorded(name)), *options, "-o", str(path)]) == 0
         with Image.open(path) as picture:

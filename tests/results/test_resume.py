@@ -47,8 +47,8 @@ SELF = MPI.COMM_SELF
 
 
 def scene(end: float = END, **output: Any) -> Scene:
-    """The pulled cube with fields in every second step."""
-    return pulled_cube(end, output={"every": 2, **output})
+    """The pulled cube with fields in every second step, and without a page."""
+    return pulled_cube(end, output={"every": 2, "report": False, **output})
 
 
 def rows(folder: Path) -> list[list[str]]:

@@ -76,7 +76,7 @@ def fitting(field: FieldInfo) -> Iterator[Any]:
 
 
 def test_every_key_with_every_kind_of_value(bases: list[Scene], tmp_path: Path):
-    path, reached, asked = tmp_path / "scene.toml", set(), dict(keys())
+    path, reached, asked, seen = tmp_path / "scene.toml", set(), dict(keys()), set()
     for key, field in asked.items():
         for base in bases:
             for value in fitting(field):
@@ -86,9 +86,11 @@ def test_every_key_with_every_kind_of_value(bases: list[Scene], tmp_path: Path):
                     scene = base.with_values({key: value})
                 except SceneError:
                     continue
-                path.write_text(scene.to_toml(), encoding="utf-8")
-                assert read_scene(path) == scene, f"{key} = {value!r} of a {base.geometry.name}"
                 reached |= {key} if value is not None else set()
+                if (whole := scene.model_dump_json()) not in seen:  # many values, and no value, make the same scene
+                    path.write_text(scene.to_toml(), encoding="utf-8")
+                    assert read_scene(path) == scene, f"{key} = {value!r} of a {base.geometry.name}"
+                seen.add(whole)
             if key in reached:
                 break
     assert set(asked) - reached == NOT_REACHED
