@@ -66,10 +66,7 @@ def test_the_sector_of_a_neo_hookean_tube_tends_to_the_incompressible_one() -> N
     assert errors[1] < 0.2 * errors[0]
 
 
-@pytest.mark.parametrize(
-    ("ratio", "angle", "axial"),
-    [(20.0, 179.0, 1.0439205), (10.0, 179.0, None)],
-)
+@pytest.mark.parametrize(("ratio", "angle", "axial"), [(20.0, 179.0, 1.0439205), (10.0, 179.0, None)])
 def test_the_closing_of_a_thick_wall_follows_its_own_error(
     monkeypatch: pytest.MonkeyPatch, ratio: float, angle: float, axial: float | None
 ) -> None:

@@ -296,13 +296,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     [("cube", "point", 3), ("tube", "radial", 3), ("tube", "axisymmetric", 9), ("tube", "sector", 12)],
 )
 def test_recorded_fields_are_revolved_into_the_body(
-    shape: str,
-    name: str,
-    cell: int,
-    whole: Callable[[str], Path],
-    tmp_path: Path,
-    refused: Refused,
-    monkeypatch: pytest.MonkeyPatch,
+    shape: str, name: str, cell: int, whole: Callable[[str], Path], tmp_path: Path, refused: Refused, monkeypatch: Any
 ) -> None:
     """Held against the full run: nodes and elements of its own mesh. Elements of `full` lie between chords."""
     monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (16, 4, 2))
