@@ -54,12 +54,7 @@ def area(domain, face):
 
 # ---------------------------------------------------------------- counts
 @pytest.mark.parametrize(
-    ("shape", "cells", "nodes"),
-    [
-        ("cube", 1, 8),
-        ("tendon", 480, 57 * 11),
-        ("tube", 1536, 16 * 9 * 13),
-    ],
+    ("shape", "cells", "nodes"), [("cube", 1, 8), ("tendon", 480, 57 * 11), ("tube", 1536, 16 * 9 * 13)]
 )
 @pytest.mark.parametrize("refinement", [1, 2])
 def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape, cells, nodes, refinement):
@@ -89,11 +84,7 @@ def test_volumes_and_jacobians(shape, element, degree):
 
 @pytest.mark.parametrize(
     ("element", "degree", "refinement"),
-    [
-        *((element, degree, 1) for element, degree in KINDS),
-        ("hexahedron", 1, 2),
-        ("hexahedron", 2, 2),
-    ],
+    [*((element, degree, 1) for element, degree in KINDS), ("hexahedron", 1, 2), ("hexahedron", 2, 2)],
 )
 def test_the_area_of_the_meshed_tendon_is_the_scenes(element, degree, refinement):
     domain = domain_of("tendon", element, degree, refinement)
@@ -124,18 +115,10 @@ def test_the_named_faces_cover_the_boundary_exactly_once(shape, element, degree)
 
 
 @pytest.mark.parametrize("unit", [1e-2, 1e2])
-@pytest.mark.parametrize(
-    ("shape", "lengths"),
-    [
-        ("cube", (1.0,)),
-        ("tendon", (1.0, 1.02e-8)),
-        ("tendon", (1.01e-4, 1.0)),
-        ("tube", (1.01e-4, 1.0, 1.0)),
-        ("tube", (1.0, 1.000101, 1.0)),
-        ("tube", (0.5, 1.0, 1.01e-4)),
-        ("tube", (1.01e-4, 2.02e-4, 1.0)),
-    ],
-)
+@pytest.mark.parametrize(("shape", "lengths"), [
+    ("cube", (1.0,)), ("tendon", (1.0, 1.02e-8)), ("tendon", (1.01e-4, 1.0)), ("tube", (1.01e-4, 1.0, 1.0)),
+    ("tube", (1.0, 1.000101, 1.0)), ("tube", (0.5, 1.0, 1.01e-4)), ("tube", (1.01e-4, 2.02e-4, 1.0)),
+])  # fmt: skip
 def test_bodies_of_extreme_proportions_are_meshed(shape, lengths, unit):
     """At the limits that are allowed no two nodes become one, in any unit of length."""
     powers = (1, 2) if shape == "tendon" else (1, 1, 1)

@@ -113,9 +113,7 @@ def test_two_layers_in_three_dimensions_are_those_of_the_reference() -> None:
     assert radius < 3e-3 and media < 0.2 and adventitia < 0.2
 
 
-def write_layers(
-    path: Path, radii: tuple[float, ...] = (1.0, INTERFACE, 3.0), turn: Any = None, around: int = 12
-) -> Path:
+def write_layers(path: Path, radii: Any = (1.0, INTERFACE, 3.0), turn: Any = None, around: int = 12) -> Path:
     """The same tube as a mesh file by the script of a demo, whose numbers are set and whose bend is left out."""
     script: Any = runpy.run_path(str(Path(__file__).parents[2] / "demos" / "bent_vessel" / "mesh.py"))
     numbers = {"RADII": radii, "LENGTH": 0.5, "AROUND": around, "THROUGH": 2, "ALONG": 1}

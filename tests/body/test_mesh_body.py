@@ -34,13 +34,9 @@ FREE = {"kind": "free"}
 def scene_of(file: Path, **tables: Any) -> Any:
     """Of a mesh file, pressed and stretched."""
     values = {
-        "geometry": {"shape": "mesh", "file": str(file)},
-        "cells": {"initial": "isotropic"},
-        "remodeling": {"law": "rate"},
-        "loads": LOADS,
-        "time": {"end": 2.0, "step": 1.0},
-        "solver": {"method": "direct"},
-    }
+        "geometry": {"shape": "mesh", "file": str(file)}, "cells": {"initial": "isotropic"}, "loads": LOADS,
+        "remodeling": {"law": "rate"}, "time": {"end": 2.0, "step": 1.0}, "solver": {"method": "direct"},
+    }  # fmt: skip
     return scene_from_dict(values | tables)
 
 
@@ -148,6 +144,9 @@ def test_every_free_rigid_motion_counts(tube: Path, supports: Any, free: int) ->
 # ---------------------------------------------------------------- runs
 
 RUN = """
+material.repulsion = "axes"
+remodeling = { law = "tensor", coupling = "extrapolated" }
+supports = { inlet.kind = "sliding", outlet.kind = "sliding", outer = { kind = "elastic", stiffness = 0.002 } }
 [geometry]
 shape = "mesh"
 file = "mesh/tube.msh"
@@ -159,15 +158,6 @@ end = 3.0
 step = 1.0
 [solver]
 method = "iterative"
-[material]
-repulsion = "axes"
-[remodeling]
-law = "tensor"
-coupling = "extrapolated"
-[supports]
-inlet = { kind = "sliding" }
-outlet = { kind = "sliding" }
-outer = { kind = "elastic", stiffness = 0.002 }
 """
 
 
@@ -222,12 +212,9 @@ def test_equal_pressures_inside_and_outside_compress_alike_everywhere(tube: Path
     stiff = {"kind": "guided", "stiffness": 1e8}
     pressure = {"value": 2.0, "ramp": [[0, 0], [2, 1]]}
     scene = scene_of(
-        tube,
-        material={"chain_density": 0.0},
-        remodeling={"law": "none"},
-        loads={"pressure": pressure, "tissue": _outside()},
-        supports={"inlet": stiff, "outlet": stiff},
-    )
+        tube, material={"chain_density": 0.0}, remodeling={"law": "none"},
+        loads={"pressure": pressure, "tissue": _outside()}, supports={"inlet": stiff, "outlet": stiff},
+    )  # fmt: skip
     row, displacement, places = solved(scene)
     mu, lame_lambda, s = scene.material.lame_mu, scene.material.lame_lambda, 1.0
     for _ in range(50):  # Newton's method
@@ -255,12 +242,10 @@ def test_a_bend_with_sliding_ends_carries_the_force_of_a_closed_tube(tmp_path: P
     length = bend * np.pi / 2
     file = write_tube(tmp_path / "bend.msh", degree=2, counts=counts, length=length, moved=moved)
     tables = {
-        "loads": {"pressure": {"value": 2.0, "ramp": [[0, 0], [10, 1]]}},
-        "material": {"repulsion": "axes"},
-        "remodeling": {"law": "tensor", "coupling": "extrapolated"},
-        "time": {"end": 40.0, "step": 10.0},
+        "loads": {"pressure": {"value": 2.0, "ramp": [[0, 0], [10, 1]]}}, "material": {"repulsion": "axes"},
+        "remodeling": {"law": "tensor", "coupling": "extrapolated"}, "time": {"end": 40.0, "step": 10.0},
         "output": {"fields": False},
-    }
+    }  # fmt: skip
     sliding: dict[str, Any] = {name: {"kind": "sliding"} for name in ("inlet", "outlet")}
     sliding["outer"] = {"kind": "elastic", "stiffness": 0.002}
     bent = Simulation(scene_of(file, supports=sliding, **tables), MPI.COMM_SELF)

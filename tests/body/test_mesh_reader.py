@@ -46,17 +46,10 @@ def sorted_rows(table: Any) -> Any:
     return table[np.lexsort(table.T)]
 
 
-@pytest.mark.parametrize(
-    ("ending", "element", "degree"),
-    [
-        (".vtu", "hexahedron", 1),
-        (".vtu", "tetrahedron", 2),
-        (".vtu", "hexahedron", 2),
-        (".vtk", "tetrahedron", 1),
-        (".xdmf", "hexahedron", 1),
-        (".xdmf", "tetrahedron", 1),
-    ],
-)
+@pytest.mark.parametrize(("ending", "element", "degree"), [
+    (".vtu", "hexahedron", 1), (".vtu", "tetrahedron", 2), (".vtu", "hexahedron", 2),
+    (".vtk", "tetrahedron", 1), (".xdmf", "hexahedron", 1), (".xdmf", "tetrahedron", 1),
+])  # fmt: skip
 def test_the_mesh_is_that_of_gmsh(tmp_path: Path, ending: str, element: str, degree: int) -> None:
     """The same elements, nodes in the same order, the same facets under the same numbers."""
     source = write_tube(tmp_path / "tube.msh", element, degree)
@@ -127,16 +120,11 @@ def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, ca
 
 
 def scene_of(file: Path, **geometry: Any) -> Any:
-    return scene_from_dict(
-        {
-            "geometry": {"shape": "mesh", "file": str(file)} | geometry,
-            "cells": {"initial": "isotropic"},
-            "loads": LOADS,
-            "remodeling": {"law": "none"},
-            "time": {"end": 2.0, "step": 1.0},
-            "solver": {"method": "direct"},
-        }
-    )
+    return scene_from_dict({
+        "geometry": {"shape": "mesh", "file": str(file)} | geometry, "cells": {"initial": "isotropic"},
+        "loads": LOADS, "remodeling": {"law": "none"}, "time": {"end": 2.0, "step": 1.0},
+        "solver": {"method": "direct"},
+    })  # fmt: skip
 
 
 @pytest.mark.parametrize("sign", [1, -1])  # SALOME counts families of elements below zero

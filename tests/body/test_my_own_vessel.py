@@ -16,7 +16,11 @@ import pytest
 from remodel_fenicsx import cli
 
 ROOT = Path(__file__).parents[2]
-SHORT = {"--size 0.9": "--size 1.0", "vessel.toml -o vessel": "vessel.toml -o vessel --set time.end=2.5", "--time 0 60": "--time 0 2.5"}
+SHORT = {
+    "--size 0.9": "--size 1.0",
+    "vessel.toml -o vessel": "vessel.toml -o vessel --set time.end=2.5",
+    "--time 0 60": "--time 0 2.5",
+}
 
 
 def commands() -> list[str]:

@@ -66,10 +66,7 @@ def test_the_sector_of_a_neo_hookean_tube_tends_to_the_incompressible_one() -> N
     assert errors[1] < 0.2 * errors[0]
 
 
-@pytest.mark.parametrize(
-    ("ratio", "angle", "axial"),
-    [(20.0, 179.0, 1.0439205), (10.0, 179.0, None)],
-)
+@pytest.mark.parametrize(("ratio", "angle", "axial"), [(20.0, 179.0, 1.0439205), (10.0, 179.0, None)])
 def test_the_closing_of_a_thick_wall_follows_its_own_error(
     monkeypatch: pytest.MonkeyPatch, ratio: float, angle: float, axial: float | None
 ) -> None:
@@ -113,7 +110,7 @@ TABLE = {  # radii and mean angles of the outer eighth of the wall of an indepen
 @pytest.mark.parametrize("angle", sorted(TABLE))
 def test_the_paper_artery_with_residual_stress(angle: float) -> None:
     """Radii to 0.004, the angle outside to 1.5 degrees: the residual stress takes most of the paper's turn."""
-    row = last_row(scene("radial", **{"natural.opening_angle": angle, "time.end": 150.0}))
+    row = last_row(scene("radial", **{"natural.opening_angle": angle, "time.end": 150.0, "time.step": 2.5}))
     inner, outer, turned = TABLE[angle]
     assert row["inner_radius"] == pytest.approx(inner, abs=0.004)
     assert row["outer_radius"] == pytest.approx(outer, abs=0.004)

@@ -80,8 +80,8 @@ def test_a_scene_beside_them_is_run_with_copies_and_goes_on(tmp_path: Path) -> N
     (tmp_path / "scene.toml").write_text(
         'geometry.shape = "mesh"\ngeometry.file = ["volume.vtu", "cap_in.vtp", "cap_out.vtp"]\n[geometry.faces]\n'
         'inner = { file = "lumen.vtp" }\nouter = { file = "wall_outer.vtp" }\ninlet = "cap_in"\noutlet = "cap_out"\n'
-        '[cells]\ninitial = "isotropic"\n[time]\nend = 2.0\n[loads]\npressure = { value = 0.5, ramp = [[0, 0], [2, 1]] }\n'
-        "elongation = { value = 0.05, ramp = [[0, 0], [2, 1]] }\n"
+        '[cells]\ninitial = "isotropic"\n[time]\nend = 2.0\n[loads]\n'
+        "pressure = { value = 0.5, ramp = [[0, 0], [2, 1]] }\nelongation = { value = 0.05, ramp = [[0, 0], [2, 1]] }\n"
     )
     folder = run(read_scene(tmp_path / "scene.toml"), tmp_path / "run", SELF)
     assert {"volume.vtu", *(f"{name}.vtp" for name in FACES.values())} <= {path.name for path in folder.iterdir()}
@@ -147,10 +147,7 @@ def test_what_is_no_list_of_a_mesh_and_surfaces_is_refused(tmp_path: Path) -> No
     for geometry, line in (
         ({"file": [files["inner"], files["volume"]]}, "geometry.file = .*: must be the path of a mesh"),
         ({"file": []}, "geometry.file = \\[\\]: must be the path of a mesh"),
-        (
-            {"file": [files["volume"], files["msh"]]},
-            "geometry.file = .*what follows the mesh must be paths of its su",
-        ),
+        ({"file": [files["volume"], files["msh"]]}, "geometry.file = .*what follows the mesh must be paths of its su"),
         (
             {"file": [files["volume"], files["inner"], str(twice)]},
             "geometry.file = .*: .*lumen.vtp: there is a face .lumen. already",

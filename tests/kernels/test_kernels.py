@@ -103,6 +103,7 @@ def test_numpy_does_the_same_and_no_c_runs(
     changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A radial artery, which says what computes, and random cells; all alike, rounding alone tells some axes apart."""
+    monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (8, 4, 2))
     values = {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 2.0} | changes
     scene, found = preset_scene("kuhl-holzapfel-2007", "tube").with_values(values), []
     for where in ("C", "numpy"):
