@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import basix.ufl
 import dolfinx.mesh
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.domain import Domain, SymbolicMesh, build_domain
+from remodel_fenicsx.body.domain import Domain, build_domain, symbolic_mesh
 from remodel_fenicsx.body.axes import found_axes
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import LocalAxes
@@ -124,10 +123,9 @@ def ring(
     hexahedra = np.stack(corners, axis=1)
     cells = hexahedra if kind == "hexahedron" else np.concatenate([hexahedra[:, list(those)] for those in TETRAHEDRA])
     here = slice(None) if comm.rank == 0 else slice(0)
-    element = SymbolicMesh(basix.ufl.element("Lagrange", kind, 1, shape=(3,)))
     shares = places / np.array(counts)[:, None]
     tube = straight(1.0, 2.0, 1.0).place(*shares)  # on which the faces are easily told apart
-    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells[here], x=tube[here], e=element)
+    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells[here], x=tube[here], e=symbolic_mesh(kind, 1))
     found = [dolfinx.mesh.locate_entities_boundary(mesh, 2, marker) for marker in FACES.values()]
     facets, values = np.concatenate(found), np.repeat(np.arange(1, 5, dtype=np.int32), list(map(len, found)))
     order = np.argsort(facets)

@@ -207,6 +207,11 @@ class SymbolicMesh(ufl.Mesh):
         return self._cell
 
 
+def symbolic_mesh(kind: str, degree: int) -> SymbolicMesh:
+    """Of the element that dolfinx's reader of Gmsh's meshes takes, too: their kernels are those of other bodies."""
+    return SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, basix.LagrangeVariant.equispaced, shape=(3,)))
+
+
 # ---------------------------------------------------------------- drawn by Gmsh
 
 
@@ -296,8 +301,7 @@ def lattice_domain(
         nodes = second[0][:, None, :, None] * (degree * counts[0] + 1) + first[None, :, None, :]
         kind, elements = "quadrilateral", nodes.reshape(counts[0] * counts[1], -1)[:, _QUADRILATERAL[degree]]
     here = slice(None) if comm.rank == 0 else slice(0)
-    geometry = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
-    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=elements[here], x=points[here], e=geometry)
+    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=elements[here], x=points[here], e=symbolic_mesh(kind, degree))
     dimension = mesh.topology.dim - 1
     found = [dolfinx.mesh.locate_entities_boundary(mesh, dimension, marker) for marker in faces.values()]
     values = np.repeat(np.arange(1, len(found) + 1, dtype=np.int32), [len(one) for one in found])

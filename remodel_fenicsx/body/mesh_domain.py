@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import basix.ufl
 import dolfinx.fem
 import dolfinx.mesh
 import numpy as np
@@ -16,7 +15,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.axes import facets_of, harmonic, slopes
-from remodel_fenicsx.body.domain import Domain, SymbolicMesh, cells_of, corners_of
+from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, symbolic_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
 from remodel_fenicsx.fem import jit
@@ -116,7 +115,7 @@ def shared(
             *(boundary.facets, tuple(boundary.faces), boundary.volume, tuple(rims_of(file, boundary, "inner"))),
         )
     kind, degree, nodes, extent, regions, facets, parts, volume, lines = comm.bcast(told)
-    symbolic = SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, shape=(3,)))
+    symbolic = symbolic_mesh(kind, degree)
     cells = np.empty((0, nodes), dtype=np.int64) if found is None else file.cells[:, node_order(file)]
     points = np.empty((0, 3)) if found is None else file.points
     mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
