@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, cli
+from remodel_fenicsx import Recording, Simulation, cli
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import Tissue
@@ -17,6 +17,7 @@ from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.newton import SolveFailure
 from tests.conftest import slowly
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.reference.radial import RadialMaterial
@@ -109,10 +110,20 @@ def compare(row: dict[str, float], expected: Rest, *but: str) -> None:
         assert row["opening_angle"] == pytest.approx(expected.opening_angle, abs=2.0)
 
 
+def fails(simulation: Simulation) -> None:
+    """As a step that is not solved, and has changed the cells."""
+    simulation.cells.set(simulation.cells.dimension_values[..., ::-1].copy(), simulation.cells.axis_values.copy())
+    raise SolveFailure("in vain", 0, 0, simulation.stepper.coupling.equilibrium.extension())
+
+
 @pytest.mark.parametrize("case", RESTS, ids=str)
 def test_walls_rest_where_an_independent_program_says(case: Any, caplog: pytest.LogCaptureFixture) -> None:
     """Radius, thickness, means, angles, what a cut shows, curves continued to the faces; nothing is said."""
-    with simulated(at_rest(case)) as (simulation, (row,)):
+    with made(at_rest(case)) as simulation:
+        limit: Any = simulation.rest.limit
+        if case[1] == 2.0:  # its last step to the rest is not solved, which takes a second each time: here at once
+            limit.solve = lambda *_: fails(simulation)
+        (row,) = (dict(step.row) for step in simulation.steps())
         stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
         depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.turnover._values("content")
     compare(row, RESTS[case])
@@ -165,8 +176,8 @@ def test_room_from_rest_on(volume: float, thickness: float, stress: float, openi
 
 def test_a_wall_comes_back_when_the_pressure_falls() -> None:
     """Thickness and content, which remember a little of it."""
-    scene = at_rest((0.3, 1.0, 1.1, 1.5), held=800.0)
-    ramp = [*map(list, scene.loads["pressure"].ramp), [1600.0, 1.5], [1624.0, 1.0]]
+    scene = at_rest((0.3, 1.0, 1.1, 1.5), held=400.0)
+    ramp = [*map(list, scene.loads["pressure"].ramp), [800.0, 1.5], [824.0, 1.0]]
     row = last_row(scene.with_values({"loads.pressure.ramp": ramp}))
     assert [row["wall_thickness"], row["content"]] == pytest.approx([0.3252, 2.595], rel=0.01)
 
@@ -193,8 +204,8 @@ def membrane(volume: float, gain: float, loads: Any, end: float, step: float) ->
 @pytest.mark.parametrize("gain", [1.0, 2.0])
 def test_a_membrane_that_is_all_collagen_keeps_its_hoop_stress(gain: float) -> None:
     """m/rho^2 follows the pressure, the radius rho, and the thickness m: the closed limits of a thin wall."""
-    rows = rows_of(membrane(1.0, gain, raised(1.5, 960.0, 0.04), 1920.0, 12.0))
-    before = next(row for row in rows if row["time"] >= 960.0)
+    rows = rows_of(membrane(1.0, gain, raised(1.5, 720.0, 0.04), 1440.0, 24.0 / gain))
+    before = next(row for row in rows if row["time"] >= 720.0)
     factor = {name: rows[-1][name] / before[name] for name in (*GROWN, "inner_radius")}
     assert factor["content"] / factor["natural_length"] ** 2 == pytest.approx(1.5, rel=0.01)
     assert factor["inner_radius"] == pytest.approx(factor["natural_length"], rel=0.01)
@@ -369,7 +380,7 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
     """E T/(k a - 2) for a membrane without a matrix, from the fall of its rates; a matrix makes it rest sooner."""
     for gain in (1.0, 2.0):
         rates: list[float] = []
-        with made(membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 10.0)) as simulation:
+        with made(membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 20.0 / gain)) as simulation:
             turnover = simulation.stepper.turnover
             for step in simulation.steps():
                 rates += [np.abs(turnover.rates()).max()] if step.time in (600.0, 700.0) else []
