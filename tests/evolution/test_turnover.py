@@ -35,20 +35,18 @@ def wall(end: float | str, step: float, turnover: dict[str, float] | None, colum
     )
 
 
-def simulated(values: dict[str, Any]) -> tuple[list[dict[str, float]], dict[str, np.ndarray]]:
-    """All rows, and content and natural length at the points in the order of their radii."""
+def simulated(values: dict[str, Any], opened: bool = False) -> tuple[list[dict[str, float]], dict[str, Any]]:
+    """All rows, content and natural length at the points in the order of their radii, and what a cut shows."""
     with made(values) as simulation:
         rows = [dict(step.row) for step in simulation.steps()]
         turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
         known = {} if turnover is None else {name: turnover._values(name).ravel()[order] for name in COLUMNS}
-        if turnover is not None:
-            known["opening_angle"] = opening_angle(simulation)
-        return rows, known
+        return rows, known | ({"opening_angle": opening_angle(simulation)} if opened else {})
 
 
 def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> None:
     """Figures of an independent program on one radius."""
-    rows, known = simulated(wall(960.0, 8.0, GROWS, COLUMNS))
+    rows, known = simulated(wall(960.0, 8.0, GROWS, COLUMNS), opened=True)
     last = rows[-1]
     assert [last[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
     assert known["opening_angle"] == pytest.approx(115.4, abs=3.0)
@@ -95,7 +93,7 @@ def test_other_walls_open_as_an_independent_solver_says(
     """At rest; another stretch of deposition; the paper's wall under its pressure."""
     values = wall("equilibrium", 4.0, GROWS | {"deposition_stretch": stretch}, [])
     values["geometry"]["outer_radius"], values["loads"]["pressure"]["value"] = tube
-    _, known = simulated(values)
+    _, known = simulated(values, opened=True)
     assert known["opening_angle"] == pytest.approx(angle, abs=1.0)
 
 
@@ -147,9 +145,10 @@ def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, f
     On the way m is no better: in the ramp two errors of a staggered row cancel in part.
     """
     found = {}
-    for coupling, step in (("staggered", 4.0), ("implicit", 4.0), ("implicit", 2.0)):
-        rows = simulated(wall(96.0, step, GROWS, COLUMNS, coupling=coupling))[0]
-        found[coupling, step] = errors(rows[-1:], small_steps), errors(rows, small_steps)
+    for coupling, step, end in (("staggered", 4.0, 96.0), ("implicit", 4.0, 96.0), ("implicit", 2.0, 48.0)):
+        rows = simulated(wall(end, step, GROWS, COLUMNS, coupling=coupling))[0]
+        on_the_way = [row for row in rows if row["time"] <= 48.0]  # in the ramp they are largest
+        found[coupling, step] = errors(rows[-1:], small_steps), errors(on_the_way, small_steps)
     ends = [ends for ends, _ in found.values()]
     assert (ends[1] < ends[0]).all() and (ends[1][:2] < 0.4 * ends[0][:2]).all()
     np.testing.assert_allclose(np.log2(found["implicit", 4.0][1] / found["implicit", 2.0][1]), 1.0, atol=0.1)
@@ -158,11 +157,11 @@ def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, f
 @pytest.mark.parametrize("room", [{}, {"rates": "cauchy", "volume": 0.5}], ids=["none", "volume"])
 def test_the_tangent_of_implicit_steps_is_the_derivative_of_the_forces(room: Any) -> None:
     """In the middle of growth; what is made has its room from the pass before."""
-    with made(wall(48.0, 12.0, GROWS | room, [], coupling="implicit")) as simulation:
+    with made(wall(24.0, 12.0, GROWS | {"time": 20.0} | room, [], coupling="implicit")) as simulation:
         list(simulation.steps())
         coupling: Any = simulation.stepper.coupling
         assert simulation.stepper.turnover.growth is None or simulation.stepper.turnover.growth.ratio.max() > 1.2
-        coupling.cells.begin(60.0, 0.0)
+        coupling.cells.begin(36.0, 0.0)
         np.testing.assert_allclose(taylor_orders(simulation, coupling.newton.equilibrium, 1e-4), 2.0, atol=0.15)
 
 
@@ -171,7 +170,7 @@ def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_step
     """Errors fall as the tolerance does, and are below it; the estimate is about the error of the content."""
     found, counts = [], []
     for tolerance in (4.0, 1.0):
-        values = wall(48.0, 1.0, GROWS, COLUMNS, coupling=coupling)
+        values = wall(24.0 if coupling == "implicit" else 48.0, 1.0, GROWS, COLUMNS, coupling=coupling)
         values["time"]["tolerance"] = tolerance
         rows, _ = simulated(values)
         error, estimate = errors(rows, small_steps), max(row["time_error"] for row in rows)
@@ -232,9 +231,10 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
     found = [record.message for record in caplog.records if "has not come to rest" in record.message]
     assert len(found) == (0 if rests else 1)
     assert rests or ("fallen no faster than 1/t" in found[0] and "mechanobiological instability" in found[0])
-    caplog.clear()
-    simulated(wall(240.0, 8.0, turnover, COLUMNS))
-    assert "come to rest" not in caplog.text
+    if gain == 0.2:
+        caplog.clear()
+        simulated(wall(240.0, 8.0, turnover, COLUMNS))
+        assert "come to rest" not in caplog.text
 
 
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
@@ -301,7 +301,7 @@ def test_the_wall_does_not_thicken_under_more_pressure() -> None:
     found = []
     for factor in (1.0, 1.5):
         values = wall("equilibrium", 4.0, GROWS | {"gain": 2.0}, [*COLUMNS, "inner_radius"])
-        values["loads"]["pressure"]["ramp"] += [[1400.0, 1.0], [1424.0, factor]]
+        values["loads"]["pressure"]["ramp"] += [[500.0, 1.0], [524.0, factor]] if factor > 1.0 else []
         row = last_row(values)
         wall_thickness = row["outer_radius"] - row["inner_radius"]
         found.append((wall_thickness, factor * row["inner_radius"] / wall_thickness))
