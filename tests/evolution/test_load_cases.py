@@ -43,7 +43,6 @@ def artery(cases: Any = (), end: float = 30.0, columns: Any = (), pressure: floa
     values = isotropic(
         "consistent",
         mesh={"refinement": 4, "degree": 2},
-        material={"repulsion": "length"},
         loads=ramped(24.0, pressure=pressure, elongation=0.1),
         time={"end": end, "step": 2.0},
         output={"fields": False, "columns": list(columns)},
@@ -53,9 +52,16 @@ def artery(cases: Any = (), end: float = 30.0, columns: Any = (), pressure: floa
 
 
 def rest(cases: Any = (), **changes: Any) -> np.ndarray:
-    """Angles inside, half-way and outside, once the cells rest."""
-    row = last_row(artery(cases, columns=ANGLES, time={"end": 400.0, "step": 8.0}, **changes))
+    """Angles inside, half-way and outside, once the cells rest; by itself of the tissue of docs/cycles.md."""
+    tables = {"time": {"end": 396.0, "step": 12.0}, "material": {"repulsion": "length"}} | changes
+    row = last_row(artery(cases, columns=ANGLES, **tables))
     return np.array([row[name] for name in ANGLES])
+
+
+@cache
+def rest_of_the_mean() -> np.ndarray:
+    """Without cases."""
+    return rest()
 
 
 # ---------------------------------------------------------------- cases that are none
@@ -107,7 +113,7 @@ def test_against_an_independent_program() -> None:
         mean = sum(weight * stress for weight, stress in zip(weights, stresses, strict=True))
         squares = structure(squares, mean, kappa * step, 1.0)
     cases = [{"weight": w, "loads": {"pressure": f}} for w, f in zip(weights, factors, strict=True)]
-    with made(artery(cases, end, remodeling={"coupling": "staggered"}, material={"repulsion": "log"})) as simulation:
+    with made(artery(cases, end, remodeling={"coupling": "staggered"})) as simulation:
         found = [step.row for step in simulation.steps()]
         names = ("inner_radius", "outer_radius", "inner_radius@2", "outer_radius@2")
         np.testing.assert_allclose([[row[name] for name in names] for row in found], rows, rtol=5e-4)
@@ -132,7 +138,7 @@ def test_which_case_is_first_changes_no_cell() -> None:
 
 def test_a_pulse_is_seen_as_its_mean() -> None:
     """The figures of docs/cycles.md: a normal pulse does not count, axial excursions and the largest tension do."""
-    mean = rest()
+    mean = rest_of_the_mean()
     assert rest(pulse(0.1))[1] - mean[1] == pytest.approx(0.6, abs=0.3)
     assert rest(pulse(0.33))[1] - mean[1] == pytest.approx(6.1, abs=1.0)
     assert rest(pulse(0.2)) - mean == pytest.approx([0.0, 2.5, 0.5], abs=0.5)
@@ -145,12 +151,12 @@ def test_the_largest_tension_of_a_pulse_is_that_of_systole() -> None:
     """More pressure is more tension at every point: as if systole never ended."""
     largest = rest(pulse(0.1), remodeling={"mean": "largest"})
     assert largest == pytest.approx(rest(pressure=1.2 * 4.8), abs=1e-6)
-    assert largest[1] < rest()[1] - 5.0
+    assert largest[1] < rest_of_the_mean()[1] - 5.0
 
 
 def test_with_residual_stress_the_mean_is_enough() -> None:
-    natural = {"opening_angle": 120.0}
-    assert rest(pulse(0.2), natural=natural) - rest(natural=natural) == pytest.approx(0.0, abs=0.3)
+    tables: Any = {"natural": {"opening_angle": 120.0}, "material": {"repulsion": "log"}}
+    assert rest(pulse(0.2), **tables) - rest(**tables) == pytest.approx(0.0, abs=0.3)
 
 
 @pytest.mark.parametrize("law, coupling", LAWS)
@@ -163,7 +169,8 @@ def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
             assert other[name] == pytest.approx(row[name], rel=1e-8, abs=1e-8, nan_ok=True), name
     chosen, fine = rows_of(artery(pulse(0.33), **tables)), artery(pulse(0.33), **tables)
     unloaded = [{"weight": 0.5, "loads": {"pressure": 0.0, "elongation": 0.0}}, {"weight": 0.5}]
-    for row, other in zip(*(rows_of(artery(order, **tables)) for order in (unloaded, unloaded[::-1])), strict=True):
+    early = tables | {"time": tables["time"] | {"end": 14.0}}
+    for row, other in zip(*(rows_of(artery(order, **early)) for order in (unloaded, unloaded[::-1])), strict=True):
         for name in ("time", "time_error"):  # whichever is the first
             assert other[name] == pytest.approx(row[name], rel=1e-5), name
     fine["time"] = {"end": 30.0, "step": 0.5}
@@ -192,7 +199,7 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
             changes.append([np.log(simulation.stepper.turnover._values(name)) for name in columns[:2]])
     both, diastole, systole = np.array(changes)
     np.testing.assert_allclose(both, 2 / 3 * diastole + 1 / 3 * systole, atol=1e-12)
-    assert np.abs(systole - diastole).max() > 1e-3
+    assert np.abs(systole - diastole).max() > 1e-4
 
 
 # ---------------------------------------------------------------- means of drives
