@@ -15,7 +15,7 @@ from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
-from tests.runs import goes_on, last_row, made, opening_angle, taylor_orders
+from tests.runs import goes_on, last_row, made, opening_angle, rows_of, simulated, taylor_orders
 from tests.values import ANGLES, TENSION, ramped, isotropic
 
 COLUMNS = ["content", "natural_length"]
@@ -35,52 +35,24 @@ def wall(end: float | str, step: float, turnover: dict[str, float] | None, colum
     )
 
 
-def simulated(values: dict[str, Any], opened: bool = False) -> tuple[list[dict[str, float]], dict[str, Any]]:
-    """All rows, content and natural length at the points in the order of their radii, and what a cut shows in the end."""
-    with made(values) as simulation:
-        rows = [dict(step.row) for step in simulation.steps()]
-        turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
-        known = {} if turnover is None else {name: turnover._values(name).ravel()[order] for name in COLUMNS}
-        return rows, known | ({"opening_angle": opening_angle(simulation)} if opened else {})
-
-
-def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own() -> None:
-    """Figures of an independent program on one radius."""
-    rows, known = simulated(wall(960.0, 8.0, GROWS, COLUMNS), opened=True)
-    last = rows[-1]
-    assert [last[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
-    assert known["opening_angle"] == pytest.approx(115.4, abs=3.0)
-    for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
-        assert known[name][[0, len(known[name]) // 2, -1]] == pytest.approx(expected, rel=0.03)
-
-
-def at_rest(gain: float) -> tuple[Simulation, dict[str, float]]:
-    """At the end of the way to the equilibrium."""
-    values = wall("equilibrium", 4.0, GROWS | {"gain": gain}, COLUMNS)
-    simulation = Simulation(scene_from_dict(values))
-    (step,) = simulation.steps()
-    return simulation, dict(step.row)
-
-
-def test_the_equilibrium_is_that_rest(caplog: pytest.LogCaptureFixture) -> None:
-    """The same figures, after a way of fewer steps; nothing is said, and nothing changes any more."""
-    simulation, row = at_rest(1.0)
-    turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
-    assert [row[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
-    assert opening_angle(simulation) == pytest.approx(115.4, abs=0.5)
-    for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
-        values = turnover._values(name).ravel()[order]
-        assert values[[0, len(values) // 2, -1]] == pytest.approx(expected, rel=0.03)
+def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(caplog: pytest.LogCaptureFixture) -> None:
+    """Figures of an independent program on one radius: in time, and at once in fewer steps; nothing is said."""
+    for end, degrees in ((960.0, 3.0), ("equilibrium", 0.5)):
+        with made(wall(end, 8.0, GROWS, COLUMNS)) as simulation:
+            row = list(simulation.steps())[-1].row
+            turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
+            assert [row[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
+            assert opening_angle(simulation) == pytest.approx(115.4, abs=degrees)
+            for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
+                values = turnover._values(name).ravel()[order]
+                assert values[[0, len(values) // 2, -1]] == pytest.approx(expected, rel=0.03)
     assert simulation.rest.steps < 40
     assert 40.0 * np.abs(turnover.rates()).max() < 2e-4
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
-    simulation.close()
 
 
 def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    simulation, row = at_rest(0.2)
-    simulation.close()
-    assert row["natural_length"] > 5.0
+    assert last_row(wall("equilibrium", 4.0, GROWS | {"gain": 0.2}, COLUMNS))["natural_length"] > 5.0
     assert sum("growth does not come to rest" in record.message for record in caplog.records) == 1
 
 
@@ -93,8 +65,8 @@ def test_other_walls_open_as_an_independent_solver_says(
     """At rest; another stretch of deposition; the paper's wall under its pressure."""
     values = wall("equilibrium", 4.0, GROWS | {"deposition_stretch": stretch}, [])
     values["geometry"]["outer_radius"], values["loads"]["pressure"]["value"] = tube
-    _, known = simulated(values, opened=True)
-    assert known["opening_angle"] == pytest.approx(angle, abs=1.0)
+    with simulated(values) as (simulation, _):
+        assert opening_angle(simulation) == pytest.approx(angle, abs=1.0)
 
 
 @pytest.mark.parametrize("coupling", ["staggered", "relaxed", "extrapolated", "implicit"])
@@ -103,7 +75,7 @@ def test_without_turnover_it_is_the_law_tensor(coupling: str, time: dict[str, fl
     """Gain 0 and a huge time."""
     never = {"time": 1e12, "deposition_stretch": 1.1, "gain": 0.0}
     scenes = [wall(20.0, 4.0, turnover, [], coupling=coupling) for turnover in (None, never)]
-    plain, turned = (simulated(scene | {"time": scene["time"] | time})[0] for scene in scenes)
+    plain, turned = (rows_of(scene | {"time": scene["time"] | time}) for scene in scenes)
     assert len(turned) == len(plain)
     assert turned[-1] == pytest.approx(plain[-1], rel=1e-9, abs=1e-9, nan_ok=True)
 
@@ -114,7 +86,7 @@ def test_without_turnover_it_is_the_law_tensor(coupling: str, time: dict[str, fl
 @pytest.fixture(scope="module")
 def small_steps() -> list[dict[str, float]]:
     """Rows up to t = 96, where m is 1.7."""
-    return simulated(wall(96.0, 0.5, GROWS, COLUMNS))[0]
+    return rows_of(wall(96.0, 0.5, GROWS, COLUMNS))
 
 
 def errors(rows: list[dict[str, float]], small_steps: list[dict[str, float]]) -> np.ndarray:
@@ -133,8 +105,7 @@ def test_content_and_natural_length_have_the_order_of_the_coupling(
     coupling: str, order: int, small_steps: list[dict[str, float]]
 ) -> None:
     coarse, fine = (
-        errors(simulated(wall(96.0, step, GROWS, COLUMNS, coupling=coupling))[0][-1:], small_steps)
-        for step in (8.0, 2.0)
+        errors(rows_of(wall(96.0, step, GROWS, COLUMNS, coupling=coupling))[-1:], small_steps) for step in (8.0, 2.0)
     )
     np.testing.assert_allclose(np.log(coarse / fine) / np.log(4.0), order, atol=0.35)
 
@@ -146,7 +117,7 @@ def test_implicit_steps_end_nearer_to_the_solution(small_steps: list[dict[str, f
     """
     found = {}
     for coupling, step, end in (("staggered", 4.0, 96.0), ("implicit", 4.0, 96.0), ("implicit", 2.0, 48.0)):
-        rows = simulated(wall(end, step, GROWS, COLUMNS, coupling=coupling))[0]
+        rows = rows_of(wall(end, step, GROWS, COLUMNS, coupling=coupling))
         on_the_way = [row for row in rows if row["time"] <= 48.0]  # in the ramp they are largest
         found[coupling, step] = errors(rows[-1:], small_steps), errors(on_the_way, small_steps)
     ends = [ends for ends, _ in found.values()]
@@ -172,7 +143,7 @@ def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_step
     for tolerance in (4.0, 1.0):
         values = wall(24.0 if coupling == "implicit" else 48.0, 1.0, GROWS, COLUMNS, coupling=coupling)
         values["time"]["tolerance"] = tolerance
-        rows, _ = simulated(values)
+        rows = rows_of(values)
         error, estimate = errors(rows, small_steps), max(row["time_error"] for row in rows)
         assert error.max() < tolerance and error[0] / 1.5 < estimate <= tolerance
         found.append(error)
@@ -202,9 +173,8 @@ def test_a_growth_that_rests_is_no_instability_however_large(
     values = wall(end, 4.0, GROWS, COLUMNS)
     values["loads"]["pressure"]["ramp"] += [[800.0, 1.0], [824.0, 1.6]]
     values["time"]["tolerance"] = 3.0
-    with caplog.at_level(NOTICE):
-        _, known = simulated(values)
-    assert known["content"].max() > 10.0
+    with caplog.at_level(NOTICE), simulated(values) as (simulation, _):
+        assert simulation.stepper.turnover._values("content").max() > 10.0
     assert not [record for record in caplog.records if record.levelname == "WARNING" and "rest" in record.message]
 
 
@@ -227,13 +197,13 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
 ) -> None:
     """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
     turnover = GROWS | {"gain": gain}
-    simulated(wall(480.0, 8.0, turnover, COLUMNS))
+    rows_of(wall(480.0, 8.0, turnover, COLUMNS))
     found = [record.message for record in caplog.records if "has not come to rest" in record.message]
     assert len(found) == (0 if rests else 1)
     assert rests or ("fallen no faster than 1/t" in found[0] and "mechanobiological instability" in found[0])
     if gain == 0.2:
         caplog.clear()
-        simulated(wall(240.0, 8.0, turnover, COLUMNS))
+        rows_of(wall(240.0, 8.0, turnover, COLUMNS))
         assert "come to rest" not in caplog.text
 
 
@@ -241,7 +211,7 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
 def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The end is that of the whole step; half-way ln m is half-way too."""
     values = wall(40.0, 8.0, GROWS, COLUMNS, coupling=coupling) | {"solver": {"predictor": "none"}}
-    whole, _ = simulated(values)
+    whole = rows_of(values)
     simulation = Simulation(scene_from_dict(values))
     coupled, turnover = simulation.stepper.coupling, simulation.stepper.turnover
     set_part, parts, refused = turnover.set_part, [], set()

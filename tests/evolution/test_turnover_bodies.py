@@ -70,9 +70,8 @@ def cauchy_of_the_energy(simulation: Simulation) -> np.ndarray:
 
 def test_fields_are_written_where_there_is_turnover(tmp_path: Path) -> None:
     """All fields have both; of a reduction they are turned to the whole body like any number."""
-    remodeling = {"coupling": "staggered", "turnover": TURNOVER | {"volume": 0.5}}  # with the kernels of test_growth
-    scene = grown("sector", output={"every": 6, "report": False}, remodeling=remodeling)
-    folder = run(scene, tmp_path / "run", SELF)
+    remodeling = {"turnover": TURNOVER | {"volume": 0.5}}  # with the kernels of test_growth
+    folder = run(grown("sector", output={"every": 6, "report": False}, remodeling=remodeling), tmp_path / "run", SELF)
     fields = Recording(folder).fields(12.0)
     assert {*TURNED} < set(fields) and 1.0 < fields["content"].min() < fields["content"].max()
 

@@ -201,7 +201,7 @@ def test_derivatives_are_those_of_the_model(folder: Path, changes: dict[str, Any
             '"regions.inside.material.lame_mu" = { start = 2.0 }',
         ),
         ({"remodeling.coupling": "implicit"}, ""),
-        ({"time.tolerance": 4.0}, ""),
+        ({"time.tolerance": 4.0, "solver.maximum_halvings": 2}, ""),
         ({}, '"geometry.outer_radius" = { start = 1.3 }'),
     ],
     ids=["closing", "regions", "implicit", "chosen steps", "geometry"],
