@@ -177,9 +177,10 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
             _check_whole(values, before, place)
             log.info("goes on from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
             begun = checkpoint.versions
+        now = versions()
         for name, version in begun.items():
-            if (now := versions().get(name)) != version:
-                log.warning("goes on with %s %s, the run was begun with %s", name, now, version)
+            if now.get(name) != version:
+                log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
         return scene, checkpoint
 
     scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))

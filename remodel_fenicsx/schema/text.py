@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import functools
 import logging
 import math
 import re
@@ -138,9 +139,14 @@ def _fill(container: Any, table: BaseModel | Mapping[str, Any]) -> None:
                 container.add(name, inner)
         elif value is not None:
             text = description(type(table), name) if isinstance(table, BaseModel) and name in fields else ""
-            for line in textwrap.wrap(text, COMMENT_WIDTH):
+            for line in _wrapped(text):
                 container.add(tomlkit.comment(line))
             container.add(name, value)
+
+
+@functools.cache
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, COMMENT_WIDTH)
 
 
 def _is_of_tables(value: Any) -> bool:
