@@ -54,7 +54,7 @@ COMPILER_FLAGS = [
 
 # Of tangents: their time is that of sums over pairs of unknowns, which -O2 makes vectors of as -O3 does if it may count
 # the turns of a loop. They run as fast (21 and 357 ms for the artery of degree 1 and 2), and the compiler takes two
-# thirds of the time; for the springs of guided ends, which lie on several faces, 2 s and not 15 to 20.
+# thirds of the time.
 TANGENT_FLAGS = ["-O2", "-ftree-vectorize", "-fvect-cost-model=dynamic", *COMPILER_FLAGS[1:]]
 
 # Components of a vector in one kernel: stores this far apart GCC makes from vectors of points, others point by point.
