@@ -207,10 +207,15 @@ def _built(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
     try:
         yield simulation
     except BaseException as error:
-        if comm.size == 1 or getattr(error, "on_all_ranks", False):
+        if _is_everywhere(error, comm):
             simulation.close()
         raise
     simulation.close()
+
+
+def _is_everywhere(error: BaseException, comm: MPI.Intracomm) -> bool:
+    """Whether all ranks have it, and may do together what ends a run."""
+    return comm.size == 1 or getattr(error, "on_all_ranks", False)
 
 
 @contextmanager
@@ -289,7 +294,7 @@ def _record(
                 reason.kept += ", and run --resume goes on from there"
             else:
                 log.info(STOPPED + "%s", reason)
-            if reason.on_all_ranks or comm.size == 1:
+            if _is_everywhere(reason, comm):
                 checkpoints.write()
             if not isinstance(reason, (interrupts.Interrupted, interrupts.Paused)):  # these shall end soon
                 leave_report()

@@ -152,7 +152,7 @@ class Change:
         if failure is not None:
             part = self._halved(part, done, failure, work)
         while done < 1.0:
-            before = self.newton.unknown.x.array.copy()
+            before = self.state.unknown.x.array.copy()
             part = self._started(min(part, 1.0 - done), done, work)
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
@@ -161,14 +161,14 @@ class Change:
                 solution = self.newton.solve(origin=before)
                 work.add(solution)
             except SolveFailure as failed:
-                self.newton.unknown.x.array[:] = before
+                self.state.unknown.x.array[:] = before
                 work.add(failed)
                 part = self._halved(part, done, failed, work)
             else:
                 expected = 0.0 if self._direction is None else part * self._size(self._direction)
-                moved = self._size(self.newton.unknown.x.array - before)
+                moved = self._size(self.state.unknown.x.array - before)
                 if self.is_another_branch(solution, moved, expected) and self._looks():
-                    solved, self.newton.unknown.x.array[:] = self.newton.unknown.x.array.copy(), before
+                    solved, self.state.unknown.x.array[:] = self.state.unknown.x.array.copy(), before
                     if part / 2 >= self._smallest:
                         log.debug(
                             "%s: far from the last part, %.3g of the first Newton step", self.stage, solution.reach
@@ -179,9 +179,9 @@ class Change:
                     refusal = diagnosed(self.newton, None, self._direction)
                     self._jumped(solved, refusal if refusal.kind else SEVERAL_SOLUTIONS)
                     self.set_fraction(1.0 if is_last else done + part)
-                    self.newton.unknown.x.array[:] = solved
+                    self.state.unknown.x.array[:] = solved
                 done = 1.0 if is_last else done + part
-                self._direction = (self.newton.unknown.x.array - before) / part
+                self._direction = (self.state.unknown.x.array - before) / part
                 part *= 2
                 work.substeps += 1
             finally:
@@ -202,7 +202,7 @@ class Change:
         if not np.all(np.isfinite(self._direction)):
             self._direction = None
             return bound
-        unknown, equilibrium = self.newton.unknown.x.array, self.newton.equilibrium
+        unknown, equilibrium = self.state.unknown.x.array, self.newton.equilibrium
         before = unknown.copy()
         self.set_fraction(done)
         present = equilibrium.look().stretches

@@ -57,6 +57,14 @@ def of_the_file(tube: Path) -> tuple[dict[str, float], Any, Any]:
     return solved(scene_of(tube))
 
 
+def test_elements_of_a_file_are_those_of_a_body_that_is_drawn(tube: Path) -> None:
+    """To the letter, which names their kernels in the cache."""
+    drawn = whole_tube(Tube(inner_radius=RADII[0], outer_radius=RADII[1], length=LENGTH), COUNTS, "hexahedron", 1)
+    own = Simulation(scene_of(tube), MPI.COMM_WORLD).domain
+    one, other = (repr(body.mesh.ufl_domain().ufl_coordinate_element()) for body in (own, drawn))
+    assert one == other
+
+
 def test_a_tube_as_a_file_is_the_tube(of_the_file: Any) -> None:
     shape = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
     scene = scene_of(Path("none.msh"), geometry=shape, model={"kinematics": "full"})
