@@ -227,7 +227,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "negative_eigenvalues",
             "",
-            "negative eigenvalues of the tangent's symmetric part; 0 where the equilibrium is stable",
+            "eigenvalues of the tangent with negative real part; 0 if the equilibrium is stable",
             lambda m: m.step.negative_eigenvalues,
             by_case=False,
         ),

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 FIRST_SHIFT = 1e-3  # of the smallest diagonal entry: where the search for a bound of the spectrum starts
 SHIFT_FACTOR = 8.0  # from one trial of it to the next
 MOST_SHIFTS = 40
+SYMMETRIC_TO = 1e-9  # of the tangent's norm: rounding leaves 1e-16, a pressure on an open face far more
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,12 @@ class FactorisationFailed(ArithmeticError):
 
 
 class Inertia:
-    """Of the symmetric part of an equilibrium's tangent on the free unknowns, at the present unknowns."""
+    """Signs of the eigenvalues of an equilibrium's tangent on the free unknowns, at the present unknowns.
+
+    A tangent whose symmetric part is positive definite has eigenvalues of positive real part. The converse holds for
+    symmetric tangents only: a pressure that follows an open face may leave the symmetric part indefinite while all
+    eigenvalues are positive, as of a strip that it pulls.
+    """
 
     def __init__(self, equilibrium: Equilibrium):
         self.equilibrium = equilibrium
@@ -51,6 +57,7 @@ class Inertia:
         self._symmetric: Any = None
         self._factorised: Any = None
         self._factorisation: Any = None
+        self._is_unsymmetric = False
         self._definite = kept_factor(equilibrium.comm)
 
     def close(self) -> None:
@@ -63,41 +70,61 @@ class Inertia:
 
     # ------------------------------------------------------------ questions
     def negative_eigenvalues(self) -> int:
-        """How many there are."""
+        """Count the eigenvalues of negative real part."""
         self._assemble()
-        kept = self._symmetric.getSize()[0] <= LARGE  # of larger ones MUMPS on all ranks takes less time and memory
+        size = self._symmetric.getSize()[0]
+        kept = size <= LARGE  # of larger ones MUMPS on all ranks takes less time and memory
         if kept and self._definite.is_definite(self._symmetric):
             return 0
-        return self._negative_of(self._symmetric)
+        number = self._negative_of(self._symmetric)
+        if number == 0 or not self._is_unsymmetric:
+            return number
+        wanted = 1
+        while (negative := sum(value < 0 for value in self._lowest(wanted)[0])) >= wanted:
+            wanted = min(2 * negative, size)
+        return negative
 
     def lowest(self) -> Mode:
-        """The lowest eigenvalue and its mode."""
+        """Return the eigenvalue of smallest real part, and its mode."""
+        self._assemble()
+        values, vector = self._lowest(1)
+        mode = self._mode(values[0], vector)
+        vector.destroy()
+        return mode
+
+    def _lowest(self, number: int) -> tuple[list[float], Any]:
+        """Return at least `number` smallest real parts of eigenvalues, and the vector of the first."""
         from slepc4py import SLEPc
 
-        self._assemble()
-        matrix = self._without_prescribed()
-        shift = self._lower_bound(matrix)
+        matrix = self._without_prescribed(self._symmetric)
+        shift = self._lower_bound(matrix)  # real parts lie above the lowest eigenvalue of the symmetric part
+        unsymmetric = self._is_unsymmetric and shift < 0
+        if unsymmetric:
+            matrix.destroy()
+            matrix = self._without_prescribed(self._tangent)
         solver = SLEPc.EPS().create(self.equilibrium.comm)
         solver.setOperators(matrix)
-        solver.setProblemType(SLEPc.EPS.ProblemType.HEP)
-        solver.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)  # all others lie above the bound too
+        kinds, which = SLEPc.EPS.ProblemType, SLEPc.EPS.Which
+        solver.setProblemType(kinds.NHEP if unsymmetric else kinds.HEP)
+        solver.setWhichEigenpairs(which.TARGET_REAL if unsymmetric else which.TARGET_MAGNITUDE)
         solver.setTarget(shift)
+        solver.setDimensions(number)
         transform = solver.getST()
         transform.setType("sinvert")
         linear = transform.getKSP()
         linear.setType("preonly")
-        linear.getPC().setType("cholesky")
+        linear.getPC().setType("lu" if unsymmetric else "cholesky")
         linear.getPC().setFactorSolverType("mumps")
         solver.setInitialSpace(uneven(matrix.createVecRight()))  # as everywhere: the same on any number of ranks
         solver.solve()
-        if solver.getConverged() < 1:
-            raise FactorisationFailed("no eigenvalue was found")
+        if solver.getConverged() < number:
+            raise FactorisationFailed("the lowest eigenvalues of the tangent did not converge")
+        values = [float(solver.getEigenvalue(i).real) for i in range(solver.getConverged())]
         vector = matrix.createVecRight()
-        value = float(solver.getEigenpair(0, vector).real)
-        mode = self._mode(value, vector)
-        for thing in (solver, vector, matrix):
+        solver.getEigenvector(0, vector)
+        for thing in (solver, matrix):
             thing.destroy()
-        return mode
+        return values, vector
 
     def cosine(self, mode: Mode, direction: Array) -> float:
         """Of the angle between a mode and another change of the unknowns, without its sign."""
@@ -115,7 +142,10 @@ class Inertia:
             self._symmetric = self._tangent.transpose(PETSc.Mat())
         else:
             self._tangent.transpose(self._symmetric)
-        self._symmetric.axpy(1.0, self._tangent, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        same = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
+        self._symmetric.axpy(-1.0, self._tangent, same)
+        self._is_unsymmetric = self._symmetric.norm() > SYMMETRIC_TO * self._tangent.norm()
+        self._symmetric.axpy(2.0, self._tangent, same)
         self._symmetric.scale(0.5)
 
     def _negative_of(self, matrix: Any, shift: float = 0.0) -> int:
@@ -143,10 +173,10 @@ class Inertia:
             raise FactorisationFailed(f"MUMPS stopped with INFOG(1) = {factor.getMumpsInfog(1)}")
         return int(factor.getInertia()[0])
 
-    def _without_prescribed(self) -> Any:
+    def _without_prescribed(self, matrix: Any) -> Any:
         """A copy in which the prescribed unknowns have an eigenvalue of the size of the largest ones, not one."""
-        matrix, diagonal = self._symmetric.copy(), self._symmetric.createVecRight()
-        self._symmetric.getDiagonal(diagonal)
+        matrix, diagonal = matrix.copy(), matrix.createVecRight()
+        matrix.getDiagonal(diagonal)
         local = diagonal.array
         held = ~np.isnan(self.equilibrium.prescribed_values()[: len(local)])
         largest = float(np.max(np.abs(local[~held]), initial=0.0))
