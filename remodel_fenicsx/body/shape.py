@@ -633,6 +633,18 @@ class Shape(_Is):  # type: ignore[misc]
             lambda: self.depth(domain.mesh.geometry.x),
         )
 
+    def unresolved(self, mesh: Any, columns: Collection[str]) -> list[str]:
+        """Warn of columns whose values the elements of a mesh do not resolve, a line each.
+
+        Parameters
+        ----------
+        mesh
+            The table `[mesh]`.
+        columns
+            Columns that are asked for.
+        """
+        return []
+
     @property
     def name(self) -> str:
         """The shape's name."""

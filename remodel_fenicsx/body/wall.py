@@ -187,13 +187,14 @@ STRESSES = {"hoop": ("around", 0), "axial": ("along", 1), "radial": ("across", 2
 
 
 def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
-    """Cauchy's stress in the wall, where the angles are."""
+    """Cauchy's stress in the wall: at its faces, and means where the angles are."""
     return tuple(
         Column(
             f"{name}_stress_{where}",
             "stress",
-            f"mean Cauchy stress {direction} the deformed wall, over the elements of `fibre_angle_{where}`",
-            partial(_stress, mean, component),
+            f"Cauchy stress {direction} the deformed wall, "
+            + (FITTED_TO_FACE if where in FACES else f"mean over the elements of `fibre_angle_{where}`"),
+            partial(_stress_at_face, where, component) if where in FACES else partial(_stress, mean, component),
         )
         for name, (direction, component) in STRESSES.items()
         for where, (_, mean) in means.items()
@@ -202,6 +203,48 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ..
 
 def _stress(mean: AngleOf, component: int, m: Any) -> float:
     return mean(m, m.wall_stress[..., component])
+
+
+FACES = ("inner", "outer")
+FITTED_TO_FACE = "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
+ON_THE_FACE = 1e-6  # normalised depth: rounding of coordinates
+SECOND_LAYER = 1.5  # layers: deeper than this the third begins, and the second begins above
+
+
+def _stress_at_face(face: str, component: int, m: Any) -> float:
+    return float(m.tool_of_step(("stress at", face), lambda: _fitted_to_face(face, m))[component])
+
+
+def _fitted_to_face(face: str, m: Any) -> Array:
+    """Return the stress around, along and across the wall at a face, (3,). Collective.
+
+    The stress at superconvergent points is fitted by a polynomial of (R_face/R)^2: in a linear elastic tube its parts
+    are linear in it (Lame). R/R_face follows from the areas of both faces, so that this holds for any wall.
+    """
+    from remodel_fenicsx.fem.compat import geometry_dofmap
+
+    quadrature, comm = m.quadrature, m.domain.comm
+    inner, outer = (m.tool(("area", name), lambda name=name: m.face_area(name)) for name in FACES)
+    widening, depths = outer / inner - 1, m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+    if face == "outer":
+        widening, depths = inner / outer - 1, 1 - depths
+    depths = quadrature.owned(depths)
+    volumes, at_face = quadrature.owned(quadrature.volumes.sum(axis=1)), depths.min(axis=1) < ON_THE_FACE
+    thickness, total = comm.allreduce(np.array([depths.max(axis=1), np.ones(len(depths))]) @ (volumes * at_face))
+    near = depths.min(axis=1) < SECOND_LAYER * thickness / total
+    if m.domain.regions:  # of other tissue the stress around differs
+        region = quadrature.owned(m.domain.element_region)
+        near &= np.isin(region, np.concatenate(comm.allgather(np.unique(region[at_face]))))
+    layers = 2 if any(comm.allgather(bool((near & ~at_face).any()))) else 1
+    t, values = (
+        quadrature.superconvergent_from_nodes(depths[near]),
+        quadrature.owned(quadrature.superconvergent(m.wall_stress))[near],
+    )
+    place = (2 + t * widening) * t / (1 + t * widening) ** 2  # (1 - (R_face/R)^2) / widening
+    powers = place.reshape(-1)[:, None] ** np.arange(layers * quadrature.element_degree)
+    weighted = powers.T * np.repeat(volumes[near], t.shape[1])
+    normal, right = comm.allreduce(weighted @ powers), comm.allreduce(weighted @ values.reshape(-1, 3))
+    return np.asarray(np.linalg.solve(normal, right)[0])
 
 
 def _in_region(name: str) -> AngleOf:

@@ -472,6 +472,7 @@ class Scene(Table):
             for case in self.each_case():
                 lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
                 found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
+        found |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
         return [*found, *self.turned_away(), *self._of_turnover(), *self.remodeling.warnings()]
 
     def turned_away(self) -> list[str]:

@@ -7,18 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from remodel_fenicsx import Scene, SceneError, preset_scene
 from remodel_fenicsx.extend import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from tests.mesh_files import LENGTH, RADII, write_tube
-from tests.reference.radial import AXIAL, CIRCUMFERENTIAL, RADIAL, solve_radial
+from tests.reference.radial import AXIAL, CIRCUMFERENTIAL, RADIAL, RadialMaterial, cauchy_stress, solve_radial
 from tests.parts import rotation, tube
 from tests.runs import last_row, simulated
 from tests.values import ramped
 
 ELEMENTS, END = 8, 30.0
-PLACES = {"inner": slice(None, 3), "outer": slice(-3, None)}  # three Gauss points of the first and the last element
+MIDDLE = slice(9, 15)  # three Gauss points of each of the two elements at the middle radius
 OF_REFERENCE = {"hoop": CIRCUMFERENTIAL, "axial": AXIAL, "radial": RADIAL}
 NAMES = [f"{name}_stress_{where}" for name in OF_REFERENCE for where in ("inner", "middle", "outer")]
 
@@ -31,13 +32,39 @@ def artery(**changes: Any) -> Scene:
 
 
 def test_they_are_those_of_the_reference_while_it_remodels() -> None:
-    """The same elements and Gauss points, so the same means."""
+    """Mid-wall the same elements and Gauss points, so the same means; at the faces those of finer elements."""
     row = last_row(artery())
-    known = solve_radial(end=END, elements=ELEMENTS)
+    known, finer = solve_radial(end=END, elements=ELEMENTS), solve_radial(end=END)
     for name, component in OF_REFERENCE.items():
-        for where, points in PLACES.items():
-            expected = np.average(known.cauchy[-1][points, component], weights=known.areas[points])
-            assert row[f"{name}_stress_{where}"] == pytest.approx(expected, rel=1e-6), (name, where)
+        expected = np.average(known.cauchy[-1][MIDDLE, component], weights=known.areas[MIDDLE])
+        assert row[f"{name}_stress_middle"] == pytest.approx(expected, rel=1e-6), name
+        for where, point in (("inner", 0), ("outer", -1)):  # 0.0011 from the face
+            expected = finer.cauchy[-1][point, component]
+            assert row[f"{name}_stress_{where}"] == pytest.approx(expected, rel=0.05, abs=0.05), (name, where)
+
+
+def test_at_the_faces_they_converge_to_the_traction_and_the_closed_form() -> None:
+    """Across: minus the pressure and zero. Around: the law at the stretches of the face, whose radial one balances."""
+    short = {"remodeling.law": "none", "time.end": 5.0, "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]]}
+    short |= {"loads.elongation.ramp": short["loads.pressure.ramp"]}
+    fine = solve_radial(end=5.0, ramp_time=5.0, law="none")
+    squares, material = np.full((1, 3), 1 / 3), RadialMaterial()
+    at_face = np.array([[fine.inner_radii[-1], 1.1, 1.0]])
+
+    def stresses(radial: float) -> np.ndarray:
+        return cauchy_stress(np.where([False, False, True], radial, at_face), squares, material)[0]
+
+    hoop = stresses(brentq(lambda radial: stresses(radial)[RADIAL] + 4.8, 0.2, 1.0))[CIRCUMFERENTIAL]
+    rows = [last_row(artery(**short, **{"mesh.refinement": refinement})) for refinement in (1, 2, 4)]
+    errors = np.array(
+        [[abs(row["hoop_stress_inner"] / hoop - 1), abs(row["radial_stress_inner"] / 4.8 + 1)] for row in rows]
+    )
+    assert (errors < [[0.02, 0.015], [0.01, 0.005], [0.005, 0.001]]).all()  # means of elements: 62, 46 and 31 % off
+    assert all(abs(row["radial_stress_outer"]) < 1e-3 for row in rows)
+    linear = last_row(artery(**short, **{"mesh.degree": 1}))
+    assert linear["radial_stress_inner"] == pytest.approx(-4.8, rel=0.05)
+    assert "linear elements that are 0.25 inner radii thick" in artery(**{"mesh.degree": 1}).warnings()[0]
+    assert not artery().warnings() and not artery(**{"mesh.degree": 1, "geometry.outer_radius": 1.3}).warnings()
 
 
 @pytest.mark.parametrize("changes", [{}, {"geometry.outer_radius": 1.2}], ids=["thick", "thin"])
