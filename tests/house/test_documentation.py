@@ -127,6 +127,18 @@ def test_the_project_keeps_within_its_ceilings() -> None:
     assert all(sizes[name] <= most for name, most in size["CEILINGS"].items()), sizes
 
 
+LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)[^)]*\)")
+
+
+def test_every_link_between_files_leads_to_one() -> None:
+    """In the repository, as a reader of it follows them; those of the site: tests/house/test_site.py."""
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("demos/**/*.md"), *ROOT.glob("paper/*.md")]
+    links = [(path, link) for path in pages for link in LINK.findall(path.read_text(encoding="utf-8"))]
+    assert len(links) > 100
+    dead = [f"{path.relative_to(ROOT)}: {link}" for path, link in links if not (path.parent / link).exists()]
+    assert not dead
+
+
 def test_a_name_that_the_package_does_not_have_is_refused() -> None:
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         remodel_fenicsx.nothing  # noqa: B018
