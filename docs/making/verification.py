@@ -271,7 +271,7 @@ def make(keep: bool) -> None:
     radial_reference(Page(folder, "radial-reference", *REFERENCE_CAPTION))
     studies = study(folder, keep)
     pictures = (*figures.FIGURES, "radial-reference")
-    files = [f"{name}.{ending}" for name in pictures for ending in ("png", "json")]
+    files = [*(f"{name}.png" for name in pictures), *(f"{name}.json" for name in (*pictures, *studies))]
     for file in (*files, *(f"{name}.csv" for name in (*pictures, *MORE_TABLES, *studies))):
         shutil.copyfile(folder / file, FIGURES / file)
     write_page()
