@@ -32,6 +32,7 @@ from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Load
+from remodel_fenicsx.schema.conventions import convention_doubt
 from remodel_fenicsx.schema.tables import Table, fault, shown
 from remodel_fenicsx.schema.text import read_columns, read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
@@ -55,8 +56,6 @@ LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
 DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
 SCALE_BOUNDS = (1e-3, 1e3)  # bounds of a scale
 WIDE = 1e3  # a bound that nobody gives over the start
-TWICE = (1.7, 2.4)  # diameters over radii of the model at the start, whose tissue is a guess
-ANOTHER_UNIT = 5.0  # lengths over those of the model, or less than its inverse: units differ by ten and more
 FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look `LOGARITHM_CHANGE` to both sides
 
 
@@ -260,6 +259,9 @@ def _read_columns(path: Path, place: str, scene: Scene) -> dict[str, Array]:
     for stretch, strain in strains.items():
         if stretch in columns and strain in columns:
             raise SceneError(f"{place}: has both {stretch} and {strain}")
+    for name in {*columns} & {*strains, *scene.load_kinds}:  # before any solve, which may fail because of them
+        if words := convention_doubt(name, columns[name]):
+            log.warning("%s, %s: %s", path.name, name, words)
     return {strains.get(name, name): values - (name in strains) for name, values in columns.items()}
 
 
@@ -277,22 +279,21 @@ def _check_columns(columns: Mapping[str, Array], loads: tuple[str, ...], state: 
         raise SceneError(f"{place}: needs a column of a load with state = {state!r}: {', '.join(scene.loads)}")
 
 
+WALL = ("wall_thickness", "inner_radius")
+
+
 def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], scene: Scene) -> Iterator[str]:
-    """What measured numbers look like beside those of the model at the start: diameters, another unit; a line each."""
+    """Lines on measured columns that may be in another convention, beside the model at the start."""
     units = {column.name: column.unit for column in _all_columns(scene)}
     for table, model in zip(tables, modelled, strict=True):
-        for name in (one for one in table.sd if one not in table.scaled):
-            found, place = np.abs(table.columns[name]), f"{table.name}, {name}"
-            known = np.maximum(np.abs(model[name]), 1e-300)
-            if units[name] == "degrees" and found.max() <= np.pi < known.max():
-                yield f"{place}: all lie within 3.14, those of the scene reach {known.max():.3g}; degrees are asked"
-            if units[name] != "length":
-                continue
-            ratio, one = float(np.median(found / known)), f"geometry.length_unit = {scene.geometry.length_unit!r}"
-            if name.endswith("radius") and TWICE[0] < (found / known).min() <= ratio < TWICE[1]:
-                yield f"{place}: {ratio:.3g} times those of the scene at the start; are they diameters?"
-            elif ratio > ANOTHER_UNIT or ratio < 1 / ANOTHER_UNIT:
-                yield f"{place}: {ratio:.3g} times those of the scene at the start; {one}, see units"
+        pairs = {f"{name} ({units[name]})": (table.columns[name], model[name]) for name in table.sd}
+        pairs = {name: pair for name, pair in pairs.items() if name.split()[0] not in table.scaled}
+        if {*WALL} <= {*table.sd}:
+            thickness, radius = ([columns[name] for columns in (table.columns, model)] for name in WALL)
+            pairs[" / ".join(WALL)] = (thickness[0] / radius[0], thickness[1] / radius[1])
+        for name, pair in pairs.items():
+            if words := convention_doubt(name, *pair):
+                yield f"{table.name}, {name.partition(' (')[0]}: {words}"
 
 
 # ---------------------------------------------------------------- what a scene says where a table has measurements
@@ -551,6 +552,8 @@ def fit(
             for words in (*explained(scene), scene.formulation_in_words()):
                 log.info("%s", words)
             problem, first = Problem(scene, unknowns, tables, journal), np.log([u.start for u in unknowns])
+            for words in problem.scene_of(first).warnings():
+                log.warning("%s", words)
             line.show(f"the start, and derivatives there: {2 * len(unknowns) + 1} runs")
             try:
                 at_start = problem.models(first)

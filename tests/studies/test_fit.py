@@ -345,9 +345,9 @@ def test_bounds_are_those_of_the_key(folder: Path, refused: Refused) -> None:
     ("name", "factor", "said"),
     [
         ("outer_radius", 2.0, "are they diameters?"),
-        ("outer_radius", 1e-3, "geometry.length_unit = 'mm'"),
-        ("inner_radius", 10.0, "geometry.length_unit = 'mm'"),
-        ("fibre_angle_outer", np.pi / 180, "degrees are asked"),
+        ("outer_radius", 1e-3, "geometry.length_unit?"),
+        ("inner_radius", 10.0, "geometry.length_unit?"),
+        ("fibre_angle_outer", np.pi / 180, "radians? Degrees are asked"),
         ("outer_radius", 1.1, ""),
     ],
 )
@@ -364,6 +364,29 @@ def test_numbers_of_another_kind_are_doubted(name: str, factor: float, said: str
     at_start = problem.models(np.log([unknown.start for unknown in problem.unknowns]))
     found = [*doubts(problem.tables, at_start, scene)]
     assert len(found) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in found)
+
+
+@pytest.mark.parametrize(
+    ("column", "numbers", "said"),
+    [
+        ("elongation_x", [2, 30], "reaches 30: percent?"),
+        ("elongation_x", [-2, -30], "reaches 30: percent?"),
+        ("elongation_x", [0.9993, 1.3], "reaches 1.3: a stretch?"),
+        ("stretch_x", [0.02, 0.3], "begins at 0.02: strains?"),
+        ("stretch_x", [102, 130], "reaches 130: percent?"),
+        ("stretch_x", [0.9993, 1.3], ""),
+        ("elongation_x", [-0.3, 0.7], ""),
+    ],
+)
+def test_loads_of_another_kind_are_doubted(
+    column: str, numbers: list[float], said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Before any solve, which may fail because of them."""
+    scene = read_scene(ROOT / "demos" / "sheet.toml")
+    (tmp_path / "d.csv").write_text(f"{column},nominal_stress_x\n{numbers[0]},1.0\n{numbers[1]},2.0\n")
+    read_measurements(written(tmp_path, {"material.lame_mu": 3.0}, "d.csv", "nominal_stress_x = 0.1"), scene)
+    found = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(found) == bool(said) and all(line.startswith(f"d.csv, {column}: {said}") for line in found)
 
 
 def test_what_is_doubted_is_said_and_logged(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
