@@ -55,12 +55,10 @@ CONVENTIONS = (
         lambda x, model: abs(np.log(np.median(x / model))) > np.log(5.0),
         "{ratio:.3g} times those of the scene at the start; another unit than geometry.length_unit? See units",
     ),
-    # a wall is thinner than its lumen's radius, or it is that of the scene
     Doubt(
         "wall_thickness / inner_radius",
-        lambda x, model: np.median(x) > 1.0 >= np.median(model),
-        "{ratio:.3g} times the ratio of the scene at the start: a wall thicker than the lumen's radius; another unit, "
-        "or the difference of diameters?",
+        lambda x, model: bool(np.median(x) > 1.0 >= np.median(model)),
+        "a wall thicker than the lumen's radius, and {ratio:.3g} times the scene's at the start: another unit?",
     ),
 )
 
