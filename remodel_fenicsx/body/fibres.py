@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from remodel_fenicsx.body.mesh_file import in_place, read_exchange_file
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
+from remodel_fenicsx.schema.conventions import convention_doubt
 from remodel_fenicsx.schema.text import read_columns
 from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE
@@ -26,7 +27,6 @@ FIBRE_ENDINGS = (".vtu", ".xdmf", ".csv")
 SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
-SMALL = 0.1  # degrees: fibres that all lie along circles
 GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
 OF_TABLES = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, parts in GROUPS.items() for c in parts))
 # ParaView writes the number of a component, and Points for places
@@ -84,8 +84,8 @@ def read_fibre_file(path: Path) -> FibreFile:
         raise UnreadableFile(found)
     if places is not None and not np.isfinite(places).all():
         raise UnreadableFile("has places that are not finite")
-    if "angle" in measured and SMALL < np.abs(measured["angle"]).max() <= np.pi:
-        log.warning("%s: all angles lie within 3.14, as in radians; degrees are asked", path.name)
+    if "angle" in measured and (words := convention_doubt("angle", measured["angle"])):
+        log.warning("%s, angle: %s", path.name, words)
     return FibreFile(measured, places, data)
 
 

@@ -576,7 +576,7 @@ class Shape(_Is):  # type: ignore[misc]
         raise NotImplementedError(f"a {self.name} has no section across z")
 
     @property
-    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
         """Ratios of lengths, which tell numbers in different units: key, words, ratio, decades where bodies have it."""
         return ()
 

@@ -96,7 +96,7 @@ class Tendon(Shape):
         return self.area
 
     @property
-    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
         """Of tendons: neither a plate nor a thread."""
         return (("length", "length / sqrt(area)", self.length / math.sqrt(self.area), (-2, 3)),)
 

@@ -287,7 +287,6 @@ class Tube(RoundWall):
             above=-1.0,
             reductions=("radial", "axisymmetric", "sector"),
             value=_elongation,
-            doubtful=(1.0, "an elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1"),
         ),
         "axial_force": LoadKind(
             lambda shape, loading, name: loading.add_axial_force(name),
@@ -448,11 +447,11 @@ class Tube(RoundWall):
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
     @property
-    def proportions(self) -> tuple[tuple[str, str, float, tuple[int, int]], ...]:
-        """Of vessels: a wall that is hardly hollow, a ring, a tube a thousand times as long as wide."""
+    def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
+        """Of vessels: a wall thicker than two radii (the paper's), a ring, a tube a thousand times as long as wide."""
         outer = self.outer_radius
         return (
-            ("inner_radius", "outer_radius / inner_radius", outer / self.inner_radius, (0, 2)),
+            ("inner_radius", "outer_radius / inner_radius", outer / self.inner_radius, (0, 0.5)),
             ("length", "length / outer_radius", self.length / outer, (-2, 3)),
         )
 

@@ -52,6 +52,7 @@ from remodel_fenicsx.schema.settings import (
     faces_of,
     in_region,
 )
+from remodel_fenicsx.schema.conventions import convention_doubt
 from remodel_fenicsx.schema.tables import (
     IN_A_LIST,
     KeysOfParts,
@@ -75,7 +76,6 @@ from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRES
 # Decades in which a ratio may lie. Units differ by a thousand and more, choices seldom by a hundred.
 NETWORK = (-2, 2)  # initial stiffness of the network over that of the matrix; the paper's bodies: 1.1 and 1.5
 LOAD = (-4, 2)  # largest stress of a load over the stiffness of both; the paper's: 0.7 to 4.6. Weak loads are a choice
-TEMPERATURES = (250.0, 400.0)  # K: of what is neither ice nor cooked
 
 
 def doubts(
@@ -92,15 +92,15 @@ def doubts(
             f"{_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
             f"{material.lame_mu:.4g} {unit}); the density is in 1/m^3 in every scene{of_pascal}"
         )
-    if not TEMPERATURES[0] <= material.temperature <= TEMPERATURES[1]:
-        yield f"material.temperature = {material.temperature:g}: an absolute temperature in K; 37 degC are 310.15"
     for key, words, ratio, decades in geometry.proportions:
         if _beyond(ratio, decades):
             one = "all lengths are in one unit, geometry.length_unit"
             yield f"geometry.{key} = {getattr(geometry, key):g}: {words} is {ratio:.3g}; {one}"
     for name, load in loads.items():
         key, kind, value = f"loads.{name}.value", geometry.loads_on(faces_of(loads))[name], load.largest(end)
-        if kind.doubtful is not None and abs(value) >= kind.doubtful[0]:
+        if words := convention_doubt(name, value):
+            yield f"{key}: {words}"
+        elif kind.doubtful is not None and abs(value) >= kind.doubtful[0]:
             yield f"{key}: {value:g} at its largest; {kind.doubtful[1]}"
         stress = abs(largest_stress(kind, value, geometry) or 0.0)
         if stress and (way := _beyond(stress / stiffness, LOAD)):
@@ -109,6 +109,21 @@ def doubts(
                 f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network (lame_mu + c g(r0) r0^2 = "
                 f"{stiffness:.3g} {unit}); all are in one unit, material.stress_unit"
             )
+
+
+def _doubted_keys(value: Any, key: str = "") -> Iterator[str]:
+    """Yield a line on each number of a table, or list of numbers, that may be in another convention."""
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from _doubted_keys(inner, f"{key}.{name}" if key else name)
+        return
+    numbers = value if isinstance(value, (list, tuple)) else [value]
+    if numbers and all(isinstance(number, float) for number in numbers):
+        if words := convention_doubt(key, numbers):
+            yield f"{key}: {words}"
+    elif numbers is value:
+        for number, item in enumerate(value):
+            yield from _doubted_keys(item, f"{key}[{number}]")
 
 
 def chain_stress(material: Material, end_to_end_length: float) -> float:
@@ -124,7 +139,7 @@ def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | Non
     return value if kind.dimension == STRESS else None
 
 
-def _beyond(ratio: float, decades: tuple[int, int]) -> int:
+def _beyond(ratio: float, decades: tuple[float, float]) -> int:
     """-1 or 1 where it is below or above them, else 0."""
     return (ratio > 10.0 ** decades[1]) - (ratio < 10.0 ** decades[0])
 
@@ -473,6 +488,8 @@ class Scene(Table):
                 lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
                 found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
         found |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
+        tables = self.model_dump(exclude={"loads", "cases"})
+        found |= dict.fromkeys(_doubted_keys(tables))
         return [*found, *self.turned_away(), *self._of_turnover(), *self.remodeling.warnings()]
 
     def turned_away(self) -> list[str]:

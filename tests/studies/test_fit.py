@@ -6,6 +6,8 @@ import csv
 import re
 import shlex
 import shutil
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -142,10 +144,36 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
     again = minimised(problem, held, held=1)
     least = float(np.sum(problem.residuals(np.log(found.values)) ** 2))
     assert 2 * again.cost - least == pytest.approx(3.84, rel=0.03)
+    wide = replace(found, covariance=1e6 * found.covariance)  # as of what the data hardly change: no overflow
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert wide.open == ["both", "both"] and wide.lower == pytest.approx([one.lower for one in found.unknowns])
     assert (folder / "out" / "profiles.csv").exists()
 
 
 PAIR = (FITS / "pair.toml").read_text()
+
+
+def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A curve that the matrix cannot follow: its band is one, whatever deviation is claimed; a bound says which end."""
+    scene = read_scene(ROOT / "demos" / "sheet.toml").with_values({"material.chain_density": 0.0})
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    (tmp_path / "d.csv").write_text("elongation_x,nominal_stress_x\n0.05,1.0\n0.1,4.0\n0.2,30.0\n")
+    tables = {}
+    for name, sd, upper in (("a", 0.5, 1e3), ("b", 0.05, 1e3), ("noise", 50.0, 1e3), ("bound", 0.5, 12.0)):
+        data = written(tmp_path, {"material.lame_mu": 10.0}, "d.csv", f"nominal_stress_x = {sd}")
+        data.write_text(data.read_text().replace("start = 10.0", f"start = 10.0, upper = {upper}"))
+        words = ["fit", str(tmp_path / "scene.toml"), str(data), "-o", str(tmp_path / name), "-q", "--starts", "1"]
+        assert cli.main(words) == 0
+        with (tmp_path / name / "fit.csv").open() as file:
+            tables[name] = next(csv.DictReader(file))
+        said = capsys.readouterr()
+        assert ("limited by the model, not the noise" in said.out) is (name != "noise") and "overflow" not in said.err
+    ends = {name: [float(row[end]) for end in ("lower", "value", "upper")] for name, row in tables.items()}
+    np.testing.assert_allclose(ends["a"], ends["b"], rtol=1e-3)
+    assert ends["a"][0] < ends["a"][1] < ends["a"][2] and tables["a"]["limited_by"] == "model"
+    assert (tables["noise"]["limited_by"], tables["a"]["open"]) == ("noise", "")
+    assert ends["bound"][1:] == [12.0, 12.0] and tables["bound"]["open"] == "upper"
 
 
 def test_what_changes_nothing_is_named(folder: Path) -> None:
@@ -345,9 +373,9 @@ def test_bounds_are_those_of_the_key(folder: Path, refused: Refused) -> None:
     ("name", "factor", "said"),
     [
         ("outer_radius", 2.0, "are they diameters?"),
-        ("outer_radius", 1e-3, "geometry.length_unit = 'mm'"),
-        ("inner_radius", 10.0, "geometry.length_unit = 'mm'"),
-        ("fibre_angle_outer", np.pi / 180, "degrees are asked"),
+        ("outer_radius", 1e-3, "geometry.length_unit?"),
+        ("inner_radius", 10.0, "geometry.length_unit?"),
+        ("fibre_angle_outer", np.pi / 180, "radians? Degrees are asked"),
         ("outer_radius", 1.1, ""),
     ],
 )
@@ -364,6 +392,29 @@ def test_numbers_of_another_kind_are_doubted(name: str, factor: float, said: str
     at_start = problem.models(np.log([unknown.start for unknown in problem.unknowns]))
     found = [*doubts(problem.tables, at_start, scene)]
     assert len(found) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in found)
+
+
+@pytest.mark.parametrize(
+    ("column", "numbers", "said"),
+    [
+        ("elongation_x", [2, 30], "reaches 30: percent?"),
+        ("elongation_x", [-2, -30], "reaches 30: percent?"),
+        ("elongation_x", [0.9993, 1.3], "reaches 1.3: a stretch?"),
+        ("stretch_x", [0.02, 0.3], "begins at 0.02: strains?"),
+        ("stretch_x", [102, 130], "reaches 130: percent?"),
+        ("stretch_x", [0.9993, 1.3], ""),
+        ("elongation_x", [-0.3, 0.7], ""),
+    ],
+)
+def test_loads_of_another_kind_are_doubted(
+    column: str, numbers: list[float], said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Before any solve, which may fail because of them."""
+    scene = read_scene(ROOT / "demos" / "sheet.toml")
+    (tmp_path / "d.csv").write_text(f"{column},nominal_stress_x\n{numbers[0]},1.0\n{numbers[1]},2.0\n")
+    read_measurements(written(tmp_path, {"material.lame_mu": 3.0}, "d.csv", "nominal_stress_x = 0.1"), scene)
+    found = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(found) == bool(said) and all(line.startswith(f"d.csv, {column}: {said}") for line in found)
 
 
 def test_what_is_doubted_is_said_and_logged(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
