@@ -14,6 +14,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Recording, Scene, Simulation
 from remodel_fenicsx.body.tube import _opening_angle
 from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import scene_from_dict
 
@@ -63,9 +64,8 @@ def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, 
 
 def opening_angle(simulation: Simulation) -> float:
     """Of a cut of the present state of a tube; the column would cut in every row."""
-    state, observer = simulation.state, simulation.observer
-    m = SimpleNamespace(state=state, observer=observer, quadrature=simulation.quadrature, step=SimpleNamespace(time=0))
-    return _opening_angle(m)
+    step: Any = SimpleNamespace(time=0.0)
+    return _opening_angle(Measurement(simulation.observer, step))
 
 
 def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:

@@ -30,7 +30,7 @@ def families(F: Any, lame_lambda: Any, mu: Any, fibre_stiffness: Any, fibre_expo
         c, s = math.cos(angle), side * math.sin(angle)
         along = c**2 * C[1, 1] + 2 * c * s * C[1, 2] + s**2 * C[2, 2]
         strain = dispersion * (C[0, 0] + C[1, 1] + C[2, 2]) + (1 - 3 * dispersion) * along - 1
-        pulled = (strain + abs(strain)) / 2
+        pulled = np.maximum(strain, 0) if on_arrays else (strain + abs(strain)) / 2  # arrays may be complex
         energy += fibre_stiffness / (2 * fibre_exponent) * (math.exp(fibre_exponent * pulled**2) - 1)
     return energy
 

@@ -6,6 +6,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LAYERS_OF_A_CUT = 64  # in which the cells are averaged: a radial mesh of up to as many points loses nothing
 PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 
 # ---------------------------------------------------------------- what stands for all of a tube
@@ -217,33 +217,49 @@ def _of_the_end(name: str, m: Any) -> float:
 
 def _opening_angle(m: Any) -> float:
     """Of the tube without loads, cut along its length, with its cells as they are; collective."""
-    from remodel_fenicsx.model.residual_stress import Layer, cut, means_through
+    from remodel_fenicsx.model.residual_stress import Rings, cut, means_through
 
-    cells, shape, comm = m.state.cells, m.observer.shape, m.state.comm
-    local = cells.local_axes
+    cells, state, stepper, comm = m.state.cells, m.state, m.observer.stepper, m.state.comm
+    local, tissue = cells.local_axes, stepper.remodeling.parameters.largest()  # one tissue: numbers
     axes = local.axes.reshape(-1, 3, 3)
-    structure = structure_tensor(*cells.point_cells[:2])
-    squared = np.einsum("nia,nab,nib->ni", axes, structure, axes)  # around, along and across the wall
-    radius = np.linalg.norm(local.coordinates.reshape(-1, 3)[:, :2], axis=1)
-    points = m.observer.stepper.remodeling.parameters.at_points()
-    turnover = m.observer.stepper.turnover
-    turned = [getattr(points, name) for name in TURNED_OVER]
-    turned += (
-        [turnover.growth.of_content(points.content)] if turnover is not None and turnover.growth is not None else []
-    )
-    squared = np.column_stack([squared, *(values for values in turned if values is not None)])
-    parts = comm.allgather((radius, squared, m.quadrature.volumes.reshape(-1)))
-    radius, squared, volumes = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    known = means_through(radius, squared, volumes, LAYERS_OF_A_CUT)
-    tissue = m.observer.stepper.remodeling.parameters.largest()  # one tissue: numbers
-    closed = m.state.kinematics.closing
-    layers = (Layer((shape.inner_radius, shape.outer_radius), tissue),) if closed is None else closed.layers
+
+    def along(tensors: Array) -> Array:
+        """Around, along and across the wall."""
+        return np.einsum("nia,nab,nib->ni", axes, tensors.reshape(-1, 3, 3), axes)
+
+    natural, closed = state.natural_gradient, state.kinematics.closing
+
+    def at_first(radii: Array) -> Array:
+        return np.ones((len(radii), 3)) if closed is None else closed.stretches(radii)
+
+    radii = np.linalg.norm(local.coordinates.reshape(-1, 3)[:, :2], axis=1)
+    changed = np.ones((len(radii), 3)) if natural is None else along(natural) / at_first(radii)
+    columns = [radii, *along(structure_tensor(*cells.point_cells[:2])).T, *changed.T]
+    turned = [name for name in TURNED_OVER if getattr(tissue, name) is not None]
+    columns += [getattr(stepper.remodeling.parameters.at_points(), name) for name in turned]
+    rows = np.column_stack([state.per_mesh_volume(m.quadrature.volumes).reshape(-1), *columns])
+    owned = m.quadrature.owned(rows.reshape(*m.quadrature.shape, -1))
+    volumes, *columns = np.concatenate(comm.allgather(owned.reshape(-1, rows.shape[1]))).T
+    edges, parts = m.tool("cut", lambda: _elements_through(m.domain, m.quadrature.element_degree))
+    volumes, means = means_through(columns[0], np.stack(columns, axis=-1), volumes, parts)
+    radii, squared, changed, turnover = np.split(means, [1, 4, 7], axis=1)
+    rings = Rings(radii[:, 0], volumes, changed * at_first(radii[:, 0]), squared)
     try:
-        return float(cut(layers, closed, *known).opening_angle)
+        return cut(replace(tissue, **dict(zip(turned, turnover.T, strict=True))), rings, edges, closed)
     except ArithmeticError as error:
         if comm.rank == 0:
             log.warning("time %g: no opening_angle: %s", m.step.time, error)
         return float("nan")
+
+
+def _elements_through(domain: Domain, degree: int) -> tuple[Array, Array]:
+    """Radii where elements end, as nodes on the x axis have them, and those between which one of Gauss' points lies."""
+    nodes = domain.comm.bcast(domain.gather_nodes(domain.mesh.geometry.x))
+    off, size = np.abs(nodes[:, 1:]).max(axis=1), np.abs(nodes).max()
+    radii = np.sort(nodes[(off < 1e-9 * size) & (nodes[:, 0] > 0), 0])
+    edges = radii[:: domain.mesh.geometry.cmap.degree]
+    shares = np.cumsum(np.polynomial.legendre.leggauss(degree + 1)[1][:-1]) / 2
+    return edges, np.sort(np.append(edges, edges[:-1, None] + np.diff(edges)[:, None] * shares))
 
 
 class Tube(RoundWall):

@@ -17,7 +17,7 @@ from remodel_fenicsx.kernels import Library, in_numpy
 from remodel_fenicsx.model import local_problem, spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import rotated_back
-from remodel_fenicsx.model.energy import PARAMETERS, Tissue, whole_structure_tensor
+from remodel_fenicsx.model.energy import PARAMETERS, Tissue, log_sum, whole_structure_tensor
 from remodel_fenicsx.model.local_problem import LocalProblem, LocalSolution, Slopes, StepOfCells, at, put
 from remodel_fenicsx.model.laws import COMPLEX_STEP, Drive
 from remodel_fenicsx.model.tensor_law import Target
@@ -59,6 +59,8 @@ class TensorKernels:
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
         """`energy.log_sum`."""
+        if np.iscomplexobj(F):
+            return log_sum(F, cells, end_to_end_length)
         result = np.empty(F.shape[:-2])
         self.call("log_sum", result.size, F, whole_structure_tensor(cells), result)
         return result

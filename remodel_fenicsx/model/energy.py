@@ -53,6 +53,9 @@ class Matrix:
     compiled
         Under which name tensor.c has it; "": numpy computes what others do in C.
 
+    Where a tube closes from a sector or is cut, the terms take arrays of complex numbers: np.maximum(x, 0), not |x|.
+    Directions along x, y and z are the radius, the circumference and the length of a tube on its radius.
+
     Examples
     --------
     A matrix that resists changes of volume by (J - 1)^2:
@@ -250,9 +253,12 @@ def length_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_
 
 
 def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
-    """M = A : ln C; arrays."""
-    C = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient
-    return (whole_structure_tensor(cells) * tensors.logarithm(C)).sum(axis=(-1, -2))
+    """M = A : ln C; arrays. Of complex numbers, to first order in the imaginary part."""
+    C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, whole_structure_tensor(cells)
+    found = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
+    return (
+        found + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2)) if np.iscomplexobj(C) else found
+    )
 
 
 def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
@@ -484,6 +490,13 @@ class Tissue:
             for part, names in self._own_parameters.items()
         }
         return replace(self, **{name: found[name] for name in found if name in PARAMETERS + TURNED_OVER}, **own)
+
+    def is_round(self) -> bool:
+        """Whether a turn about z before the deformation leaves the energy of the matrix."""
+        pulled, (c, s) = np.diag([1.1, 1.3, 1.2]), (0.8, 0.6)
+        turned = pulled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        found, again = (self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, turned))
+        return bool(np.isclose(found, again, rtol=1e-9))
 
     def strain_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
         """W per reference volume (eqs. 3 and 4 with errata 1 and 2), in the unit of the Lame constants.

@@ -1,9 +1,8 @@
-"""Residual stress of a round wall: closed from a sector, or cut, on panels through its radius."""
+"""Residual stress of a round wall: closed from a sector on panels through its radius, or cut."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,8 +10,9 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
+from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import COMPLEX_STEP
+from remodel_fenicsx.schema.tables import SceneError
 
 Array = NDArray[np.float64]
 
@@ -21,13 +21,14 @@ MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls 
 MOST_POLYNOMIALS = 8  # of one layer: walls of 1 to 1.05 ... 12 take 1 or 2
 LARGEST_TURN = 0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too; half of it
 ITERATIONS = 30  # of Newton's method, which takes 5 to 7 for walls of 1 to 1.05 ... 12 at 90 to 270 degrees
-CLOSED = 1e-9  # of the residual over lambda + 2 mu; the differences of the energy are good to about 1e-11
-STRETCH_DIFFERENCE = 1e-3  # of a logarithm in the five-point rules: their error is of fourth order
+CLOSED = 1e-9  # of the residual over lambda + 2 mu
+ROUNDINGS = 8.0  # of values, over what one of each may leave of a residual: thin layers, of which some hardly leave 1
+TANGENT_DIFFERENCE = 1e-7  # of a logarithm: Newton's method needs no better tangent
+CHECK_DIFFERENCE, CHECKED = 1e-4, 1e-2  # of a logarithm; of the largest stress: |x| for max(x, 0) is off by half of it
 UNSTRETCHED = (1.0, 1.0, 1.0)
-MODULI = ("lame_lambda", "lame_mu", "network_modulus")
-PARTS_OF_A_LAYER, CUT_DEGREE = 6, 12
-"""Polynomials of rho(R) in a layer, and their degree. Angles of remodeled walls, whose cells have fronts, are good to
-0.3 degrees; one of degree 32 is off by 1.3 in a thick wall that has grown, and one of 64 ends at rounding."""
+ON_THE_RADIUS = [2, 0, 1]
+"""The order of energies: x, y and z of a body on its radius are across, around and along the wall; all else here is
+around, along, across, as local axes have their rows."""
 
 
 # ---------------------------------------------------------------- functions of the radius on panels
@@ -176,7 +177,7 @@ def _balanced(near: Closing, loads: Loads) -> Closing:
         return near._replace(radius=radius, axial=values[..., -1:, None]).at_panels()
 
     def residual(values: Array, stresses: Array) -> Array:
-        through = _through(panels, values[..., :-1], stresses, panels.places, loads.pressure / stiffness)
+        through = _through(panels, values[..., :-1], stresses, loads.pressure / stiffness)
         force = 2 * np.pi * panels.integral(stresses[..., 1] * panels.places)
         if loads.force is None:
             along = values[..., -1] - loads.axial
@@ -192,12 +193,10 @@ def _stiffness(tissues: Sequence[Tissue]) -> float:
     return max(float(np.max(tissue.lame_lambda + 2 * tissue.lame_mu)) for tissue in tissues)
 
 
-def _through(
-    panels: Panels, unknown: Array, stresses: Array, place: Array, pressure: float = 0.0, slope: Array | float = 1.0
-) -> Array:
+def _through(panels: Panels, unknown: Array, stresses: Array, pressure: float) -> Array:
     """Radial balance in the layers, radial stress on both faces, and what goes from one layer to the next."""
     hoop, _, radial = np.moveaxis(stresses, -1, 0)
-    balance = panels.derivative(radial) + (radial - hoop) * slope / place
+    balance = panels.derivative(radial) + (radial - hoop) / panels.places
     inside = balance[..., 1:-1] * (panels.edges[-1] - panels.edges[0]) / 2
     faces = np.stack([radial[..., 0, 0] + pressure, radial[..., -1, -1]], axis=-1)
     between = panels.jumps(unknown.reshape(radial.shape)) / panels.edges[0]
@@ -235,7 +234,10 @@ def solved(
             step = np.linalg.solve(columns.T, present)
         except np.linalg.LinAlgError:
             break
-        if np.abs(present).max() < CLOSED:
+        rounding = ROUNDINGS * np.finfo(np.float64).eps * np.abs(values) @ np.abs(columns)
+        if (np.abs(present) < np.maximum(CLOSED, rounding)).all():
+            for tissue, of_layer, cells in zip(tissues, [*of], dimensions, strict=True):
+                _check_complex(tissue, of_layer, cells)
             return values - step  # bending is soft: what is left of the balance may be a millionth of the angle
         for share in (0.5**power for power in range(12)):
             of, stresses, tangents, trial = state(values - share * step)
@@ -247,91 +249,88 @@ def solved(
 
 def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> tuple[Array, Array]:
     """Principal Cauchy stresses (..., 3) along stretches (..., 3), axes of the cells, and d sigma_i/d ln lambda_j."""
-    h, one = STRETCH_DIFFERENCE, np.eye(3)
-    pairs = one[[0, 0, 1]] + one[[1, 2, 2]]
-    ways = np.concatenate([np.zeros((1, 3)), one, -one, 2 * one, -2 * one, pairs, -pairs])
-    moved = stretches * np.exp(h * ways.reshape(-1, *(1,) * (stretches.ndim - 1), 3))
-    length = tissue.end_to_end_length / np.sqrt(3.0) if dimensions is None else dimensions
-    cell = UnitCell(np.broadcast_to(length, moved.shape), np.broadcast_to(one, (*moved.shape, 3)))
-    still, *changed = np.asarray(tissue.strain_energy(moved[..., None] * one, [cell]))
-    ahead, behind, two_ahead, two_behind, both, neither = np.reshape(changed, (6, 3, *still.shape))
-    volume, sums = np.prod(stretches, axis=-1), ahead + behind
-    stresses = np.moveaxis(8 * (ahead - behind) - (two_ahead - two_behind), 0, -1) / (12 * h) / volume[..., None]
-    mixed = (both + neither - sums[[0, 0, 1]] - sums[[1, 2, 2]] + 2 * still) / (2 * h**2)
-    tangents = np.empty((*stretches.shape, 3))
-    tangents[..., range(3), range(3)] = np.moveaxis(16 * sums - two_ahead - two_behind - 30 * still, 0, -1) / (
-        12 * h**2
+    one = np.eye(3).reshape(3, *(1,) * (stretches.ndim - 1), 3)
+    near = stretches * np.exp(TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(one[:1]), one]))
+    ways: Any = np.exp(1j * COMPLEX_STEP * one)
+    slopes = np.imag(_energy(tissue, near * ways[:, None], dimensions)) / COMPLEX_STEP
+    stresses, *others = np.moveaxis(slopes, 0, -1) / np.prod(near, axis=-1)[..., None]
+    return stresses, np.stack([(other - stresses) / TANGENT_DIFFERENCE for other in others], axis=-1)
+
+
+def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array:
+    """W (...) at stretches (..., 3)."""
+    length = np.broadcast_to(
+        tissue.end_to_end_length / np.sqrt(3.0) if dimensions is None else dimensions, stretches.shape
     )
-    tangents[..., [0, 0, 1], [1, 2, 2]] = tangents[..., [1, 2, 2], [0, 0, 1]] = np.moveaxis(mixed, 0, -1)
-    return stresses, tangents / volume[..., None, None] - stresses[..., None]
+    cell = UnitCell(length[..., ON_THE_RADIUS], np.broadcast_to(np.eye(3), (*stretches.shape, 3)))
+    return np.asarray(tissue.strain_energy(stretches[..., ON_THE_RADIUS, None] * np.eye(3), [cell]))
+
+
+def _check_complex(tissue: Tissue, stretches: Array, dimensions: Array | None) -> None:
+    """Refuse an energy that is another function of complex numbers: as |x| is, for x where that is positive."""
+    way: Any = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])  # in which the volume, however stiff, stays
+    of_complex = np.imag(_energy(tissue, stretches * np.exp(1j * COMPLEX_STEP * way), dimensions)) / COMPLEX_STEP
+    ahead, still, behind = (_energy(tissue, stretches * np.exp(side * way), dimensions) for side in (1, 0, -1))
+    slope, bend = (ahead - behind) / 2, np.abs(ahead + behind - 2 * still) + 1e-14 * np.abs(still)
+    if not (np.abs(of_complex - slope) <= CHECKED * np.abs(slope).max() + bend).all():
+        rule = "its energy must take complex numbers, by whose imaginary part it is derived: np.maximum(x, 0), not |x|"
+        raise SceneError(f"material.matrix, chain or repulsion: {rule}")
 
 
 # ---------------------------------------------------------------- what a tube without loads does when it is cut
 # It is cut along its length, and opens to a sector. The mesh's ring of radii R becomes a sector of radii rho(R), in
 # cylindrical axes
 #     F = diag(k rho/R, e, drho/dR),    F_e = F G,
-# without pressure, axial force and bending moment; its opening angle is 360 (1 - k). The cells stay.
+# of least energy, so that there is no pressure, axial force and bending moment; its opening angle is 360 (1 - k). The
+# cells stay. The energy is summed up as that of the run is: over its points, with its elements through the wall.
 
 
-class Cut(NamedTuple):
-    """A ring that has been cut."""
+class Rings(NamedTuple):
+    """Thin rings of which an unloaded tube is made: arrays of n, or (n, 3) around, along and across the wall."""
 
-    opening_angle: float
-    radii: tuple[float, float]
-    axial: float
-
-
-def cut(layers: Sequence[Layer], closed: Closing | None, radius: Array, squared_dimensions: Array) -> Cut:
-    """Cut an unloaded tube: squared dimensions of its cells, and m, rho and J_g of turnover, at radii."""
-    edges = [np.linspace(*layer.radii, PARTS_OF_A_LAYER + 1)[1:] for layer in layers]
-    layers = [layer for layer in layers for _ in range(PARTS_OF_A_LAYER)]
-    panels = Panels([layers[0].radii[0], *np.concatenate(edges)], CUT_DEGREE)
-    squared = np.empty((*panels.places.shape, squared_dimensions.shape[1]))
-    panel = panels.of(radius)
-    for number, at in enumerate(panels.places):  # what lies in a layer says nothing of the next
-        here = panel // PARTS_OF_A_LAYER == number // PARTS_OF_A_LAYER
-        rows = radius[here], squared_dimensions[here]
-        squared[number] = np.stack([np.interp(at, rows[0], column) for column in rows[1].T], axis=-1)
-    squared, turned = squared[..., :3], np.moveaxis(squared[..., 3:], -1, 0)
-    natural, start = np.ones_like(squared), (panels.places, 1.0, 1.0)
-    if closed is not None:
-        fine = closed._replace(layers=tuple(layers), panels=panels, radius=closed.natural_radius(panels.places))
-        natural = fine.at_panels()
-        start = (fine.radius, 1 / closed.axial, 1 / closed.circumferential)  # what opens, were the cells as they were
-    tissues = []
-    for number, layer in enumerate(layers):
-        changes: dict[str, Any] = dict(zip(TURNED_OVER, turned[:, number], strict=False))  # none without turnover
-        if len(turned) > len(TURNED_OVER):  # what has grown across is longer there, and as much as before in all
-            growth = turned[-1, number]
-            natural[number, :, 2] /= growth
-            changes |= {key: getattr(layer.tissue, key) / growth for key in MODULI}
-        tissues.append(replace(layer.tissue, **changes))
-
-    def opened(values: Array) -> tuple[Array, Array]:
-        rho = values[..., :-2].reshape(*values.shape[:-1], *panels.places.shape)
-        return rho, panels.derivative(rho)
-
-    def stretches(values: Array) -> Array:
-        (rho, slope), axial, k = opened(values), values[..., -2:-1, None], values[..., -1:, None]
-        return np.stack(np.broadcast_arrays(k * rho / panels.places, axial, slope), axis=-1) * natural
-
-    def residual(values: Array, stresses: Array) -> Array:  # and axial force and bending moment, as stresses
-        rho, slope = opened(values)
-        through = _through(panels, values[..., :-2], stresses, rho, slope=slope)
-        area = (panels.edges[-1] - panels.edges[0]) / 2 * (rho[..., 0, 0] + rho[..., -1, -1])
-        means = [panels.integral(stresses[..., n] * rho * slope) / area for n in (1, 0)]
-        return np.concatenate([through, np.stack(means, axis=-1)], axis=-1)
-
-    dimensions = [*np.sqrt(np.maximum(squared, 0.0))]
-    found = solved(tissues, dimensions, stretches, residual, np.append(start[0], start[1:]))
-    return Cut(360.0 * (1.0 - float(found[-1])), (float(found[0]), float(found[-3])), float(found[-2]))
+    radius: Array
+    volume: Array
+    natural: Array
+    squared: Array
 
 
-def means_through(radius: Array, values: Array, weights: Array, number: int) -> tuple[Array, Array]:
-    """Radius and values (n, 3) at points, averaged in as many layers of one thickness as hold a point, by weight."""
-    edges = np.linspace(radius.min(), radius.max() * (1 + 1e-12), number + 1)
+def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = None) -> float:
+    """Opening angle of rings: volumes of stress-free tissue, G and squared dimensions of cells; edges of elements."""
+    from scipy.interpolate import BSpline  # which few runs need
+
+    knots = np.concatenate([edges[:1], np.repeat(edges, 2), edges[-1:]])
+    spline = BSpline(knots, np.eye(len(knots) - 3), 2)
+    functions, slopes = spline(rings.radius), spline(rings.radius, 1)
+    sector, steepness, start = rings.radius, np.ones_like(rings.radius), (1.0, 1.0)
+    if closed is not None:  # what opens, were the cells as they were
+        sector, start = closed.natural_radius(rings.radius), (1 / closed.axial, 1 / closed.circumferential)
+        steepness = closed.panels.at(rings.radius, closed.panels.derivative(closed.radius))
+    shares = rings.volume / rings.volume.sum()
+
+    def opened(values: Array) -> tuple[Array, Array, Array]:
+        rho, slope = sector + values[..., :-2] @ functions.T, steepness + values[..., :-2] @ slopes.T
+        around = values[..., -1:] * rho / rings.radius
+        gradient = np.stack(np.broadcast_arrays(around, values[..., -2:-1], slope), axis=-1)
+        return rho, slope, gradient * rings.natural
+
+    def residual(values: Array, stresses: Array) -> Array:  # derivatives by rho, ln e and ln k
+        rho, slope, stretches = opened(values)
+        work = stresses[..., 0, :, :] * (np.prod(stretches, axis=-1) * shares)[..., None]
+        hoop, axial, radial = np.moveaxis(work, -1, 0)
+        nodes = edges[-1] * ((hoop / rho) @ functions + (radial / slope) @ slopes)
+        return np.concatenate([nodes, axial.sum(axis=-1, keepdims=True), hoop.sum(axis=-1, keepdims=True)], axis=-1)
+
+    values = np.append(np.zeros(functions.shape[1]), start)
+    dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
+    found = solved([tissue], dimensions, lambda values: opened(values)[2][..., None, :, :], residual, values)
+    return float(360.0 * (1.0 - found[-1]))
+
+
+def means_through(radius: Array, values: Array, weights: Array, edges: Array) -> tuple[Array, Array]:
+    """Weights and values (n, m) at points, summed up and averaged by weight between those edges that hold a point."""
+    number = len(edges) - 1
     layer = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, number - 1)
     total = np.bincount(layer, weights, number)
     some = total > 0
-    means = [np.bincount(layer, weights * column, number)[some] / total[some] for column in (radius, *values.T)]
-    return means[0], np.stack(means[1:], axis=-1)
+    means = [np.bincount(layer, weights * column, number)[some] / total[some] for column in values.T]
+    return np.asarray(total[some], dtype=np.float64), np.stack(means, axis=-1)

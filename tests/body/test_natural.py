@@ -222,3 +222,22 @@ def test_stretched_layers_make_a_step_of_the_angle(monkeypatch: pytest.MonkeyPat
         found = ends_of_layers(axial)
         assert found == pytest.approx(known, abs=0.6)
         assert here[0] < found[0] - 2 and here[1] < found[1] - 3 and here[1] - here[0] > 10
+
+
+def test_thin_layers_close_as_far_as_rounding_lets_them() -> None:
+    """Circumferential, axial and radial stretch at the lumen, as an independent program integrates it by shooting."""
+    common = {"lame_mu": 1.37, "chain_density": 1.111e21, "locking_stretch": 1.25, "persistence_length": 0.4959}
+    parts: dict[str, dict[str, float]] = {"a": {}, "b": {"lame_mu": 4.11, "lame_lambda": 14.47}}
+    parts["c"] = {"lame_lambda": 24.12, "locking_stretch": 1.8, "chain_density": 1.333e21}
+    regions: dict[str, Any] = {name: {"material": own} for name, own in parts.items()}
+    regions["a"]["outer_radius"], regions["b"]["outer_radius"] = 1.146, 1.153
+    geometry = {"geometry.inner_radius": 1.139, "geometry.outer_radius": 1.196, "geometry.length": 1.426}
+    of = preset_scene("consistent", "tube").with_values(
+        {"cells.initial": "isotropic", "material.lame_lambda": 12.06, "natural.opening_angle": 120.0}
+        | {f"material.{key}": value for key, value in common.items()}
+        | geometry
+        | {"regions": regions}
+    )
+    tissues = {name: properties.tissue for name, properties in of.properties().items()}
+    found = closing(of.geometry.layers_of_tissue(of.natural, of.regions, tissues), 120.0)
+    assert found.stretches(np.array([1.139]))[0] == pytest.approx([0.99350, 0.99985, 1.00423], abs=1e-5)
