@@ -557,16 +557,17 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
     if written > FORMAT:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
-    return {**_without_columns(_with_rates(values), COLUMNS_THAT_WENT), "format": FORMAT}
+    return {**_without_columns(_with_turnover(values), COLUMNS_THAT_WENT), "format": FORMAT}
 
 
-def _with_rates(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Turnover as it was run by version 0.3.0, which wrote neither rates nor volume: by tension, without room."""
+def _with_turnover(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Turnover as it was run: none without a time; by tension and without room where 0.3.0 wrote neither."""
     remodeling: Any = values.get("remodeling")
     turnover = remodeling.get("turnover") if isinstance(remodeling, Mapping) else None
-    if not isinstance(turnover, Mapping) or not turnover or "rates" in turnover:
+    if not isinstance(turnover, Mapping) or "rates" in turnover:
         return values
-    return {**values, "remodeling": {**remodeling, "turnover": {"rates": "tension", "volume": 0.0, **turnover}}}
+    turned = {"rates": "tension", "volume": 0.0, **turnover} if "time" in turnover else {}
+    return {**values, "remodeling": {**remodeling, "turnover": turned}}
 
 
 def _without_columns(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:

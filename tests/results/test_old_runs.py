@@ -1,6 +1,7 @@
 """Folders of runs of earlier versions: they are read, shown and gone on with; a newer one is refused plainly.
 
-run-0.2.0.zip is the folder that `remodel-fenicsx run demos/cube.toml --set time.end=3` of version 0.2.0 left.
+run-VERSION.zip is the folder that three steps of the paper's cube left with that version; layers-VERSION.zip is of a
+tube with regions, natural.opening_angle and turnover (0.2.0 has none of these).
 """
 
 from __future__ import annotations
@@ -17,13 +18,17 @@ from remodel_fenicsx import Recording, __version__, cli, preset_scene, run
 from tests.conftest import Refused
 
 
+def unpacked(name: str, place: Path) -> Path:
+    """The folder of a run."""
+    with zipfile.ZipFile(Path(__file__).with_name(f"{name}.zip")) as archive:
+        archive.extractall(place / "run")
+    return place / "run"
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """The run of 0.2.0."""
-    found = tmp_path / "run"
-    with zipfile.ZipFile(Path(__file__).with_name("run-0.2.0.zip")) as archive:
-        archive.extractall(found)
-    return found
+    return unpacked("run-0.2.0", tmp_path)
 
 
 def test_a_run_of_the_version_before_is_read_and_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -34,6 +39,20 @@ def test_a_run_of_the_version_before_is_read_and_shown(folder: Path, capsys: pyt
     assert stretched[:, 2].max() == pytest.approx(recording.history["mean_stretch"][-1], rel=1e-6)
     assert recording.report().stat().st_size > 100_000
     assert cli.main(["status", str(folder)]) == 0 and "step 3 of 3" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("drawn_by_forks")
+@pytest.mark.parametrize("kept", ["run-0.2.0", "run-0.3.0", "run-0.4.0", "layers-0.3.0", "layers-0.4.0"])
+def test_folders_of_each_release_are_whole_for_each_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: str
+) -> None:
+    """They are validated, shown, drawn and gone on with; turnover is on where it was."""
+    folder = unpacked(kept, tmp_path)
+    assert Recording(folder).scene.remodeling.turnover.is_on == kept.startswith("layers")
+    for words in ("status", "report", "picture", "run -q --set time.end=4 --resume"):
+        assert cli.main([*words.split(), str(folder)]) == 0, capsys.readouterr().err
+    assert cli.main(["validate", str(folder / "scene.toml")]) == 0
+    np.testing.assert_array_equal(Recording(folder).times, np.arange(5.0))
 
 
 def test_it_goes_on_as_if_this_version_had_begun_it(folder: Path, tmp_path: Path) -> None:
