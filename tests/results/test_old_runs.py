@@ -41,6 +41,7 @@ def test_a_run_of_the_version_before_is_read_and_shown(folder: Path, capsys: pyt
     assert cli.main(["status", str(folder)]) == 0 and "step 3 of 3" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("drawn_by_forks")
 @pytest.mark.parametrize("kept", ["run-0.2.0", "run-0.3.0", "run-0.4.0", "layers-0.3.0", "layers-0.4.0"])
 def test_folders_of_each_release_are_whole_for_each_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: str
@@ -48,7 +49,7 @@ def test_folders_of_each_release_are_whole_for_each_command(
     """They are validated, shown, drawn and gone on with; turnover is on where it was."""
     folder = unpacked(kept, tmp_path)
     assert Recording(folder).scene.remodeling.turnover.is_on == kept.startswith("layers")
-    for words in ("status", "report", "picture", "run --resume --set time.end=4 -q"):
+    for words in ("status", "report", "picture", "run -q --set time.end=4 --resume"):
         assert cli.main([*words.split(), str(folder)]) == 0, capsys.readouterr().err
     assert cli.main(["validate", str(folder / "scene.toml")]) == 0
     np.testing.assert_array_equal(Recording(folder).times, np.arange(5.0))
