@@ -27,7 +27,7 @@ CONVENTIONS = (
     Doubt(
         "elongation",
         lambda x, _: x.min() > 0.98,
-        "reaches {high:.4g}: a stretch? An elongation is an engineering strain: a stretch of 1.1 is an elongation of 0.1",
+        "reaches {high:.4g}: a stretch? A stretch of 1.1 is an elongation of 0.1, an engineering strain",
     ),
     Doubt("stretch", lambda x, _: x.max() > 10.0, "reaches {high:.4g}: percent? A stretch of 110 % is 1.1"),
     # soft tissue is compressed to 0.5 at most

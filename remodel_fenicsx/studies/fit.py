@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import product
+from itertools import cycle, product
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -141,11 +141,31 @@ class Measured:
     loads: tuple[str, ...]
     sd: dict[str, float]
     scaled: tuple[str, ...]
+    units: dict[str, tuple[str, float]]  # of the file where it has others, with their factors to the scene's
 
     @property
     def rows(self) -> int:
         """How many there are."""
         return len(next(iter(self.columns.values())))
+
+    def over(self, name: str) -> str:
+        """The column over which a measured one is drawn: the load along its own axis, the first load, or time."""
+        same = [load for load in self.loads if load.rpartition("_")[2] == name.rpartition("_")[2]]
+        return [*same, *self.loads, "time"][0]
+
+    @property
+    def protocols(self) -> list[NDArray[np.int64]]:
+        """Rows of each protocol in their order: between two of them the loads fall by more than half of the first's."""
+        if not self.loads:
+            return [np.arange(self.rows)]
+        sizes = np.max(
+            [np.abs(self.columns[name]) / (np.abs(self.columns[name]).max() or 1.0) for name in self.loads], axis=0
+        )
+        starts = [0]
+        for row in range(1, self.rows):
+            if sizes[row - 1] - sizes[row] > sizes[starts[-1] : row].max() / 2:
+                starts.append(row)
+        return np.split(np.arange(self.rows), starts[1:])
 
 
 def read_measurements(path: Path, scene: Scene) -> tuple[list[Unknown], list[Measured]]:
@@ -208,15 +228,18 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
         for name in getattr(table, key):
             if name not in columns or (name == "time" and key != "units"):
                 raise SceneError(f"{place}.{key}.{name}: no such column is measured; the file has {', '.join(columns)}")
-    for name, unit in table.units.items():
-        columns[name] = columns[name] * _factor(name, unit, scene, f"{place}.units.{name} = {shown(unit)}")
+    units = {
+        name: (unit, _factor(name, unit, scene, f"{place}.units.{name} = {shown(unit)}"))
+        for name, unit in table.units.items()
+    }
+    columns |= {name: columns[name] * factor for name, (_, factor) in units.items()}
     for name in columns:
         if (name in loads or name == "time") == (name in table.sd):
             rule = (
                 "is prescribed, not measured" if name in table.sd else "each measured column has a standard deviation"
             )
             raise SceneError(f"{place}.sd.{name}: {rule}")
-    return Measured(table.file, table.state, table.time or 0.0, columns, loads, table.sd, tuple(table.scale))
+    return Measured(table.file, table.state, table.time or 0.0, columns, loads, table.sd, tuple(table.scale), units)
 
 
 def _prescribed(columns: Mapping[str, Array], table: MeasuredTable, scene: Scene, place: str) -> tuple[str, ...]:
@@ -763,7 +786,7 @@ class Fit(Answer):
     profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
 
     name = "fit"
-    caption = "Points: measured, with one standard deviation; lines: the fitted model."
+    caption = "Points: measured, with one standard deviation; lines: the fitted model. A panel is a protocol."
 
     @property
     def title(self) -> str:
@@ -869,19 +892,49 @@ class Fit(Answer):
         Page(folder, "correlations").save_table({"key": self.keys, **correlations}, notes)
 
     def figure(self) -> Figure:
-        """Each measured column over the load, or time, that was prescribed."""
-        shown = [(*pair, name) for pair in zip(self.tables, self.modelled, strict=True) for name in pair[0].sd]
-        figure, grid = panels(len(shown), 2.4)
-        for axes, (table, modelled, name) in zip(grid, shown, strict=True):
-            self._draw(axes, table, name, modelled[name])
-        grid[0].legend()
+        """A panel for each protocol, and in it for each unit; each column over what was prescribed along its axis."""
+        shown: list[tuple[Any, ...]] = []
+        for table, modelled in zip(self.tables, self.modelled, strict=True):
+            units: dict[str, list[str]] = {}
+            for name in table.sd:
+                units.setdefault(self._label(table, name).partition(", ")[2], []).append(name)
+            parts, title = table.protocols, f"{Path(table.name).name} ({table.state})"
+            for number, (rows, names) in enumerate(product(parts, units.values()), start=1):
+                which = f", protocol {-(-number // len(units))} of {len(parts)}" if len(parts) > 1 else ""
+                shown.append((table, modelled, names, rows, title + which))
+        figure, grid = panels(len(shown), 2.6)
+        for axes, (*panel, title) in zip(grid, shown, strict=True):
+            self._draw(axes, *panel)
+            axes.set_title(title, fontsize=8)
         return figure
 
-    def _draw(self, axes: Any, table: Measured, name: str, modelled: Array) -> None:
-        scales, along = dict(zip(self.keys, self.values, strict=True)), table.loads[0] if table.loads else "time"
-        x, y = (scales.get(f"{SCALE}{one}", 1.0) * table.columns[one] for one in (along, name))
-        order = np.argsort(x)
-        axes.errorbar(x, y, yerr=table.sd[name], fmt="o", color=COLOURS[1], label="measured")
-        axes.plot(x[order], modelled[order], color=COLOURS[0], label="fitted model")
-        axes.set(xlabel=label(self.scene, along), ylabel=label(self.scene, name))
-        axes.set_title(f"{table.name} ({table.state})", fontsize=8)
+    def _label(self, table: Measured, name: str) -> str:
+        return label(self.scene, name, table.units.get(name, ("", 1.0))[0])
+
+    def _draw(
+        self, axes: Any, table: Measured, modelled: Mapping[str, Array], names: list[str], rows: NDArray[np.int64]
+    ) -> None:
+        scales = dict(zip(self.keys, self.values, strict=True))
+
+        def in_unit(values: Any, name: str, scale: float = 1.0) -> Array:
+            return np.asarray(scale * values / table.units.get(name, ("", 1.0))[1])
+
+        unit = self._label(table, names[0]).partition(", ")[2]
+        for name, color in zip(names, cycle(COLOURS)):
+            x, y = (
+                in_unit(table.columns[one][rows], one, scales.get(f"{SCALE}{one}", 1.0))
+                for one in (table.over(name), name)
+            )
+            axes.errorbar(
+                x,
+                y,
+                in_unit(table.sd[name], name),
+                fmt="o",
+                color=color,
+                label=label(self.scene, name).partition(", ")[0],
+            )
+            axes.plot(x, in_unit(modelled[name][rows], name), color=color)
+        over = dict.fromkeys(self._label(table, table.over(name)) for name in names)
+        axes.plot([], [], color="0.3", label="fitted model")
+        axes.set(xlabel=" and ".join(over), ylabel=self._label(table, names[0]) if len(names) == 1 else unit)
+        axes.legend(fontsize=7)

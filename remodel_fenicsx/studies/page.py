@@ -160,11 +160,11 @@ def made_with() -> str:
     return ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
 
 
-def label(scene: Scene, name: str) -> str:
-    """A column of the history in words, or a load, with its unit where the scene says it."""
+def label(scene: Scene, name: str, unit: str = "") -> str:
+    """A column of the history in words, or a load, with its unit, that of the scene where it says one."""
     loads = {load: kind.dimension.name for load, kind in scene.load_kinds.items() if kind.dimension}
     dimensions = loads | {column.name: column.unit for column in scene.columns()}
-    unit = unit_of(scene, dimensions.get(name, ""))
+    unit = unit or unit_of(scene, dimensions.get(name, ""))
     return words(name) + (f", {unit}" if unit else "")
 
 

@@ -144,6 +144,9 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
     again = minimised(problem, held, held=1)
     least = float(np.sum(problem.residuals(np.log(found.values)) ** 2))
     assert 2 * again.cost - least == pytest.approx(3.84, rel=0.03)
+    (panel,) = found.figure().axes[:1]
+    assert panel.get_xlabel() == "pressure, mmHg" and panel.get_ylabel() == "outer radius, mm"
+    np.testing.assert_allclose(panel.lines[0].get_xdata(), np.multiply(PRESSURES, PER_MMHG))
     wide = replace(found, covariance=1e6 * found.covariance)  # as of what the data hardly change: no overflow
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -152,6 +155,31 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
 
 
 PAIR = (FITS / "pair.toml").read_text()
+
+
+def test_the_picture_has_a_panel_for_each_protocol(tmp_path: Path) -> None:
+    """Three in a file, one of them unloaded slowly: each stress over its own axis, points and model in their order."""
+    scene = read_scene(ROOT / "demos" / "sheet.toml").with_values({"material.chain_density": 0.0})
+    protocols = [[(0.1, 0.1), (0.2, 0.2)], [(0.0, 0.0), (0.1, 0.05), (0.2, 0.1)],
+                 [(0.02, 0.04), (0.05, 0.1), (0.03, 0.06), (0.01, 0.02)]]  # fmt: skip
+    head = "stretch_x,stretch_y,nominal_stress_x,nominal_stress_y\n"
+    lines = [f"{1 + x},{1 + y},{60 * x},{50 * y}\n" for protocol in protocols for x, y in protocol]
+    (tmp_path / "d.csv").write_text(head + "".join(lines))
+    sd = "nominal_stress_x = 1.0, nominal_stress_y = 1.0"
+    found = fit(scene, written(tmp_path, {"material.lame_mu": 10.0}, "d.csv", sd), tmp_path / "o", starts=1)[1]
+    axes = [panel for panel in found.figure().axes if panel.axison]
+    assert [panel.get_title() for panel in axes] == [f"d.csv (virgin), protocol {n} of 3" for n in (1, 2, 3)]
+    count = 0
+    for panel, protocol in zip(axes, protocols, strict=True):
+        for axis in (0, 1):
+            points, model = panel.lines[2 * axis : 2 * axis + 2]
+            strains = [row[axis] for row in protocol]
+            for line in (points, model):
+                np.testing.assert_allclose(line.get_xdata(), strains, atol=1e-12)
+            np.testing.assert_allclose(points.get_ydata(), np.multiply((60, 50)[axis], strains), atol=1e-9)
+            part = found.modelled[0][f"nominal_stress_{'xy'[axis]}"][count : count + len(protocol)]
+            np.testing.assert_array_equal(model.get_ydata(), part)
+        count += len(protocol)
 
 
 def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
