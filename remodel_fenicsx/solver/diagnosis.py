@@ -319,7 +319,10 @@ def _of_the_tolerance(failure: SolveFailure) -> Refusal | None:
     if failure.relative_residual > LOOSEST:
         return found
     enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))  # twice: it is not the same in every iteration
-    return replace(found, advice=f"{found.advice}; solver.relative_tolerance = {enough:g} would accept this state")
+    key = f"solver.relative_tolerance = {enough:g}"
+    if failure.stagnates:
+        return replace(found, advice=f"the residual stagnates, as rounding does: {key} accepts this state")
+    return replace(found, advice=f"{found.advice}; {key} would accept this state")
 
 
 def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> Refusal:
