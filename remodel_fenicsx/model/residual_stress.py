@@ -300,29 +300,35 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
 
     knots = np.concatenate([edges[:1], np.repeat(edges, 2), edges[-1:]])
     spline = BSpline(knots, np.eye(len(knots) - 3), 2)
-    functions, slopes = spline(rings.radius), spline(rings.radius, 1)
-    sector, steepness, start = rings.radius, np.ones_like(rings.radius), (1.0, 1.0)
+    functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]  # zero at the lumen
+    inner, depth, steepness = edges[0], rings.radius - edges[0], np.ones_like(rings.radius)
+    start = (1.0, 1.0)
     if closed is not None:  # what opens, were the cells as they were
-        sector, start = closed.natural_radius(rings.radius), (1 / closed.axial, 1 / closed.circumferential)
+        inner, start = float(closed.natural_radius(edges[:1])[0]), (1 / closed.axial, 1 / closed.circumferential)
+        depth = closed.natural_radius(rings.radius) - inner
         steepness = closed.panels.at(rings.radius, closed.panels.derivative(closed.radius))
-    shares = rings.volume / rings.volume.sum()
+    shares, thickness = rings.volume / rings.volume.sum(), edges[-1] - edges[0]
 
-    def opened(values: Array) -> tuple[Array, Array, Array]:
-        rho, slope = sector + values[..., :-2] @ functions.T, steepness + values[..., :-2] @ slopes.T
-        around = values[..., -1:] * rho / rings.radius
-        gradient = np.stack(np.broadcast_arrays(around, values[..., -2:-1], slope), axis=-1)
-        return rho, slope, gradient * rings.natural
+    # k rho of the lumen, rho - rho of the lumen, e and k: in these a thin wall that bends far is almost linear, and
+    # k may be zero or less
+    def opened(values: Array) -> tuple[Array, Array, Array, Array]:
+        across, slope = depth + values[..., 1:-2] @ functions.T, steepness + values[..., 1:-2] @ slopes.T
+        around = values[..., :1] + values[..., -1:] * across
+        gradient = np.stack(np.broadcast_arrays(around / rings.radius, values[..., -2:-1], slope), axis=-1)
+        return across, slope, around, gradient * rings.natural
 
-    def residual(values: Array, stresses: Array) -> Array:  # derivatives by rho, ln e and ln k
-        rho, slope, stretches = opened(values)
+    def residual(values: Array, stresses: Array) -> Array:  # derivatives by all of them
+        across, slope, around, stretches = opened(values)
         work = stresses[..., 0, :, :] * (np.prod(stretches, axis=-1) * shares)[..., None]
         hoop, axial, radial = np.moveaxis(work, -1, 0)
-        nodes = edges[-1] * ((hoop / rho) @ functions + (radial / slope) @ slopes)
-        return np.concatenate([nodes, axial.sum(axis=-1, keepdims=True), hoop.sum(axis=-1, keepdims=True)], axis=-1)
+        hoop = edges[-1] * hoop / around
+        nodes = (values[..., -1:] * hoop) @ functions + edges[-1] * (radial / slope) @ slopes
+        whole = [part.sum(axis=-1, keepdims=True) for part in (hoop, axial, hoop * across / thickness)]
+        return np.concatenate([whole[0], nodes, *whole[1:]], axis=-1)
 
-    values = np.append(np.zeros(functions.shape[1]), start)
+    values = np.concatenate([[inner * start[1]], np.zeros(functions.shape[1]), start])
     dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
-    found = solved([tissue], dimensions, lambda values: opened(values)[2][..., None, :, :], residual, values)
+    found = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
     return float(360.0 * (1.0 - found[-1]))
 
 

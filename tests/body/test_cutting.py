@@ -60,6 +60,22 @@ def test_what_was_closed_opens_again(opening_angle: float) -> None:
         assert found == pytest.approx(opening_angle, abs=close)
 
 
+def test_thin_layers_bend_to_the_closed_form_of_a_strip() -> None:
+    """Two of h/2, one shorter by m in all directions: as Timoshenko's bimetal that cannot bend along, many turns."""
+    thickness, shorter = 0.01, 0.06
+    edges = np.linspace(1.0, 1.0 + thickness, 17)
+    tissue = replace(scene().properties()[""].tissue, chain=None)
+    places, weights = np.polynomial.legendre.leggauss(3)
+    radius = (edges[:-1, None] + np.diff(edges)[:, None] * (places + 1) / 2).ravel()
+    natural = np.ones((48, 3))
+    natural[radius > 1.0 + thickness / 2, 0] += shorter
+    natural[:, [1, 2]] = natural[:, :1]
+    thin = Rings(radius, np.tile(weights, 16) * radius / natural.prod(axis=1), natural, isotropic(tissue)(radius))
+    poisson = tissue.lame_lambda / (2 * (tissue.lame_lambda + tissue.lame_mu))
+    turns = 1.5 * (1 + poisson) * shorter / (1 + shorter / 2) / thickness
+    assert cut(tissue, thin, edges) / 360.0 == pytest.approx(turns, rel=0.02)
+
+
 # ---------------------------------------------------------------- matrices with directions: the radius comes first
 DIRECTED = {
     "gasser-ogden-holzapfel": {"fibre_stiffness": 20.0, "family_angle": 10.0, "dispersion": 0.0},
