@@ -264,7 +264,7 @@ CUT = WORDS[: len(WORDS) * 3 // 4].encode()
         ("lumen.vtp", b"<!DOCTYPE x [<!ENTITY a 'b'>]><VTKFile/>"), ("lumen.obj", b"v 0 0\nf 1 2 3\n"),
         ("more.ply", CUT), ("fewer.ply", WORDS.replace("face 2304", "face 2302").encode()),
         ("cut.stl", as_programs_write(*tube())["capitals.stl"][:5000]),
-        ("corners.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 4\n"), 
+        ("corners.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 4\n"),
         ("points.ply", WORDS.replace("\n3 0 ", "\n3 5000 ").encode()),
         ("lumen.step", b""), ("lumen.vtp", b"<VTKFile type='PolyData'><xi:include href='/etc/passwd'/></VTKFile>"),
     ],
