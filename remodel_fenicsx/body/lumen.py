@@ -145,7 +145,7 @@ def polygons(points: Array, simplices: Integers) -> Any:
     """Edges or triangles, as VTK has them."""
     import pyvista
 
-    cells = np.insert(simplices, 0, simplices.shape[1], axis=1).ravel()
+    cells: Any = np.insert(simplices, 0, simplices.shape[1], axis=1).ravel()
     return pyvista.PolyData(points, **{"lines" if simplices.shape[1] == 2 else "faces": cells})
 
 
@@ -205,9 +205,9 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
         sides = np.sort(cells[:, edges], axis=2) @ key
         return np.column_stack([cells, len(points) - len(pairs) + np.searchsorted(keys, sides)])
 
-    tetrahedra = with_middles(tetrahedra, EDGES)
+    elements = with_middles(tetrahedra, EDGES)
     faces = {name: with_middles(face, EDGES[:3]) for name, face in faces.items()}
-    return GrownWall(points, tetrahedra, of_layer, faces, _straightened(points, tetrahedra))
+    return GrownWall(points, elements, of_layer, faces, _straightened(points, elements))
 
 
 def _straightened(points: Array, tetrahedra: Integers) -> int:
@@ -312,8 +312,7 @@ def write_wall(
         write_new(path, (Path(folder) / "wall.msh").read_bytes())
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))
     nodes = np.unique(outer)
-    _, near = nearest(wall.points, _halved(inner), wall.points[nodes])
-    between = np.linalg.norm(wall.points[nodes] - near, axis=1)
+    between = np.linalg.norm(wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1)
     # of parabolas: chords of half the length leave a quarter of what they leave out
     coarse, fine = (_signed_volume(wall.points, face) for face in (inner[:, :3], _halved(inner)))
     lines = [
