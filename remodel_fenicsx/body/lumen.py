@@ -2,109 +2,51 @@
 
 from __future__ import annotations
 
-import re
+import io
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, rims
-from remodel_fenicsx.body.mesh_file import in_place, of_vtk, split_quads, split_wedges, vtk_arrays
+from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
+from remodel_fenicsx.body.mesh_file import ORDERS, in_place, split_quads, split_wedges
+from remodel_fenicsx.body.surface_file import SURFACES, Surface, triangles_of
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.schema.tables import SceneError
-from remodel_fenicsx.system.children import read_guarded
-from remodel_fenicsx.system.files import ForeignFileError, write_new
+from remodel_fenicsx.system.children import DAMAGED, made_apart
+from remodel_fenicsx.system.files import write_new
+from remodel_fenicsx.system.terminal import announce
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-SURFACE_ENDINGS = (".stl", ".ply", ".vtp", ".obj")
+MANY = 200_000  # triangles of which Gmsh divides 6,000 a second
 SHARP = 60.0  # degrees between two triangles from which on Gmsh keeps an edge between them
-LONGEST_HEAD = 10**5  # bytes of a PLY file
+FLAT = 1e-6  # of an area to the power of 1.5: a tube of that volume is 80,000 times longer than wide
 SMOOTHINGS = 50  # of the normals where a wall would fold over: more change no corner that is still there
 MOST_THROUGH = 100  # elements through the wall
+MOST_RADII, LEAST_RADII = 3.0, 2e-3  # of a wall: arterioles that are contracted have 2, the widest aneurysms 0.02
 LEAST_ROOM = 0.5  # of the thickness: an outer face that is nearer to the lumen lies in another part of the wall
 EDGES = ([0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3])  # of a tetrahedron, in the order of its further nodes
 
 
-class Surface(NamedTuple):
-    """Triangles whose normals point out of the lumen, and arrays of numbers at their corners."""
-
-    points: Array
-    triangles: Integers
-    arrays: dict[str, Array]
-
-
-# ---------------------------------------------------------------- reading, in a process with limits
-
-
 def read_surface(path: Path) -> Surface:
-    """The surface of a file; its ending is one of `SURFACE_ENDINGS`."""
-    ending = path.suffix.lower()
-    if ending not in SURFACE_ENDINGS:
-        raise SceneError(f"{path}: allowed is a file that ends with {', '.join(SURFACE_ENDINGS)}")
+    """The surface of a file; its ending is one of `SURFACES`."""
+    if path.suffix.lower() not in SURFACES:
+        raise SceneError(f"{path}: allowed is a file that ends with {', '.join(SURFACES)}")
     try:
-        found, _ = read_guarded(path, f"{__name__}:{ending[1:]}")
-    except (OSError, UnreadableFile, ForeignFileError) as error:
+        surface, _ = triangles_of(path)
+    except (OSError, UnreadableFile) as error:
         raise SceneError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    points, triangles = found.pop("points"), found.pop("triangles")
-    known = points.ndim == 2 and points.shape[1:] == (3,) and len(triangles) and np.isfinite(points).all()
-    if not known or triangles.min() < 0 or triangles.max() >= len(points):
-        raise SceneError(f"{path}: has no triangles between points of three finite coordinates")
-    _, first, number = np.unique(points, axis=0, return_index=True, return_inverse=True)  # STL repeats its corners
-    triangles = number.reshape(-1)[triangles]
-    whole = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
-    return oriented(Surface(points[first], triangles[whole], {name: found[name][first] for name in found}), str(path))
-
-
-def _as_arrays(file: str, kind: str) -> dict[str, Any]:
-    import meshio
-
-    mesh = meshio.read(file, file_format=kind)
-    arrays = {name: values for name, values in mesh.point_data.items() if np.ndim(values) == 1}
-    return {"points": mesh.points, "triangles": mesh.get_cells_type("triangle"), **arrays}
-
-
-def stl(file: str) -> dict[str, Any]:
-    """In the child process."""
-    return _as_arrays(file, "stl")
-
-
-def ply(file: str) -> dict[str, Any]:
-    """In the child process."""
-    data = Path(file).read_bytes()
-    if any(int(count) > len(data) for count in re.findall(rb"(?m)^element \w+ (\d+)", data[:LONGEST_HEAD])):
-        raise UnreadableFile("announces more points or triangles than it has bytes")
-    return _as_arrays(file, "ply")
-
-
-def obj(file: str) -> dict[str, Any]:
-    """In the child process."""
-    return _as_arrays(file, "obj")
-
-
-def vtp(file: str) -> dict[str, Any]:
-    """In the child process: VTK's own file, by VTK."""
-    reader, numbers = of_vtk("vtkIOXML", "vtkXMLPolyDataReader")(), of_vtk("util.numpy_support", "vtk_to_numpy")
-    triangulated = of_vtk("vtkFiltersCore", "vtkTriangleFilter")()
-    reader.SetFileName(file)
-    triangulated.SetInputConnection(reader.GetOutputPort())
-    triangulated.Update()
-    data = triangulated.GetOutput()
-    if not data.GetNumberOfPolys():
-        raise UnreadableFile("has no polygons")
-    return {
-        "points": numbers(data.GetPoints().GetData()).astype(float),
-        "triangles": numbers(data.GetPolys().GetData()).reshape(-1, 4)[:, 1:],
-        **{name: values for name, values in vtk_arrays(data.GetPointData()).items() if values.ndim == 1},
-    }
+    return oriented(surface, str(path))
 
 
 # ---------------------------------------------------------------- what a surface is
@@ -112,41 +54,23 @@ def vtp(file: str) -> dict[str, Any]:
 
 def oriented(surface: Surface, name: str) -> Surface:
     """The surface with all normals out of the lumen, whatever the file has; refused where it is none of a lumen."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import breadth_first_order, connected_components
-
-    points, triangles = surface.points, surface.triangles
-    edges, directions, owners = _edges(triangles)
-    distinct, number, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
-    number = number.reshape(-1)
-    if (counts > 2).any():
-        place = points[distinct[counts > 2][0]].mean(axis=0)
-        raise SceneError(f"{name}: three triangles or more meet in one edge, at {in_place(place)}; a lumen has two")
-    if (counts == 2).all():
+    mesh = polygons(surface.points, surface.triangles)
+    kinds = {"boundary_edges": False, "feature_edges": False, "manifold_edges": False}
+    if (odd := mesh.extract_feature_edges(non_manifold_edges=True, **kinds)).n_cells:
+        place = in_place(odd.cell_centers().points[0])
+        raise SceneError(f"{name}: three triangles or more meet in one edge, at {place}; a lumen has two")
+    if not mesh.n_open_edges:
         raise SceneError(f"{name}: the surface is closed; cut its ends open, where the vessel goes on")
-    order = np.argsort(number, kind="stable")
-    shared = counts[number[order]] == 2
-    one, other = order[shared].reshape(-1, 2).T
-    count = len(triangles)
-    turned = directions[one] == directions[other]  # both go the same way along their edge: one is inside out
-    links = coo_matrix((np.where(turned, 2.0, 1.0), (owners[one], owners[other])), (count, count)).tocsr()
-    links = links.maximum(links.T)
-    if (parts := connected_components(links, directed=False)[0]) > 1:
+    if (parts := mesh.connectivity()["RegionId"].max() + 1) > 1:
         raise SceneError(f"{name}: has {parts} parts that do not touch; allowed is one lumen")
-    visited, before = breadth_first_order(links, 0, directed=False)
-    flipped: Flags = np.zeros(count, dtype=bool)
-    for triangle in visited[1:]:
-        flipped[triangle] = flipped[before[triangle]] ^ (links[triangle, before[triangle]] == 2.0)
-    triangles = np.where(flipped[:, None], triangles[:, ::-1], triangles)
-    if _signed_volume(points, triangles) < 0:
+    normals = mesh.compute_normals(point_normals=False, split_vertices=False, auto_orient_normals=False)
+    points, triangles = surface.points, normals.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
+    volume, area = _signed_volume(points, triangles), np.linalg.norm(area_vectors(points[triangles]), axis=1).sum()
+    if abs(volume) <= FLAT * area**1.5:
+        raise SceneError(f"{name}: the surface is flat, it encloses no lumen")
+    if volume < 0:
         triangles = triangles[:, ::-1]
     return Surface(points, triangles, surface.arrays)
-
-
-def _edges(triangles: Integers) -> tuple[Integers, Flags, Integers]:
-    """All edges with the smaller number first, whether they go that way, and their triangles."""
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    return np.sort(edges, axis=1), edges[:, 0] < edges[:, 1], np.tile(np.arange(len(triangles)), 3)
 
 
 def _signed_volume(points: Array, triangles: Integers) -> float:
@@ -156,31 +80,73 @@ def _signed_volume(points: Array, triangles: Integers) -> float:
     return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim, _ in rims(triangles)))
 
 
-def remeshed(surface: Surface, size: float) -> Surface:
-    """The surface with triangles of a size, by Gmsh; arrays as at the nearest corner before."""
-    import meshio
+def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
+    """The surface with triangles of a size, by Gmsh, rounded, and the nearest corner before of each of its own."""
     from scipy.spatial import cKDTree
 
-    with tempfile.TemporaryDirectory() as folder, gmsh_model("wall") as gmsh:
-        file = Path(folder) / "lumen.stl"
-        meshio.Mesh(surface.points, [("triangle", surface.triangles)]).write(file)
-        try:
-            gmsh.merge(str(file))
-            gmsh.model.mesh.classifySurfaces(np.radians(SHARP), True, True, np.pi)
-            gmsh.model.mesh.createGeometry()
-            for option in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
-                gmsh.option.setNumber(option, size)
-            gmsh.model.mesh.generate(2)
-        except Exception as error:  # Gmsh has no other
-            raise SceneError(f"--size {size:g}: Gmsh could not divide the surface so: {error}") from error
+    numbers = io.BytesIO()
+    np.savez(numbers, points=surface.points, triangles=surface.triangles, size=size)
+    try:  # a process of its own: Gmsh hears no signals
+        found = made_apart(numbers.getvalue(), "the surface", f"{__name__}:by_gmsh")
+    except UnreadableFile as error:
+        reason = str(error).removeprefix(DAMAGED)
+        raise SceneError(f"--size {size:g}: Gmsh could not divide the surface so: {reason}") from error
+    points, triangles = found["points"], found["triangles"]
+    on_rims = np.isin(np.arange(len(points)), np.concatenate([rim for rim, _ in rims(triangles)]))
+    divided = Surface(rounded(surface, points, on_rims), triangles, {})
+    return oriented(divided, "the surface by Gmsh"), cKDTree(surface.points).query(points)[1]
+
+
+def by_gmsh(file: str) -> dict[str, Any]:
+    """In the child process: points and triangles of a size, of those in a file."""
+    with np.load(file) as read, gmsh_model("wall") as gmsh:
+        count, corners = len(read["points"]), read["triangles"].ravel() + 1
+        gmsh.model.addDiscreteEntity(2, 1)
+        gmsh.model.mesh.addNodes(2, 1, np.arange(1, count + 1), read["points"].ravel())
+        gmsh.model.mesh.addElementsByType(1, 2, [], corners)
+        gmsh.model.mesh.classifySurfaces(np.radians(SHARP), True, True, np.pi)
+        gmsh.model.mesh.createGeometry()
+        for option in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
+            gmsh.option.setNumber(option, float(read["size"]))
+        gmsh.model.mesh.generate(2)
         numbers, places, _ = gmsh.model.mesh.getNodes()
-        corners = gmsh.model.mesh.getElementsByType(2)[1]
-    used, triangles = np.unique(corners, return_inverse=True)
+        used, triangles = np.unique(gmsh.model.mesh.getElementsByType(2)[1], return_inverse=True)
     order = np.argsort(numbers)
     points = places.reshape(-1, 3)[order[np.searchsorted(numbers[order], used)]]
-    _, near = cKDTree(surface.points).query(points)
-    arrays = {name: values[near] for name, values in surface.arrays.items()}
-    return oriented(Surface(points, triangles.reshape(-1, 3), arrays), "the surface by Gmsh")
+    return {"points": points, "triangles": triangles.reshape(-1, 3)}
+
+
+def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
+    """Places near a surface on the smooth one through its corners, square to their normals; those of rims on its rims.
+
+    Phong's tessellation with the factor 1/2, which is exact where the surface is a parabola: T. Boubekeur and M. Alexa,
+    Phong tessellation (2008).
+    """
+    rims_of_it = [rim for rim, _ in rims(surface.triangles)]
+    normals, found = _normals(surface, rims_of_it), np.empty_like(places)
+    for simplices, chosen in ((surface.triangles, ~on_rims), (np.concatenate(rims_of_it), on_rims)):
+        rows, flat = nearest(surface.points, simplices, places[chosen])
+        corners, upwards = surface.points[simplices[rows]], normals[simplices[rows]]
+        sides = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        shares = np.einsum("nij,nj->ni", np.linalg.pinv(sides), flat - corners[:, 0])
+        shares = np.column_stack([1 - shares.sum(axis=1), shares])
+        lifts = np.einsum("nki,nki->nk", corners - flat[:, None], upwards)
+        found[chosen] = flat + np.einsum("nk,nk,nki->ni", shares, lifts, upwards) / 2
+    return found
+
+
+def nearest(points: Array, simplices: Integers, places: Array) -> tuple[Integers, Array]:
+    """Which of the edges or triangles is the nearest of each place, and where."""
+    found: Any = polygons(points, simplices).find_closest_cell(places, return_closest_point=True)
+    return found
+
+
+def polygons(points: Array, simplices: Integers) -> Any:
+    """Edges or triangles, as VTK has them."""
+    import pyvista
+
+    cells: Any = np.insert(simplices, 0, simplices.shape[1], axis=1).ravel()
+    return pyvista.PolyData(points, **{"lines" if simplices.shape[1] == 2 else "faces": cells})
 
 
 # ---------------------------------------------------------------- the wall
@@ -193,10 +159,11 @@ class GrownWall(NamedTuple):
     tetrahedra: Integers
     layers: Integers
     faces: dict[str, Integers]
+    straight: int
 
 
-def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], through: int) -> GrownWall:
-    """Prisms outwards of a surface: thickness (points,), of which each layer has its share."""
+def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[str, float], through: int) -> GrownWall:
+    """Prisms outwards of a surface, bent as the given one: thickness (points,), of which each layer has its share."""
     counts = shared_out(list(layers.values()), max(through, len(layers)))
     shares, ends = np.array(list(layers.values())), np.cumsum([0.0, *layers.values()])
     levels = np.concatenate([[0.0], *(np.linspace(ends[k], ends[k + 1], n + 1)[1:] for k, n in enumerate(counts))])
@@ -222,7 +189,43 @@ def grown(surface: Surface, thickness: Array, layers: Mapping[str, float], throu
     sides = [split_quads(each.reshape(-1, 4)) for each in quads]
     sides.sort(key=lambda side: float(np.linalg.norm(points[side].mean(axis=(0, 1)))))
     faces |= {"inlet": sides[0]} | {f"outlet_{number}": side for number, side in enumerate(sides[1:], 1)}
-    return _of_degree_2(points, tetrahedra, of_layer, faces)
+    rim_edges, key = np.sort(np.concatenate(openings), axis=1), [len(points), 1]
+    keys = np.unique(np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2) @ key)
+    pairs = np.column_stack(np.divmod(keys, len(points)))
+    # below each lies a corner of the surface, twice the same, or an edge of it
+    below, row = np.unique(np.sort(pairs % size, axis=1) @ key, return_inverse=True)
+    ends = np.column_stack(np.divmod(below, len(points)))
+    feet, is_edge = surface.points[ends].mean(axis=1), ends[:, 0] != ends[:, 1]
+    feet[is_edge] = rounded(given, feet[is_edge], np.isin(below, rim_edges @ key)[is_edge])
+    outwards, depth = normals[ends].mean(axis=1), np.repeat(levels, size)[pairs].mean(axis=1)
+    outwards *= (thickness[ends].mean(axis=1) / np.linalg.norm(outwards, axis=1))[:, None]
+    points = np.concatenate([points, feet[row] + depth[:, None] * outwards[row]])
+
+    def with_middles(cells: Integers, edges: Sequence[Sequence[int]]) -> Integers:
+        sides = np.sort(cells[:, edges], axis=2) @ key
+        return np.column_stack([cells, len(points) - len(pairs) + np.searchsorted(keys, sides)])
+
+    elements = with_middles(tetrahedra, EDGES)
+    faces = {name: with_middles(face, EDGES[:3]) for name, face in faces.items()}
+    return GrownWall(points, elements, of_layer, faces, _straightened(points, elements))
+
+
+def _straightened(points: Array, tetrahedra: Integers) -> int:
+    """Give elements straight edges that are twisted by bent ones, until none is; how many edges these are."""
+    done: set[int] = set()
+    body: Any = SimpleNamespace(kind="tetrahedron", degree=2, points=points, cells=tetrahedra[:, ORDERS["tetra10"]])
+    while True:
+        twisted = (jacobian_determinants(body) <= 0).any(axis=1)
+        edges = {
+            int(middle): cell[edge]
+            for cell in tetrahedra[twisted]
+            for middle, edge in zip(cell[4:], map(list, EDGES), strict=True)
+        }
+        if not edges.keys() - done:
+            return len(done)
+        done |= edges.keys()
+        for middle, ends in edges.items():
+            points[middle] = points[ends].mean(axis=0)
 
 
 def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
@@ -244,7 +247,7 @@ def _in_planes(vectors: Array, points: Array, openings: Sequence[Integers]) -> A
 
 def _smoothed(normals: Array, surface: Surface, openings: Sequence[Integers]) -> Array:
     """Each with the mean of those around it."""
-    edges = np.unique(_edges(surface.triangles)[0], axis=0)
+    edges = np.unique(np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2), axis=0)
     sums, counts = normals.copy(), np.ones(len(normals))
     for one, other in (edges.T, edges.T[::-1]):
         np.add.at(sums, one, normals[other])
@@ -260,23 +263,6 @@ def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
     if (crossed := distance < LEAST_ROOM * thickness).any():
         place = outer[int(np.argmax(crossed))]
         raise SceneError(f"--thickness: too thick: the wall meets another part of the vessel at {in_place(place)}")
-
-
-def _of_degree_2(points: Array, tetrahedra: Integers, layers: Integers, faces: Mapping[str, Integers]) -> GrownWall:
-    """With nodes in the middle of straight edges: curved ones would twist thin elements."""
-    edges = np.sort(np.concatenate([tetrahedra[:, edge] for edge in EDGES]), axis=1)
-    distinct, number = np.unique(edges, axis=0, return_inverse=True)
-    middles = number.reshape(len(EDGES), -1).T + len(points)
-    keys = distinct @ [len(points), 1]
-
-    def with_middles(face: Integers) -> Integers:
-        sides = (np.sort(face[:, edge], axis=1) @ [len(points), 1] for edge in EDGES[:3])
-        return np.column_stack([face, *(len(points) + np.searchsorted(keys, side) for side in sides)])
-
-    whole = np.concatenate([points, points[distinct].mean(axis=1)])
-    return GrownWall(
-        whole, np.column_stack([tetrahedra, middles]), layers, {k: with_middles(v) for k, v in faces.items()}
-    )
 
 
 # ---------------------------------------------------------------- what the command does
@@ -301,9 +287,15 @@ def write_wall(
     number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # of equilateral triangles
     if number > LARGEST_MESH:
         raise SceneError(f"--size {size:g}: makes about {number:.2g} tetrahedra; at most {LARGEST_MESH:g} are made")
-    found = remeshed(read, size)
-    depth = _thickness(thickness, shares, found)
-    wall = grown(found, depth, shares or {"wall": 1.0}, through)
+    depth, radius = _thickness(thickness, shares, read), 2 * _signed_volume(read.points, read.triangles) / area
+    _check_units(radius, size, depth)
+    if len(read.triangles) > MANY:
+        announce(f"{surface}: {len(read.triangles)} triangles are divided again, which takes minutes")
+    found, near = remeshed(read, size)
+    depth = depth[near]
+    if len(read.triangles) > MANY:
+        announce(f"{path}: the wall grows on {len(found.triangles)} triangles")
+    wall = grown(found, read, depth, shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
     names = list(shares) or ["wall"]
@@ -318,11 +310,35 @@ def write_wall(
     with tempfile.TemporaryDirectory() as folder:
         mesh.write(Path(folder) / "wall.msh", file_format="gmsh22", binary=False)
         write_new(path, (Path(folder) / "wall.msh").read_bytes())
-    layers_of = f"regions {', '.join(names)}" if shares else "one region"
-    return [
+    inner, outer = (wall.faces[name] for name in ("inner", "outer"))
+    nodes = np.unique(outer)
+    between = np.linalg.norm(wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1)
+    # of parabolas: chords of half the length leave a quarter of what they leave out
+    coarse, fine = (_signed_volume(wall.points, face) for face in (inner[:, :3], _halved(inner)))
+    lines = [
         f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, {max(through, len(names))} through the wall",
-        f"thickness {depth.min():.4g} to {depth.max():.4g}; faces {', '.join(wall.faces)}; {layers_of}",
+        f"thickness {between.min():.4g} to {between.max():.4g} at the nodes; volume of the lumen "
+        f"{(4 * fine - coarse) / 3:.5g}, of the flat triangles of {surface.name} {radius * area / 2:.5g}",
+        f"faces {', '.join(wall.faces)}; " + (f"regions {', '.join(names)}" if shares else "one region"),
     ]
+    if wall.straight:
+        lines.append(f"{wall.straight} edges are straight: bent as the surface they would twist elements")
+    return lines
+
+
+def _halved(face: Integers) -> Integers:
+    """Four triangles for each of degree 2."""
+    return face[:, [0, 3, 5, 3, 1, 4, 5, 4, 2, 3, 4, 5]].reshape(-1, 3)
+
+
+def _check_units(radius: float, size: float, thickness: Array) -> None:
+    """Refuse lengths that no vessel has beside the mean radius of its lumen."""
+    for option, length in (("--thickness", thickness.max()), ("--thickness", thickness.min()), ("--size", size)):
+        if length > MOST_RADII * radius or (option == "--thickness" and length < LEAST_RADII * radius):
+            raise SceneError(
+                f"{option}: {length:.3g} is {length / radius:.3g} times the lumen's radius, which is {radius:.3g}: "
+                "is it in another unit than the surface?"
+            )
 
 
 def _thicknesses(said: Sequence[str]) -> dict[str, float]:
@@ -350,8 +366,8 @@ def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) 
     if said not in surface.arrays:
         known = ", ".join(surface.arrays) or "none"
         raise SceneError(f"--thickness {said}: allowed is a number above 0, or an array at the points: {known}")
-    if not (surface.arrays[said] > 0).all():
-        raise SceneError(f"--thickness {said}: this array has values that are not above 0")
+    if not ((surface.arrays[said] > 0) & np.isfinite(surface.arrays[said])).all():
+        raise SceneError(f"--thickness {said}: this array has values that are not above 0, or not finite")
     return np.asarray(surface.arrays[said], dtype=np.float64)
 
 

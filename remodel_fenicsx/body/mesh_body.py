@@ -19,7 +19,6 @@ from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gms
 from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
     ENDINGS,
-    SURFACES,
     TAGS,
     Array,
     Block,
@@ -28,6 +27,7 @@ from remodel_fenicsx.body.mesh_file import (
     distinct,
     read_mesh,
 )
+from remodel_fenicsx.body.surface_file import SURFACES
 from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
 from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_columns, stress_columns
 from remodel_fenicsx.errors import UnreadableFile

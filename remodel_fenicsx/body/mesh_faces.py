@@ -53,6 +53,7 @@ class Face:
     area: float
     normal: Array
     centre: Array
+    corners: Array  # of the facets, (facets, 3 or 4, 3)
 
     @property
     def flatness(self) -> float:
@@ -115,7 +116,7 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
             )
             normal, centre = mean / max(float(np.linalg.norm(mean)), 1e-300), size @ middles / size.sum()
             units = normals[part] / size[:, None]
-            faces.append(Face(name, part, middles, units, float(size.sum()), normal, centre))
+            faces.append(Face(name, part, middles, units, float(size.sum()), normal, centre, places[part]))
     volume = float(np.einsum("fi,fi->", places.mean(axis=1), normals) / 3)
     return Boundary(facets, cell, faces, volume)
 
@@ -376,18 +377,23 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
     for part in parts:
         support = supports.get(part.name)
         if support is not None and support.kind != "free":
-            # displacements (facets, 6, 3) of the unit motions along and about the axes
-            turns = np.cross(np.eye(3)[None], (part.places - middle)[:, None] / size)
-            motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
-            matrix += np.einsum("fki,fij,flj->kl", motions, _held_directions(support, part), motions) / len(motions)
+            # halfway to the corners, exact on triangles: a single one is held against turns too. Springs along N alone
+            # are taken at the middles: around a tube they would hold its facets, but nothing of the round body
+            share = 0.0 if support.kind == "elastic" and not support.tangential else 0.5
+            for places in np.swapaxes((1 - share) * part.places[:, None] + share * part.corners, 0, 1):
+                # displacements (facets, 6, 3) of the unit motions along and about the axes
+                turns = np.cross(np.eye(3)[None], (places - middle)[:, None] / size)
+                motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
+                held = _held_directions(support, part, places)
+                matrix += np.einsum("fki,fij,flj->kl", motions, held, motions) / len(motions)
     values = np.linalg.eigvalsh(matrix)
     return int(np.sum(values <= STILL * max(float(values[-1]), 1e-300)))
 
 
-def _held_directions(support: Support, part: Face) -> Array:
-    """What a support holds at the facets of a part, as projections (facets, 3, 3)."""
+def _held_directions(support: Support, part: Face, places: Array) -> Array:
+    """What a support holds at a place of each facet of a part, as projections (facets, 3, 3)."""
     along = np.broadcast_to(np.outer(part.normal, part.normal), (len(part.places), 3, 3))
-    around = np.cross(part.normal, part.places - part.centre)
+    around = np.cross(part.normal, places - part.centre)
     around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
     own = part.normals
     share, springs = support.tangential, np.einsum("fi,fj->fij", own, own)

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.body.surface_file import of_vtk, triangles_of, vtk_arrays
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.system.children import DAMAGED, read_guarded
 
@@ -182,21 +183,6 @@ def _of_vtk(reader: str, module: str, file: str) -> dict[str, Any]:
     return _as_arrays(meshio.Mesh(points, cells, vtk_arrays(grid.GetPointData()), of_cells))
 
 
-def of_vtk(module: str, name: str) -> Any:
-    """A class or a function of VTK's."""
-    try:
-        return getattr(importlib.import_module(f"vtkmodules.{module}"), name)
-    except ImportError:
-        raise UnreadableFile("VTK, which reads such files, is not installed: pip install vtk") from None
-
-
-def vtk_arrays(data: Any) -> dict[str, Any]:
-    """Arrays of points or cells by name."""
-    numbers = of_vtk("util.numpy_support", "vtk_to_numpy")
-    found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
-    return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
-
-
 def _as_arrays(mesh: Any, group_names: list[tuple[int, int, str]] | None = None) -> dict[str, Any]:
     names = [[block.type for block in mesh.cells], [*mesh.point_data], [*mesh.cell_data], group_names or []]
     found = {"names": np.frombuffer(json.dumps(names).encode(), np.uint8), "points": mesh.points}
@@ -239,7 +225,6 @@ def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tu
     return found
 
 
-SURFACES = (".vtp", ".stl", ".ply", ".obj")  # endings of surfaces, which `body.lumen` reads
 SAME_NODE = 1e-3  # of the shortest side of a triangle: files may have 7 digits
 
 
@@ -252,12 +237,10 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
     if path.stem in file.names[2]:
         raise UnreadableFile(f"{path.name}: there is a face {path.stem!r} already; give the surface another name")
     try:
-        arrays, data = read_guarded(path, f"remodel_fenicsx.body.lumen:{path.suffix[1:].lower()}")
+        surface, data = triangles_of(path)
     except UnreadableFile as error:
         raise UnreadableFile(f"{path.name}: {error}") from None
-    corners = np.asarray(arrays["points"], dtype=np.float64)[arrays["triangles"]]
-    if not corners.size or not np.isfinite(corners).all():
-        raise UnreadableFile(f"{path.name}: has no triangles with corners at finite places")
+    corners = surface.points[surface.triangles]
     away, nodes = cKDTree(file.points).query(corners)
     far = away > SAME_NODE * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1, keepdims=True)
     if far.any():
@@ -325,11 +308,17 @@ def arrays_msh(file: str) -> dict[str, Any]:
             raise UnreadableFile(f"must have one section ${name.decode()}")
     sections = dict(found)
     groups, names = _groups_of_entities(sections.get(b"Entities", b"0 0 0 0")), _group_names(sections)
+    if parts := sections.get(b"PartitionedEntities"):
+        ghosts, *rows = parts.strip().split(b"\n")[1:]
+        groups |= _groups_of_entities(b"\n".join(rows[int(ghosts) :]), is_partitioned=True)
     # without its groups, for meshio reads those of all parts or none
     plain = version[0] + b"".join(b"\n$%s\n%s$End%s" % (k, sections[k], k) for k in (b"Nodes", b"Elements"))
     Path(file).write_bytes(plain)  # in this process' memory
     try:
         mesh = importlib.import_module("meshio.gmsh").read(file)
+    except importlib.import_module("meshio").ReadError as error:
+        todo = "; save it without, in Gmsh: Mesh.SaveParametric = 0" if "parametric" in str(error) else ""
+        raise UnreadableFile(f"{error}{todo}") from None
     except (IndexError, ValueError) as error:
         raise UnreadableFile(f"{_OTHER_NUMBERS}, or nodes that are not there: {error}") from None
     _check_numbers(sections, version[1], mesh)
@@ -350,7 +339,7 @@ def _group_names(sections: dict[bytes, bytes]) -> list[tuple[int, int, str]]:
     return names
 
 
-def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]]:
+def _groups_of_entities(text: bytes, is_partitioned: bool = False) -> dict[tuple[int, int], list[int]]:
     """Numbers of the groups of points, curves, faces and volumes, by dimension and number."""
     counts, *rows = [line.split() for line in text.splitlines() if line.strip()]
     dimensions: Any = np.repeat(np.arange(4), np.array(counts, dtype=np.int64)).tolist()
@@ -358,6 +347,8 @@ def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]]:
         raise UnreadableFile(f"$Entities has {len(rows)} lines, but announces {len(dimensions)}")
     found: dict[tuple[int, int], list[int]] = {}
     for dimension, row in zip(dimensions, rows, strict=True):
+        if is_partitioned:  # behind the number: what it is a part of, and how many partitions have it, and which
+            del row[1 : 4 + int(row[3])]
         start = 8 if dimension else 5  # behind the number, the box around it, and how many groups there are
         groups = row[start : start + int(row[start - 1])]
         found[dimension, int(row[0])] = [abs(int(group)) for group in groups]
@@ -377,6 +368,8 @@ def _check_numbers(sections: dict[bytes, bytes], version: bytes, mesh: Any) -> N
     beside = 5 if is_old else 1  # an element's number; its type, how many tags it has, and these
     in_elements = sum(len(block.data) * (beside + block.data.shape[1]) for block in mesh.cells)
     heads = (1, 1) if is_old else (4 + 4 * int(found[b"Nodes"][0]), 4 + 4 * len(mesh.cells))
+    if is_old and len(found[b"Elements"]) > 3 and found[b"Elements"][3] > 2:
+        raise UnreadableFile("is partitioned; save it without, in Gmsh: Mesh, Unpartition (or in format 4.1)")
     if [*map(len, found.values())] != [heads[0] + 4 * len(mesh.points), heads[1] + in_elements]:
         raise UnreadableFile(_OTHER_NUMBERS)
     if is_old and (lost := _NO_NODE.search(sections[b"Elements"])):

@@ -54,10 +54,17 @@ def read_toml(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
         where = f"line {place[2] or len(text.splitlines())}: " if place else ""
-        raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}") from None
+        line = text.splitlines()[int(place[2]) - 1] if place and place[2] else ""
+        raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}{_marks(line)}") from None
     if _depth_exceeds(values, MOST_PARTS):
         raise SceneError(f"{path}: tables or lists in more than {MOST_PARTS} others; a scene has up to 4")
     return values
+
+
+def _marks(text: str) -> str:
+    """What is to be said of quotes that word processors have turned."""
+    found = re.search("[\u2018-\u201f\u00ab\u00bb]", text)
+    return f'; {found[0]} is no quote of TOML: type " in its place' if found else ""
 
 
 def _depth_exceeds(value: Any, most: int) -> bool:
@@ -85,7 +92,7 @@ def parse_override(text: str) -> tuple[str, Any]:
         return key, parsed["value"]
     if re.fullmatch(r"[\w.+/:-]+", value) or is_quantity(value):
         return key, value
-    raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word")
+    raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word{_marks(value)}")
 
 
 def put(values: dict[str, Any], key: str, value: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import importlib
 import io
@@ -20,7 +21,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, RemodelError, UnreadableFile
 from remodel_fenicsx.system.environment import extensions_for_children
 from remodel_fenicsx.system.files import open_own, read_regular
 
@@ -147,8 +148,13 @@ WAITING = 10  # times the processor time: the machine may be busy
 ELSEWHERE = "its numbers stand in another file; allowed is a file that holds them (Format='XML')"
 LONGEST_REASON = 150  # characters of what is wrong
 DAMAGED = "cannot be read: "
+FOR_EVER, NO_LIMIT = 1e5, 10**15  # seconds, which the system takes ten times; bytes
+NO_ROOM = (errno.EFBIG, errno.ENOSPC, errno.EDQUOT)
 # as VTK adds to its words
-_LOGGED = re.compile(r"\x1b\[[0-9;]*m|\(0x[0-9a-f]+\)|\S+ \S+ \( *[\d.]+s\) \[ *\w+\]\S+ ERR\| ")
+_HEAD = r"\S+ \S+ \( *[\d.]+s\) \[ *\w+\] ?\S+ ERR\| "
+_LOGGED = re.compile(
+    rf"\x1b\[[0-9;]*m|{_HEAD}vtkCompositeDataPipeline.*|{_HEAD}(\w+ \(0x[0-9a-f]+\): )?|\(0x[0-9a-f]+\)"
+)
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # marks of its byte order
 _COUNTS = re.compile(r"(?i)^(number.*|dimensions|offset)$")
 _LINES = re.compile(
@@ -156,13 +162,34 @@ _LINES = re.compile(
 )
 
 
+class NoRoomError(RemodelError):
+    """A disk, or the largest file that the system allows, is full: not the fault of what is read."""
+
+    exit_code = BAD_ENVIRONMENT
+
+    def __init__(self) -> None:
+        super().__init__(
+            "there is no room for the numbers of a file: a full disk, or a limit of the size of files (ulimit -f)"
+        )
+
+
 def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], bytes]:
     """What a reader makes of a file, and the file: the bytes that it has read, and no others."""
     data = read_regular(path, LARGEST_FILE)
     seconds, memory = SECONDS + SECONDS_PER_MB * len(data) / 1e6, MEMORY + MEMORY_PER_BYTE * len(data)
+    return made_apart(data, path.name, reader, seconds, memory), data
+
+
+def made_apart(
+    data: bytes, name: str, reader: str, seconds: float = FOR_EVER, memory: int = NO_LIMIT
+) -> dict[str, NDArray[Any]]:
+    """What a function makes of a file of that name with these bytes, in a process of its own with limits."""
     with os.fdopen(os.memfd_create("read"), "wb") as source, os.fdopen(os.memfd_create("found"), "rb") as found:
-        source.write(data)
-        source.flush()
+        try:
+            with open(source.fileno(), "wb", closefd=False) as copy:
+                copy.write(data)
+        except OSError as error:
+            raise NoRoomError from error
         words = [reader, str(source.fileno()), str(found.fileno()), str(int(seconds)), str(memory)]
         command = [sys.executable, "-P", "-W", "ignore", "-m", "remodel_fenicsx.system.children", *words]
         kept: dict[str, Any] = {"pass_fds": (source.fileno(), found.fileno()), "env": environment_of_child()}
@@ -172,16 +199,23 @@ def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], byte
             )
         except subprocess.TimeoutExpired:
             raise UnreadableFile(f"takes more than {seconds:.3g} seconds to read") from None
+        if done.returncode == BAD_ENVIRONMENT:
+            raise NoRoomError
         said = _LOGGED.sub("", " ".join(done.stderr[-4000:].decode(errors="replace").split()))
-        if done.returncode < 0:
+        said = said.replace(f"/proc/self/fd/{source.fileno()}", name)
+        if -done.returncode in (signal.SIGXCPU, signal.SIGKILL):
             raise UnreadableFile(f"takes more than {seconds:.3g} seconds or {memory / 1e6:.0f} MB to read")
+        if done.returncode < 0:
+            raise UnreadableFile(
+                f"{DAMAGED}its reader has crashed, so it is damaged ({signal.Signals(-done.returncode).name})"
+            )
         if done.returncode or said:
             raise UnreadableFile(DAMAGED + (said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]} ..."))
         found.seek(0)
         import numpy as np  # late: most commands need no numbers
 
         with np.load(io.BytesIO(found.read()), allow_pickle=False) as arrays:
-            return dict(arrays), data
+            return dict(arrays)
 
 
 # ---------------------------------------------------------------- the child
@@ -190,18 +224,23 @@ def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], byte
 def read_as_child(reader: str, source: str, found: str, seconds: str, memory: str) -> None:
     """Read, in a process of its own."""
     for limit, most in ((resource.RLIMIT_CPU, seconds), (resource.RLIMIT_AS, memory), (resource.RLIMIT_CORE, 0)):
-        resource.setrlimit(limit, (int(most), int(most)))
+        highest = resource.getrlimit(limit)[1]  # of whoever has started the command
+        most = int(most) if highest == resource.RLIM_INFINITY else min(int(most), highest)
+        resource.setrlimit(limit, (most, most))
     os.environ["OMP_NUM_THREADS"] = "1"
     module, _, name = reader.partition(":")
     file = f"/proc/self/fd/{source}"
     try:
         read: Callable[[str], dict[str, Any]] = getattr(importlib.import_module(module), name)
-        _guard(file)
+        if int(memory) < NO_LIMIT:  # a file of others
+            _guard(file)
         arrays = read(file)
         import numpy as np
 
         with os.fdopen(int(found), "wb") as target:
             np.savez(target, **arrays)
+    except OSError as error:
+        sys.exit(BAD_ENVIRONMENT if error.errno in NO_ROOM else str(error))
     except MemoryError:
         sys.exit(f"takes more than {int(memory) / 1e6:.0f} MB to read")
     except KeyError as error:  # a table of types, or what was found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,16 @@ def test_every_free_rigid_motion_counts(tube: Path, supports: Any, free: int) ->
     parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).parts
     chosen = {"inlet": Support(), "outlet": Support()} | {name: Support(**one) for name, one in supports.items()}
     assert free_motions(parts, chosen) == free
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_springs_on_one_or_two_facets_hold_a_body(tube: Path, number: int) -> None:
+    """Any displacement that is linear in place is held on a triangle; at its middle alone three turns are not."""
+    scene = scene_of(tube)
+    parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).parts
+    rows = {name: getattr(parts[0], name)[:number] for name in ("facets", "places", "normals", "corners")}
+    spot = replace(parts[0], name="spot", **rows)
+    assert free_motions([*parts, spot], {"spot": Support(**SPRINGS)}) == 0
 
 
 # ---------------------------------------------------------------- runs

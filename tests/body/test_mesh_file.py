@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import SceneError
+from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_file import read_mesh
 from remodel_fenicsx.scene import read_scene, scene_from_dict
 from tests.mesh_files import TUBE, changed, write_tube
@@ -106,3 +107,27 @@ def test_a_wall_of_one_element_is_warned_of(tmp_path: Path, caplog: pytest.LogCa
     values = {"geometry": {"shape": "mesh", "file": str(thin)}, "time": {"end": 1.0, "step": 1.0}}
     scene_from_dict(values).geometry.checked()
     assert any("one element thick" in record.message for record in caplog.records)
+
+
+def test_a_partitioned_mesh_keeps_its_groups_or_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    """With and without elements of neighbours; format 2.2 has partitions among the numbers of elements."""
+    whole, files = read_mesh(write_tube(tmp_path / "tube.msh")), {}
+    with gmsh_model("parts") as gmsh:
+        gmsh.merge(str(tmp_path / "tube.msh"))
+        for name, version, ghosts in (("parts", 4.1, 0), ("ghosts", 4.1, 1), ("old", 2.2, 0)):
+            gmsh.option.setNumber("Mesh.PartitionCreateGhostCells", ghosts)
+            gmsh.option.setNumber("Mesh.MshFileVersion", version)
+            gmsh.model.mesh.partition(3)
+            files[name] = tmp_path / f"{name}.msh"
+            gmsh.write(str(files[name]))
+            gmsh.model.mesh.unpartition()
+        gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
+        gmsh.option.setNumber("Mesh.SaveParametric", 1)
+        gmsh.write(str(tmp_path / "parametric.msh"))
+    for name in ("parts", "ghosts"):
+        found = read_mesh(files[name])
+        assert found.names == whole.names and (np.sort(found.cell_groups) == np.sort(whole.cell_groups)).all()
+        for number in whole.names[2].values():
+            assert (found.facet_groups == number).sum() == (whole.facet_groups == number).sum()
+    assert "Gmsh: Mesh, Unpartition" in refusal(files["old"])
+    assert "Mesh.SaveParametric = 0" in refusal(tmp_path / "parametric.msh")

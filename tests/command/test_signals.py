@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import pyvista
 
 from remodel_fenicsx.results.recording import read_history
+from tests.body.test_lumen import tube
 from tests.conftest import slowly
 from tests.forks import forked
 from tests.processes import wait_for_rows
@@ -159,3 +161,32 @@ os.kill(os.getpid(), signal.SIGUSR1)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, process_group=0)
     assert done.returncode == -signal.SIGUSR1, done.stderr
+
+
+def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: Path) -> None:
+    """While Gmsh, which hears no signals, divides 204,800 triangles."""
+    points, triangles = tube(around=640, along=160)
+    file = tmp_path / "lumen.vtp"
+    pyvista.PolyData.from_regular_faces(points, triangles).save(file)
+    words = ["wall", str(file), "--thickness", "0.3", "--size", "0.3", "-o", str(tmp_path / "wall.msh")]
+    process = subprocess.Popen([*COMMAND[:3], *words], stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None and "204800 triangles are divided again" in process.stderr.readline()
+    process.terminate()
+    _, said = process.communicate(timeout=5)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert said == "remodel-fenicsx: stopped by SIGTERM; nothing is written\n"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_limit_of_files_is_no_fault_of_a_surface(tmp_path: Path) -> None:
+    """Below the size of the surface, and below that of the mesh."""
+    points, triangles = tube()
+    file = tmp_path / "lumen.vtp"
+    pyvista.PolyData.from_regular_faces(points, triangles).save(file)
+    words = ["wall", str(file), "--thickness", "0.3", "--size", "0.3", "-o", str(tmp_path / "wall.msh")]
+    for blocks in (20, 200):
+        limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$0" "$@"', *COMMAND[:3], *words]
+        done = subprocess.run(limited, capture_output=True, text=True, timeout=100)
+        assert done.returncode == 5, done.stderr
+        assert "lumen.vtp" not in done.stderr and "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == [file]
