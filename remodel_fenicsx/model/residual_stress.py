@@ -342,6 +342,6 @@ def means_through(radius: Array, volumes: Array, values: Array, edges: Array) ->
     order = np.argsort(radius, kind="stable")
     inside = np.cumsum(volumes[order]) - volumes[order] / 2
     bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
-    ring = np.searchsorted(bounds, inside / volumes.sum())
-    total, *means = (np.bincount(ring, volumes[order] * part[order]) for part in (np.ones_like(radius), *values.T))
-    return total, np.stack(means, axis=-1) / total[:, None]
+    ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
+    sums: list[Array] = [np.bincount(ring, volumes[order] * part[order]) for part in (np.ones_like(radius), *values.T)]
+    return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]
