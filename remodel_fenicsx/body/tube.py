@@ -234,16 +234,17 @@ def _opening_angle(m: Any) -> float:
 
     radii = np.linalg.norm(local.coordinates.reshape(-1, 3)[:, :2], axis=1)
     changed = np.ones((len(radii), 3)) if natural is None else along(natural) / at_first(radii)
-    columns = [radii, *along(structure_tensor(*cells.point_cells[:2])).T, *changed.T]
+    density = state.per_mesh_volume(np.ones(m.quadrature.shape)).reshape(-1)
+    columns = [radii, density, *along(structure_tensor(*cells.point_cells[:2])).T, *changed.T]
     turned = [name for name in TURNED_OVER if getattr(tissue, name) is not None]
     columns += [getattr(stepper.remodeling.parameters.at_points(), name) for name in turned]
-    rows = np.column_stack([state.per_mesh_volume(m.quadrature.volumes).reshape(-1), *columns])
+    rows = np.column_stack([m.quadrature.volumes.reshape(-1), *columns])
     owned = m.quadrature.owned(rows.reshape(*m.quadrature.shape, -1))
-    volumes, *columns = np.concatenate(comm.allgather(owned.reshape(-1, rows.shape[1]))).T
+    rows = np.concatenate(comm.allgather(owned.reshape(-1, rows.shape[1])))
     edges, parts = m.tool("cut", lambda: _elements_through(m.domain, m.quadrature.element_degree))
-    volumes, means = means_through(columns[0], np.stack(columns, axis=-1), volumes, parts)
-    radii, squared, changed, turnover = np.split(means, [1, 4, 7], axis=1)
-    rings = Rings(radii[:, 0], volumes, changed * at_first(radii[:, 0]), squared)
+    volumes, means = means_through(rows[:, 1], rows[:, 0], rows[:, 1:], parts)
+    (radii, density), (squared, changed, turnover) = means[:, :2].T, np.split(means[:, 2:], [3, 6], axis=1)
+    rings = Rings(radii, volumes * density, changed * at_first(radii), squared)
     try:
         return cut(replace(tissue, **dict(zip(turned, turnover.T, strict=True))), rings, edges, closed)
     except ArithmeticError as error:

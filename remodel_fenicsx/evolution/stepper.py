@@ -6,12 +6,14 @@ import logging
 import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Coupling, Maker, Staggered
@@ -19,8 +21,9 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver, Turnover
-from remodel_fenicsx.solver.continuation import StepFailure, Work
-from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
+from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.solver.newton import GuardedNewton
 from remodel_fenicsx.state import State, on_mesh
 from remodel_fenicsx.system.interrupts import Paused
 
@@ -183,7 +186,7 @@ class Stepper:
         coupling: Maker | None = None,
         kappa: Any = None,
     ):
-        self.state, self.load_values = state, load_values
+        self.state, self.load_values, self._solver = state, load_values, solver
         self.tissue = on_mesh(tissue, state.cells.quadrature.mesh)
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa)
         # cells that never change are coupled to nothing
@@ -217,9 +220,12 @@ class Stepper:
         return [getattr(part, name) for part in parts]
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
-        """The present state as the step that watchers see before all others."""
-        state = self.state
-        step = Step(state.time, state.number, dict(state.loading.values), self.coupling.equilibrium.extension(), Work())
+        """The present state as the step that watchers see before all others; at first in equilibrium without loads."""
+        state, work = self.state, Work()
+        if not state.number:
+            for case in (self, *self.remodeling.cases):
+                release(case.state, case.coupling.equilibrium, self._solver, work)
+        step = Step(state.time, state.number, dict(state.loading.values), self.coupling.equilibrium.extension(), work)
         for watcher in watchers:
             if step.number:
                 watcher.resumed(step)
@@ -312,6 +318,25 @@ class Stepper:
         """Free PETSc's objects and options; the state stays, and takes no further step."""
         self._closed = True
         self.coupling.close()
+
+
+def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work) -> None:
+    """Let a body go that its prestretch leaves out of balance, in as many parts as it needs. Collective."""
+    G, one = state.natural_gradient, np.eye(3)
+    if G is None or state.kinematics.closing is not None or not state.cells.quadrature.maximum(np.abs(G - one)):
+        return
+    whole = G.copy()
+
+    def set_fraction(fraction: float) -> None:
+        G[:] = whole if fraction == 1.0 else one + fraction * (whole - one)
+
+    with state.transaction(), closing(GuardedNewton(equilibrium, settings)) as newton:
+        change = Change(state.time, "the prestretch", set_fraction, state, lambda: newton, settings.maximum_halvings)
+        try:
+            change.advance(work)
+        finally:
+            G[:] = whole
+    log.info("the body is let go with its prestretch: %d parts", work.substeps)
 
 
 @contextmanager

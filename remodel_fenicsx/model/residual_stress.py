@@ -308,6 +308,8 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
         depth = closed.natural_radius(rings.radius) - inner
         steepness = closed.panels.at(rings.radius, closed.panels.derivative(closed.radius))
     shares, thickness = rings.volume / rings.volume.sum(), edges[-1] - edges[0]
+    thinner = shares @ (1 / (steepness * rings.natural[:, 2]))  # where tissue has grown across
+    depth, steepness, start = thinner * depth, thinner * steepness, (start[0], start[1] / thinner)
 
     # k rho of the lumen, rho - rho of the lumen, e and k: in these a thin wall that bends far is almost linear, and
     # k may be zero or less
@@ -326,17 +328,20 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
         whole = [part.sum(axis=-1, keepdims=True) for part in (hoop, axial, hoop * across / thickness)]
         return np.concatenate([whole[0], nodes, *whole[1:]], axis=-1)
 
-    values = np.concatenate([[inner * start[1]], np.zeros(functions.shape[1]), start])
+    values = np.concatenate([[inner * start[1] * thinner], np.zeros(functions.shape[1]), start])
     dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
     found = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
     return float(360.0 * (1.0 - found[-1]))
 
 
-def means_through(radius: Array, values: Array, weights: Array, edges: Array) -> tuple[Array, Array]:
-    """Weights and values (n, m) at points, summed up and averaged by weight between those edges that hold a point."""
-    number = len(edges) - 1
-    layer = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, number - 1)
-    total = np.bincount(layer, weights, number)
-    some = total > 0
-    means = [np.bincount(layer, weights * column, number)[some] / total[some] for column in values.T]
-    return np.asarray(total[some], dtype=np.float64), np.stack(means, axis=-1)
+def means_through(radius: Array, volumes: Array, values: Array, edges: Array) -> tuple[Array, Array]:
+    """Volumes (m) and means by volume of values (n, ...) in rings: between edges, those of the same share of the whole.
+
+    Facets of elements lie inside of the cylinders, by more than a thin ring: the radius itself leaves some rings empty.
+    """
+    order = np.argsort(radius, kind="stable")
+    inside = np.cumsum(volumes[order]) - volumes[order] / 2
+    bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
+    ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
+    sums: list[Array] = [np.bincount(ring, volumes[order] * part[order]) for part in (np.ones_like(radius), *values.T)]
+    return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_layers import write_layers
 from tests.body.test_natural import layers, scene
 from tests.body.test_stresses import NAMES
-from tests.runs import goes_on, last_row
+from tests.runs import goes_on, last_row, made
 from tests.tables import rows, values
 
 SELF = MPI.COMM_SELF
@@ -93,6 +94,21 @@ def test_a_prestretch_that_is_given_back_leaves_no_stress(two_layers: Path) -> N
     assert abs(row["stored_energy"] - last_row(own_body(two_layers, 0.0, natural={}))["stored_energy"]) < 1e-4
     assert held["stored_energy"] > 0.1
     assert np.sqrt(row["lumen_volume"] / (np.pi * 0.5 / 1.1)) == pytest.approx(np.sqrt(1.1), abs=2e-3)
+
+
+def test_an_own_body_begins_in_balance_without_loads(two_layers: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The row of t = 0 is the one that a step without loads has, also where the prestretch comes in parts."""
+    strong = {"natural": {"layers": layers(("media", {"circumferential": 1.3}), ("adventitia", {"axial": 1.2}))}}
+    few: dict[str, Any] = {"method": "direct", "maximum_iterations": 3}
+    columns = {"output": {"fields": False, "columns": ["outer_area", *NAMES]}}
+    for tables, parts in (({}, 1), (strong | {"solver": few}, 2)):
+        caplog.clear()
+        with caplog.at_level(logging.INFO), made(own_body(two_layers, 0.0, **columns, **tables)) as simulation:
+            start = simulation.stepper.start(simulation.watchers)
+            row = next(iter(simulation.steps())).row
+        for name in ("lumen_volume", "outer_area", *NAMES):
+            assert start.row[name] == pytest.approx(row[name], rel=1e-8, abs=1e-8), name
+        assert start.work.substeps >= parts and "the body is let go" in caplog.text
 
 
 @pytest.mark.parametrize(("table", "words"), rows(__file__, "bad_layers.txt"))
