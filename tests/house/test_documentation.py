@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 import shlex
@@ -125,6 +126,14 @@ def test_the_project_keeps_within_its_ceilings() -> None:
     size = runpy.run_path(str(ROOT / "tests" / "house" / "size"))
     sizes, _ = size["measured"]()
     assert all(sizes[name] <= most for name, most in size["CEILINGS"].items()), sizes
+
+
+def test_tables_and_pictures_of_pages_are_of_this_version() -> None:
+    """By the stamps that their studies write (`docs/make NAME` makes them anew)."""
+    stamps = {path.name: json.loads(path.read_text())["made by"] for path in (ROOT / "docs/figures").glob("*.json")}
+    assert len(stamps) > 20
+    old = {name: stamp for name, stamp in stamps.items() if stamp.split()[-1] != remodel_fenicsx.__version__}
+    assert not old
 
 
 LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)[^)]*\)")
