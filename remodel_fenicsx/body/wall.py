@@ -314,6 +314,8 @@ class RoundWall(Walled, WithRegions, Unloads):
             return
         for name, properties in scene.properties().items():
             if not properties.tissue.is_round():
-                rule = "has directions along x, y and z, which follow the wall with model.kinematics = 'radial' or "
-                rule = f"{rule}'axisymmetric' alone: these are the radius, the circumference and the length"
+                rule = (
+                    "has directions along x, y and z, which follow the wall in the kinematics 'radial' and "
+                    "'axisymmetric' alone: the radius, the circumference and the length"
+                )
                 raise fault(rule, f"{in_region(name)}material.matrix", properties.material.matrix)

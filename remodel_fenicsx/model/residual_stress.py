@@ -301,15 +301,14 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
     knots = np.concatenate([edges[:1], np.repeat(edges, 2), edges[-1:]])
     spline = BSpline(knots, np.eye(len(knots) - 3), 2)
     functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]  # zero at the lumen
-    inner, depth, steepness = edges[0], rings.radius - edges[0], np.ones_like(rings.radius)
-    start = (1.0, 1.0)
+    depth, steepness, inner, axial, k = rings.radius - edges[0], np.ones_like(rings.radius), edges[0], 1.0, 1.0
     if closed is not None:  # what opens, were the cells as they were
-        inner, start = float(closed.natural_radius(edges[:1])[0]), (1 / closed.axial, 1 / closed.circumferential)
+        inner, axial, k = closed.radius[0, 0], 1 / closed.axial, 1 / closed.circumferential
         depth = closed.natural_radius(rings.radius) - inner
         steepness = closed.panels.at(rings.radius, closed.panels.derivative(closed.radius))
-    shares, thickness = rings.volume / rings.volume.sum(), edges[-1] - edges[0]
+    shares = rings.volume / rings.volume.sum()
     thinner = shares @ (1 / (steepness * rings.natural[:, 2]))  # where tissue has grown across
-    depth, steepness, start = thinner * depth, thinner * steepness, (start[0], start[1] / thinner)
+    depth, steepness = thinner * depth, thinner * steepness
 
     # k rho of the lumen, rho - rho of the lumen, e and k: in these a thin wall that bends far is almost linear, and
     # k may be zero or less
@@ -325,10 +324,10 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
         hoop, axial, radial = np.moveaxis(work, -1, 0)
         hoop = edges[-1] * hoop / around
         nodes = (values[..., -1:] * hoop) @ functions + edges[-1] * (radial / slope) @ slopes
-        whole = [part.sum(axis=-1, keepdims=True) for part in (hoop, axial, hoop * across / thickness)]
+        whole = [part.sum(axis=-1, keepdims=True) for part in (hoop, axial, hoop * across / np.ptp(edges))]
         return np.concatenate([whole[0], nodes, *whole[1:]], axis=-1)
 
-    values = np.concatenate([[inner * start[1] * thinner], np.zeros(functions.shape[1]), start])
+    values = np.concatenate([[inner * k], np.zeros(functions.shape[1]), [axial, k / thinner]])
     dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
     found = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
     return float(360.0 * (1.0 - found[-1]))
@@ -343,5 +342,5 @@ def means_through(radius: Array, volumes: Array, values: Array, edges: Array) ->
     inside = np.cumsum(volumes[order]) - volumes[order] / 2
     bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
     ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
-    sums: list[Array] = [np.bincount(ring, volumes[order] * part[order]) for part in (np.ones_like(radius), *values.T)]
+    sums: list[Any] = [np.bincount(ring, volumes[order] * part[order]) for part in (np.ones_like(radius), *values.T)]
     return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]
