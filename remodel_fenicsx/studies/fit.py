@@ -11,6 +11,7 @@ import signal
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -27,7 +28,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import explained
-from remodel_fenicsx.errors import SOLVE_FAILED, RemodelError, UnreadableFile
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, SOLVE_FAILED, RemodelError, UnreadableFile
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
@@ -40,6 +41,7 @@ from remodel_fenicsx.simulation import Simulation, begin_again, with_choices
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.studies.page import COLOURS, Answer, Page, label, made_with, panels
+from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.children import cores
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
 from remodel_fenicsx.system.terminal import Line, hold_log, open_log, unsaid
@@ -554,6 +556,12 @@ class NoStart(RemodelError):  # noqa: N818
     exit_code = SOLVE_FAILED
 
 
+class LostProcess(RemodelError):  # noqa: N818
+    """A process of a fit was killed by somebody else."""
+
+    exit_code = BAD_ENVIRONMENT
+
+
 def fit(
     scene: Scene,
     data: Path | str,
@@ -596,12 +604,21 @@ def fit(
 
         def on_cores(tasks: Mapping[str, Callable[[Problem], Any]]) -> list[Any]:
             asked = [pool.submit(_told, *task) for task in tasks.items()]
-            left = set(asked)
+            left, processes = set(asked), active_children()
             while left:
                 left = wait(left, 0.5).not_done
                 runs = journal.path.read_bytes().count(b"\n") - 1
                 line.show(f"{runs} runs, {len(left)} of {len(asked)} left: {', '.join(tasks)}")
-            answers = [one.result() for one in asked]
+            try:
+                answers = [one.result() for one in asked]
+            except BrokenProcessPool as error:
+                pool.shutdown()  # it has ended the others by SIGTERM
+                codes = [one.exitcode for one in processes if one.exitcode]
+                first = min(codes, key=lambda code: code == -signal.SIGTERM)
+                raise LostProcess(
+                    f"a process was ended by {signal.Signals(-first).name}, as where memory is short (--jobs 1 takes "
+                    "less); all that is recorded is kept, the same command goes on"
+                ) from error
             problem.known |= Journal(place).known
             return answers
 
@@ -627,6 +644,8 @@ def _begin_with(problem: Problem) -> None:
     global _problem
     _problem = problem
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # it ends with its parent, which minds the other signals
+    for number in (signal.SIGTERM, signal.SIGHUP, interrupts.PAUSE):
+        signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -85,3 +86,27 @@ def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
     assert number == signal.SIGKILL or said
     assert not (tmp_path / "runs" / "ensemble.csv").exists()
     assert all(history.read_text().count("\n") < 152 for history in (tmp_path / "runs").rglob("history.csv"))
+
+
+# ---------------------------------------------------------------- the processes of a fit
+FIT = ARTERY.parent / "fit"
+
+
+KILLED = [("child", signal.SIGKILL, 5), ("child", signal.SIGTERM, 5), ("child", signal.SIGHUP, 5)]
+KILLED += [("parent", signal.SIGTERM, 143), ("parent", signal.SIGINT, 130)]
+
+
+@pytest.mark.parametrize(("whose", "number", "code"), KILLED)
+def test_a_fit_whose_process_is_killed_ends(whose: str, number: signal.Signals, code: int, tmp_path: Path) -> None:
+    """Who is short of memory kills a process: one line, and what was evaluated stays."""
+    words = ["fit", str(FIT / "scene.toml"), str(FIT / "inflation.toml"), "--starts", "999", "--jobs", "2", "-o", "out"]
+    journal, command = tmp_path / "out" / "evaluations.jsonl", [sys.executable, "-c", COMMAND, *words]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        while len(pool := members(process.pid, CHILDREN)) < 2 or journal.read_text().count("\n") < 10:
+            assert process.poll() is None
+            time.sleep(0.05)
+        os.kill(min(pool) if whose == "child" else process.pid, number)
+        last = process.communicate(timeout=60)[1].splitlines()[-1]
+    assert process.returncode == code and number.name in last and all(map(has_ended, pool))
+    assert last.endswith("; all that is recorded is kept, the same command goes on")
+    assert journal.read_text().count("\n") >= 10
