@@ -28,9 +28,9 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-MANY = 200_000  # triangles of which Gmsh divides 6,000 a second
+LARGE_SURFACE = 200_000  # triangles of which Gmsh divides 6,000 a second
 SHARP = 60.0  # degrees between two triangles from which on Gmsh keeps an edge between them
-FLAT = 1e-6  # of an area to the power of 1.5: a tube of that volume is 80,000 times longer than wide
+HOLLOW = 1e-6  # of an area to the power of 1.5: a tube of that volume is 80,000 times longer than wide
 SMOOTHINGS = 50  # of the normals where a wall would fold over: more change no corner that is still there
 MOST_THROUGH = 100  # elements through the wall
 MOST_RADII, LEAST_RADII = 3.0, 2e-3  # of a wall: arterioles that are contracted have 2, the widest aneurysms 0.02
@@ -66,7 +66,7 @@ def oriented(surface: Surface, name: str) -> Surface:
     normals = mesh.compute_normals(point_normals=False, split_vertices=False, auto_orient_normals=False)
     points, triangles = surface.points, normals.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
     volume, area = _signed_volume(points, triangles), np.linalg.norm(area_vectors(points[triangles]), axis=1).sum()
-    if abs(volume) <= FLAT * area**1.5:
+    if abs(volume) <= HOLLOW * area**1.5:
         raise SceneError(f"{name}: the surface is flat, it encloses no lumen")
     if volume < 0:
         triangles = triangles[:, ::-1]
@@ -289,11 +289,11 @@ def write_wall(
         raise SceneError(f"--size {size:g}: makes about {number:.2g} tetrahedra; at most {LARGEST_MESH:g} are made")
     depth, radius = _thickness(thickness, shares, read), 2 * _signed_volume(read.points, read.triangles) / area
     _check_units(radius, size, depth)
-    if len(read.triangles) > MANY:
+    if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: {len(read.triangles)} triangles are divided again, which takes minutes")
     found, near = remeshed(read, size)
     depth = depth[near]
-    if len(read.triangles) > MANY:
+    if len(read.triangles) > LARGE_SURFACE:
         announce(f"{path}: the wall grows on {len(found.triangles)} triangles")
     wall = grown(found, read, depth, shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:

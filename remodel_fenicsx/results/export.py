@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from remodel_fenicsx.body.mesh_faces import FACETS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
@@ -23,6 +24,7 @@ from remodel_fenicsx.system.files import write_new
 
 
 log = logging.getLogger(__name__)
+LEAST_SAID = 0.01  # of a change between elements: less is below what a fit of angles resolves
 
 
 def write_vtu(
@@ -113,9 +115,31 @@ def export(folder: Path | str, kind: str, path: Path | None = None, time: float 
     if fibres.others and kind not in WITH_OTHERS:
         kinds = " and ".join(WITH_OTHERS)
         log.warning("%s has no place for %s; %s files have them", kind, ", ".join(fibres.others), kinds)
+    if (share := uneven(fibres)) > LEAST_SAID:
+        log.warning(
+            "each element has the mean of its points: neighbours differ by up to %.1f %% of tr A, and "
+            "a run that begins with them is off by up to about half of that at their faces",
+            100 * share,
+        )
     path = Path(folder) / f"fibres{ending}" if path is None else path
     write(path, fibres)
     return path
+
+
+def uneven(fibres: Fibres) -> float:
+    """Largest change of A between elements that share a facet, over tr A; 0 of elements with one point."""
+    nodes = fibres.elements.shape[1]
+    if nodes == 4:
+        return 0.0
+    local = np.array(FACETS["tetrahedron" if nodes == 10 else "hexahedron"])
+    facets = np.sort(fibres.elements[:, local].reshape(-1, local.shape[1]), axis=1)
+    _, number = np.unique(facets, axis=0, return_inverse=True)
+    order = np.argsort(number.reshape(-1))
+    one, other = order[:-1], order[1:]
+    beside = number.reshape(-1)[one] == number.reshape(-1)[other]
+    tensors = fibres.tensors / np.trace(fibres.tensors, axis1=1, axis2=2)[:, None, None]
+    steps = tensors[one[beside] // len(local)] - tensors[other[beside] // len(local)]
+    return float(np.linalg.norm(steps, axis=(1, 2)).max(initial=0.0))
 
 
 def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:

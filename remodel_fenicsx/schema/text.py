@@ -54,8 +54,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
         where = f"line {place[2] or len(text.splitlines())}: " if place else ""
-        line = text.splitlines()[int(place[2]) - 1] if place and place[2] else ""
-        raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}{_marks(line)}") from None
+        words = text.splitlines()[int(place[2]) - 1] if place and place[2] else ""
+        raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}{_marks(words)}") from None
     if _depth_exceeds(values, MOST_PARTS):
         raise SceneError(f"{path}: tables or lists in more than {MOST_PARTS} others; a scene has up to 4")
     return values

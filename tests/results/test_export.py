@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import itertools
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
@@ -231,6 +233,24 @@ def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(kind: str,
         ends = places[:, i - 1], places[:, j - 1]
         chord = np.linalg.norm(ends[1] - ends[0], axis=1)
         assert (np.linalg.norm(places[:, node] - (ends[0] + ends[1]) / 2, axis=1) < 0.25 * chord).all(), (node, i, j)
+
+
+def test_what_means_of_elements_leave_out_is_said(start: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The largest difference of A between neighbours, which elements with one point do not lose."""
+    mesh = meshio.read(exported(start, "vtu"), file_format="vtu")
+    said = re.findall(r"neighbours differ by up to ([\d.]+) % of tr A", caplog.text)
+    (block,), tensors = mesh.cells, mesh.cell_data["structure_tensor"][0]
+    if block.type == "tetra":
+        assert not said
+        return
+    corners = [set(row) for row in block.data[:, : 4 if block.type == "tetra10" else 8].tolist()]
+    shared = 3 if block.type == "tetra10" else 4
+    pairs = [
+        (i, j) for i, j in itertools.combinations(range(len(corners)), 2) if len(corners[i] & corners[j]) == shared
+    ]
+    units = tensors / tensors[:, [0, 4, 8]].sum(axis=1, keepdims=True)
+    largest = max(np.linalg.norm(units[i] - units[j]) for i, j in pairs)
+    assert float(said[0]) == pytest.approx(100 * largest, abs=0.06)
 
 
 def test_vtu_and_csv_hold_the_same(start: Path) -> None:
