@@ -131,6 +131,20 @@ sys.exit(cli.main({[*CUBE, "-o", str(tmp_path / "out")]!r}))
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_rank_does_not_wait_for_a_second_signal(tmp_path: Path) -> None:
+    """mpirun gives its ranks a quarter of a second between SIGTERM and SIGKILL: all of it is for the checkpoint."""
+    program = """
+import os, signal, time
+from remodel_fenicsx.system.interrupts import StopRequest
+time.sleep = None
+with StopRequest() as stop:
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert stop.number == signal.SIGTERM
+"""
+    done = forked("python", program, variables={**os.environ, "OMPI_COMM_WORLD_SIZE": "2"})
+    assert done.returncode == 0, done.stderr
+
+
 # ---------------------------------------------------------------- while it compiles
 
 
