@@ -174,6 +174,14 @@ def _line(error: BaseException, path: Path) -> str:
     return f", line {lines[-1]}" if lines else ""
 
 
+def blamed(error: BaseException) -> str:
+    """What went wrong in a part, and in which file and line; nothing of what no part had a share in."""
+    for path, _ in _loaded.values():
+        if line := _line(error, path):
+            return f"extension {path}{line}: {type(error).__name__}: {error}"
+    return ""
+
+
 def extensions() -> dict[str, str]:
     """The sums of those that were run, by name."""
     return {name: found for name, (_, found) in _loaded.items()}
