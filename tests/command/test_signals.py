@@ -158,6 +158,16 @@ def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:
     assert "unrecognized arguments: --bad" in said[0] and said[1] == ""
 
 
+def test_processes_of_srun_that_share_no_mpi_are_refused(tmp_path: Path) -> None:
+    """SLURM_NTASKS alone stands in every batch script."""
+    variables = {**os.environ, "SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2"}
+    words = [*CUBE, "--set", "time.end=1", "-q", "-o", tmp_path / "out"]
+    done = forked("remodel-fenicsx", *words, variables=variables)
+    assert done.returncode == 5 and "know nothing of each other: use mpirun -n 2" in done.stderr
+    assert not (tmp_path / "out").exists()
+    assert forked("remodel-fenicsx", *words, variables=variables | {"SLURM_STEP_NUM_TASKS": "1"}).returncode == 0
+
+
 def test_a_pause_for_the_whole_group_spares_the_compiler() -> None:
     """Batch systems send SIGUSR1 to all that a job has started."""
     program = """
