@@ -21,6 +21,7 @@ from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.children import SERVE, serve
 from remodel_fenicsx.system.environment import (
     EXTENSIONS,
+    blamed,
     check_usable,
     kernels,
     load_extensions,
@@ -172,7 +173,9 @@ def _done(arguments: list[str]) -> int:
             text = f"-o {options.output}: {refusal_in_words(error)}; allowed is a new or an empty folder"
             code = BAD_INPUT
         return _fail(text, code, on_all_ranks=False)
-    except Exception:
+    except Exception as error:
+        if words := blamed(error):
+            return _fail(words, BAD_INPUT, on_all_ranks=False)
         traceback.print_exc()
         return _fail("stopped by a defect of the program, see above", 1, on_all_ranks=False)
 

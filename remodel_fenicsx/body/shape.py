@@ -92,6 +92,10 @@ class Column:
     by_case: bool = True
     of_one_tissue: bool = False
 
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w .@+-]+", self.name):
+            raise ValueError(f"column {self.name!r}: its name must be of letters, digits, spaces and _ . + - @")
+
     def of_case(self, number: int) -> Column:
         """The same of another load case; the first one is 1.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from numbers import Real
 from typing import Any, NamedTuple
 
 import basix.ufl
@@ -16,12 +17,13 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Column, Shape, columns_of
 from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.drivers import DRIVERS
-from remodel_fenicsx.schema.tables import SceneError
+from remodel_fenicsx.schema.tables import SceneError, shown
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
@@ -87,7 +89,15 @@ class Observer(Watcher):
         measurement = Measurement(self, step)
         for column in self.columns:
             if column.after_pass == after_pass:
-                step.row[column.name] = column.value(measurement)
+                value = column.value(measurement)
+                if not isinstance(value, Real) or np.isinf(value):
+                    error = RemodelError(
+                        f"the column {column.name!r} is {shown(value)} at time {step.time:g}: must be a finite number, "
+                        "or nan where there is none"
+                    )
+                    error.on_all_ranks = False
+                    raise error
+                step.row[column.name] = float(value)
 
 
 class Measurement:

@@ -10,6 +10,7 @@ import itertools
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -268,6 +269,9 @@ class Scene(Table):
             table.check_with(self, key)
         if not isinstance(self.geometry, FromFile):
             check_number(self)
+        for name, count in Counter(column.name for column in self.columns()).items():
+            if count > 1:
+                raise fault("there are two columns of this name; parts of your own need other names", name, None)
         return self
 
     def _tables(self) -> Iterator[tuple[str, Table | Properties]]:

@@ -91,9 +91,15 @@ def reason_unusable() -> str | None:
         take_back_signals()
         import dolfinx
         import numpy
+        from mpi4py import MPI
         from petsc4py import PETSc
     except ImportError as error:
         return str(error)
+    if (tasks := os.environ.get("SLURM_STEP_NUM_TASKS", "1")) != "1" and MPI.COMM_WORLD.size == 1:
+        return (
+            f"srun has started {tasks} processes that know nothing of each other: use mpirun -n {tasks} or srun "
+            "--mpi=pmix (for runs of their own unset SLURM_STEP_NUM_TASKS)"
+        )
     major, minor = (int(part) for part in dolfinx.__version__.split(".")[:2])
     if (major, minor) < OLDEST_DOLFINX:
         oldest = ".".join(map(str, OLDEST_DOLFINX))
@@ -172,6 +178,14 @@ def _line(error: BaseException, path: Path) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     lines = [frame.lineno for frame in frames if frame.filename == str(path)]
     return f", line {lines[-1]}" if lines else ""
+
+
+def blamed(error: BaseException) -> str:
+    """What went wrong in a part, and in which file and line; nothing of what no part had a share in."""
+    for path, _ in _loaded.values():
+        if line := _line(error, path):
+            return f"extension {path}{line}: {type(error).__name__}: {error}"
+    return ""
 
 
 def extensions() -> dict[str, str]:

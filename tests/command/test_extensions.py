@@ -106,6 +106,29 @@ def test_a_file_that_cannot_be_run_is_bad_input(text: str, said: str, tmp_path: 
     assert not (tmp_path / "results").exists()
 
 
+COLUMN = "from remodel_fenicsx.extend import COLUMNS, Column\nCOLUMNS['a'] = Column({!r}, '', 'a', lambda m: {})\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("time", "7.0", "time: there are two columns of this name"),
+        ("force", "7.0", "force: there are two columns of this name"),
+        ("a,b", "7.0", "bad.py, line 2: ValueError: column 'a,b'"),
+        ("a\nb", "7.0", "bad.py, line 2: ValueError: column 'a\\nb'"),
+        ("mine", "float('inf')", "the column 'mine' is inf at time 0"),
+        ("mine", "None", "the column 'mine' is None at time 0"),
+        ("mine", "1 / m.step.time", "bad.py, line 2: ZeroDivisionError"),
+    ],
+)
+def test_a_column_that_cannot_be_written_is_refused_by_name(tmp_path: Path, name: str, value: str, said: str) -> None:
+    """In one line: a row that it would spoil is not there."""
+    (tmp_path / "bad.py").write_text(COLUMN.format(name, value))
+    line = refusal_of("run", PROJECT / "demos" / "cube.toml", "--with", "bad.py", "-q", "-o", "run", cwd=tmp_path)
+    assert said in line
+    assert not (tmp_path / "run" / "history.csv").exists() or not len(read_history(tmp_path / "run")["time"])
+
+
 def test_two_of_one_name_are_refused_and_one_is_run_once(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()

@@ -133,6 +133,20 @@ sys.exit(cli.main({[*CUBE, "-o", str(tmp_path / "out")]!r}))
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_rank_does_not_wait_for_a_second_signal(tmp_path: Path) -> None:
+    """mpirun gives its ranks a quarter of a second between SIGTERM and SIGKILL: all of it is for the checkpoint."""
+    program = """
+import os, signal, time
+from remodel_fenicsx.system.interrupts import StopRequest
+time.sleep = None
+with StopRequest() as stop:
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert stop.number == signal.SIGTERM
+"""
+    done = forked("python", program, variables={**os.environ, "OMPI_COMM_WORLD_SIZE": "2"})
+    assert done.returncode == 0, done.stderr
+
+
 # ---------------------------------------------------------------- while it compiles
 
 
@@ -144,6 +158,16 @@ def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:
         assert done.returncode == 2
         said.append(done.stderr + done.stdout)
     assert "unrecognized arguments: --bad" in said[0] and said[1] == ""
+
+
+def test_processes_of_srun_that_share_no_mpi_are_refused(tmp_path: Path) -> None:
+    """SLURM_NTASKS alone stands in every batch script."""
+    variables = {**os.environ, "SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2"}
+    words = [*CUBE, "--set", "time.end=1", "-q", "-o", tmp_path / "out"]
+    done = forked("remodel-fenicsx", *words, variables=variables)
+    assert done.returncode == 5 and "know nothing of each other: use mpirun -n 2" in done.stderr
+    assert not (tmp_path / "out").exists()
+    assert forked("remodel-fenicsx", *words, variables=variables | {"SLURM_STEP_NUM_TASKS": "1"}).returncode == 0
 
 
 def test_a_pause_for_the_whole_group_spares_the_compiler() -> None:

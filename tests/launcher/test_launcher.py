@@ -230,8 +230,9 @@ def test_session_folder_is_private(ready):
 
 
 def test_ranks_must_start_inside(ready):
-    ranks = {"OMPI_COMM_WORLD_SIZE": "2"}
-    one_line(ready.run("true", environment=ranks), "must start inside: ./with-fenicsx mpirun -n 2 true\n")
+    for name in ("OMPI_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS"):
+        one_line(ready.run("true", environment={name: "2"}), "must start inside: ./with-fenicsx mpirun -n 2 true\n")
+    assert ready.run("true", environment={"SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "1"}).returncode == 0
 
 
 # ---------------------------------------------------------------- making the root
