@@ -312,12 +312,13 @@ class Analysis(Answer):
 
     def lines(self) -> list[str]:
         """A row for each time."""
-        return aligned({name: v for name, v in self.columns.items() if name != "growing_factor"}, 8, 3)
+        return aligned(self.columns, 8, 5)
 
     def verdict(self) -> str:
         """Whether passes with the scene's coupling make small changes smaller; and what the analysis does not see."""
         unseen = unseen_by(self.scene)
-        return verdict(self.columns) + (f" But {unseen}." if unseen else "")
+        step = np.inf if self.scene.time.is_equilibrium else self.scene.time.step
+        return verdict(self.columns, step, self.share) + (f" But {unseen}." if unseen else "")
 
     def figure(self) -> Figure:
         """Factors over time."""
@@ -337,8 +338,8 @@ class Analysis(Answer):
         return figure
 
 
-def verdict(table: Table) -> str:
-    """The answer in a sentence: whether passes with the scene's coupling make small changes smaller."""
+def verdict(table: Table, step: float = np.inf, share: float = 1.0) -> str:
+    """The answer in a sentence, for the share of passes that is made; step: time of one, inf where passes have none."""
     times, factors, growing = (np.array(table[name]) for name in ("time", "factor_of_coupling", "growing_factor"))
     unknown = ~np.isfinite(table["factor"])
     swings, grows = factors < -1, growing > GROWS
@@ -351,9 +352,12 @@ def verdict(table: Table) -> str:
         )
     if grows.any():
         worst = int(np.nanargmax(growing))
+        factor = 1 + share * (growing[worst] - 1)
+        per_time = f", {factor ** (1 / step):.5g} per unit of time" if np.isfinite(step) else ""
         return (
             f"Unstable: at {grows.sum()} of {len(times)} times a small change of the cells grows from pass to pass "
-            f"without swinging, first at {times[grows][0]:g}; by {growing[worst]:.3g} at time {times[worst]:g}."
+            f"without swinging, first at {times[grows][0]:g}; the worst by a factor of {factor:.5g} a "
+            f"pass{per_time}, at time {times[worst]:g}."
         )
     if unknown.any():
         return f"Not known: at {unknown.sum()} of {len(times)} times no mode was found (run.log); stable at all others."

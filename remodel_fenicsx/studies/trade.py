@@ -234,9 +234,14 @@ def typical(values: Array) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
+def _shown(number: float) -> float:
+    """Two digits: what is as good there is no better, as estimates and timings are not known to more."""
+    return float(f"{number:.2g}")
+
+
 def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
-    """Which of some settings no other one beats in cost and error."""
-    pairs = list(zip(costs, errors, strict=True))
+    """Which of some settings no other one beats in cost and error, as they are shown."""
+    pairs = [(_shown(cost), _shown(error)) for cost, error in zip(costs, errors, strict=True)]
     return [
         np.isfinite(error) and not any((c <= cost and e < error) or (c < cost and e <= error) for c, e in pairs)
         for cost, error in pairs
@@ -444,6 +449,8 @@ class _TradeStudy(Study):
         self.deadline = clock.monotonic() + budget
         self._setting_of = {name: setting for name, (setting, _) in of_run.items()}
         self._results: dict[str, Result] = {}
+        self._begun: dict[str, float] = {}
+        self._start = 0.0  # seconds before the first step: mesh, kernels, the search for an unloaded body
         self._pace: dict[tuple[str, str], float] = {}  # seconds over those expected, by kinematics and coupling
 
     @property
@@ -461,7 +468,9 @@ class _TradeStudy(Study):
         """The table of what was run."""
         if len(self.results) < FEWEST_RUNS:
             reached = f"{len(self.results)} of {len(self.settings)} settings reached the end"
-            advice = "a larger budget goes on" if self.left else "the same command tries again what has failed"
+            advice = (
+                f"a larger budget goes on{self._needed()}" if self.left else "the same command tries again what failed"
+            )
             raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, advice)
         rows, notes = estimated(self.results)
         if self.left:
@@ -470,8 +479,23 @@ class _TradeStudy(Study):
 
     def fits(self, run: Run) -> bool:
         """Whether a run that begins now would end in time, by what others have taken."""
-        setting = self._setting_of[run.name]
-        return clock.monotonic() + self._pace.get(setting.way, 1.0) * setting.expected_seconds < self.deadline
+        self._begun[run.name] = clock.monotonic()
+        return self._begun[run.name] + self._seconds(self._setting_of[run.name]) < self.deadline
+
+    def _seconds(self, setting: Setting) -> float:
+        """Of a run, by what others of its kind have taken, or else by the slowest."""
+        pace = self._pace.get(setting.way, max(self._pace.values(), default=1.0))
+        return self._start + pace * setting.expected_seconds
+
+    def _needed(self) -> str:
+        """What the settings that are left take, once one has ended; nothing where the budget has it."""
+        seconds = sum(self._seconds(setting) * len(setting.seeds) for setting in self.left) / self.jobs
+        if not self._pace or seconds < self.deadline - clock.monotonic():
+            return ""
+        return f"; all settings take about {_shown(seconds / 60):g} min more (--budget)"
+
+    def _progress(self) -> str:
+        return super()._progress() + self._needed()
 
     def learn(self) -> None:
         """Read what is new, and how long it took."""
@@ -481,6 +505,8 @@ class _TradeStudy(Study):
                 if all(run.is_complete() for run in runs):
                     result = self._results[setting.name] = read(setting, runs, self.times)
                     self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
+                    took = [clock.monotonic() - self._begun[run.name] for run in runs if run.name in self._begun]
+                    self._start = max(min(took, default=0.0) - result.wall_seconds, 0.0)
 
 
 def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Result:
@@ -540,7 +566,7 @@ class Trade(Answer):
         """A row for each setting."""
         lines = [f"{'':2}{'seconds':>9} {'degrees':>9} {compared_lengths(self.scene)[0] + ' %':>9}  setting"]
         for row in self.rows:
-            numbers = f"{row.result.seconds:9.3g} {row.angle_error:9.2g} {100 * row.length_error:9.2g}"
+            numbers = f"{row.result.seconds:9.2g} {row.angle_error:9.2g} {100 * row.length_error:9.2g}"
             doubt = f"  ({row.doubt})" if row.doubt else ""
             lines.append(f"{'* ' if row.on_front else '  '}{numbers}  {row.result.setting.name}{doubt}")
         about = "*: no other setting is as good for less. Errors are estimates; degrees: fibre angle, root mean square."

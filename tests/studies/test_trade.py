@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -125,6 +127,8 @@ def test_random_cells_are_compared_in_the_mean() -> None:
 def test_the_front() -> None:
     assert trade.pareto([1.0, 2.0, 3.0, 3.0], [4.0, 2.0, 3.0, 1.0]) == [True, True, False, True]
     assert trade.pareto([1.0, 2.0], [np.nan, 1.0]) == [False, True]
+    # as they are shown: the second one is dearer by more than timings are known to, and no better
+    assert trade.pareto([10.01, 12.0, 9.99], [0.502, 0.498, 0.504]) == [True, False, True]
 
 
 # ---------------------------------------------------------------- the ladder
@@ -251,6 +255,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
     assert said.endswith("is kept, a larger budget goes on\n")
     assert said.count("\n") == 1
+    for kept in (names[0] + "-1", names[0] + "-1.toml"):  # one run says what all take
+        (shutil.copytree if (out / kept).is_dir() else shutil.copy)(out / kept, tmp_path / "one" / kept)
+    assert cli.main(["trade", str(path), "-o", str(tmp_path / "one"), "--budget", "0.001s", "-q"]) == 4
+    said = capsys.readouterr().err
+    assert "1 of 4 settings" in said and re.search(r"all settings take about [\d.e-]+ min more \(--budget\)\n$", said)
 
 
 def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:

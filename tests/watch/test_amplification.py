@@ -133,3 +133,9 @@ def table(factors: list[float], growing: float = 0.5, share: float = 1.0) -> dic
 ])  # fmt: skip
 def test_the_verdict(found: dict[str, list[float]], words: str) -> None:
     assert verdict(found).startswith(words)
+
+
+def test_a_growth_that_is_slow_is_said_per_pass_and_time() -> None:
+    """2.4e-3 of a whole pass each half a unit of time, of which the coupling makes a half."""
+    said = verdict(table([-0.5, 0.2], growing=1.0024), 0.5, 0.5)
+    assert said.endswith("first at 1; the worst by a factor of 1.0012 a pass, 1.0024 per unit of time, at time 1.")
