@@ -16,7 +16,7 @@ from functools import cached_property
 from html import escape
 from itertools import chain, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -275,6 +275,14 @@ MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
 LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
 
 
+class UnknownColumn(NamedTuple):
+    """A column of a history that its scene does not have, under whatever name."""
+
+    name: str
+    unit: str = ""
+    meaning: str = ""
+
+
 @dataclass(frozen=True)
 class ReportedRun:
     """All that a part may ask of a run."""
@@ -312,7 +320,7 @@ class ReportedRun:
         return state, f"{at}: {reason}" if reason else f"{at}, without a word: it was killed"
 
     @cached_property
-    def columns(self) -> list[Column]:
+    def columns(self) -> list[Column | UnknownColumn]:
         """Of the history, those of the shape first; none without a number."""
         scene, history = self.recording.scene, self.recording.history
         known = {column.name: column for column in scene.columns()}
@@ -324,9 +332,9 @@ class ReportedRun:
         if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
             names.remove("substeps")
         names.sort(key=lambda name: name not in own)
-        return [known.get(name) or Column(name, "", "", lambda m: np.nan) for name in names]
+        return [known.get(name) or UnknownColumn(name) for name in names]
 
-    def unit(self, column: Column) -> str:
+    def unit(self, column: Column | UnknownColumn) -> str:
         """The column's unit where the scene says what it is, else nothing."""
         return unit_of(self.recording.scene, column.unit)
 
@@ -470,7 +478,7 @@ def curves(run: ReportedRun) -> Card | None:
     if len(history["time"]) < 2 or not run.columns:
         return None
     rows = np.unique(np.linspace(0, len(history["time"]) - 1, MOST_ROWS).round().astype(int))
-    groups: list[list[Column]] = []
+    groups: list[list[Any]] = []
     for column in run.columns:
         alike = next((group for group in groups if _together(group[0], column)), None)
         groups.append([column]) if alike is None else alike.append(column)
@@ -488,7 +496,7 @@ def curves(run: ReportedRun) -> Card | None:
     return Card("curves", f'<div class="curves whole">{"".join(cards)}</div>', {"times": times, "curves": data})
 
 
-def _together(first: Column, second: Column) -> bool:
+def _together(first: Any, second: Any) -> bool:
     """Whether two columns are drawn in one frame: of one unit, their names begin alike, or are two words and end so."""
     a, b = first.name.split("_"), second.name.split("_")
     ends_alike = len(a) == len(b) == 2 and a[1] == b[1] and len(a[1]) > 1  # no letter of an axis

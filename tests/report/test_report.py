@@ -69,8 +69,8 @@ class Decoded:
 # ---------------------------------------------------------------- the data
 @pytest.mark.parametrize("kinematics", ["radial", "sector"])
 def test_stresses_through_the_wall_are_those_of_the_columns(kinematics: str, tmp_path: Path) -> None:
-    """The innermost and the outermost layer, at each time; their mean over the wall as it is now is Laplace's."""
-    names = [f"{name}_stress_{where}" for name in ("hoop", "axial", "radial") for where in ("inner", "outer")]
+    """Two layers mid-wall, at each time; the mean over the wall as it is now is Laplace's."""
+    names = [f"{name}_stress_middle" for name in ("hoop", "axial", "radial")]
     changes = {
         "cells.initial": "isotropic", "model.kinematics": kinematics, "time.end": 3.0, "loads.pressure.value": 2.0,
         "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "output.columns": [*names, "inner_radius", "outer_radius"],
@@ -82,9 +82,9 @@ def test_stresses_through_the_wall_are_those_of_the_columns(kinematics: str, tmp
     layers = np.array(found["layers"])
     assert layers.shape == (4, 8, 3) and found["through"] == "through the wall (0 inside, 1 outside)"
     for component, name in enumerate(("hoop", "axial", "radial")):
-        for layer, where in ((0, "inner"), (-1, "outer")):
-            column = history[f"{name}_stress_{where}"]
-            np.testing.assert_allclose(layers[:, layer, component], column, rtol=0.02, atol=0.001 * layers.max())
+        middle = np.average(layers[:, 3:5, component], axis=1, weights=[1.875, 2.125])  # by their radii
+        column = history[f"{name}_stress_middle"]
+        np.testing.assert_allclose(middle, column, rtol=0.02, atol=0.001 * layers.max())
     inner, outer = (history[f"{face}_radius"][-1] for face in ("inner", "outer"))
     assert found["level"][-1] == pytest.approx(2.0 * inner / (outer - inner), rel=1e-6)
 
