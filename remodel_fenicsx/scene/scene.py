@@ -63,6 +63,7 @@ from remodel_fenicsx.schema.tables import (
     VariantOf,
     allowed,
     fault,
+    is_number,
     named,
     quoted,
     shown,
@@ -156,6 +157,8 @@ FORMAT = 2  # of recorded scenes: raised where a reader of the one before would 
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
 COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
+LARGEST_NUMBER = 1e60  # products of four are no overflow
+MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
 SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
 FORGOTTEN_AFTER = (
     1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
@@ -239,6 +242,9 @@ class Scene(Table):
         if not isinstance(values, dict):
             return handler(values)
         own = _with_measured_cells(_in_present_format(_plain(values)))
+        for name in ("regions", "loads", "cases", "supports"):
+            if isinstance(found := own.get(name), dict | list | tuple) and len(found) > MOST_TABLES:
+                raise fault(f"has {len(found)} tables; at most {MOST_TABLES} are allowed", name, None)
         presets.check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
@@ -256,7 +262,9 @@ class Scene(Table):
 
         def made(settings: Mapping[str, Any]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
-            return handler(presets.with_own_numbers(_in_own_units(values, SHAPES[shape])))
+            values = _in_own_units(values, SHAPES[shape])
+            _check_sizes(values, "")
+            return handler(presets.with_own_numbers(values))
 
         if profile is None:
             return made({})
@@ -627,6 +635,14 @@ def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def _words(region: str) -> str:
     return f"{region}: " if region else ""
+
+
+def _check_sizes(value: Any, key: str) -> None:
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            _check_sizes(inner, f"{key}.{name}" if key else str(name))
+    elif is_number(value) and abs(value) > LARGEST_NUMBER:
+        raise fault(f"too large a number; must be at most {LARGEST_NUMBER:g}", key, value)
 
 
 def _check_name(key: str, name: Any, names: Iterable[str]) -> None:
