@@ -7,6 +7,7 @@ keys.
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import os
 import re
@@ -70,6 +71,9 @@ from remodel_fenicsx.schema.tables import (
 )
 from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
+from remodel_fenicsx.system.interrupts import is_first_rank
+
+log = logging.getLogger(__name__)
 
 
 # ---------------------------------------------------------------- what a scene may say but hardly means
@@ -259,6 +263,7 @@ class Scene(Table):
                 known = ", ".join(map(repr, presets.PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
             base = merged(base, presets.PRESETS[preset][shape])
+        presets.without_coupling(base, own)
 
         def made(settings: Mapping[str, Any]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
@@ -561,7 +566,7 @@ class Scene(Table):
             if not isinstance(key, str):
                 raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
             put(values, key, value)
-        presets.without_replaced(values, changes)
+        _follow(values, changes, is_whole=True)
         return type(self)(**values)
 
     def to_toml(self, header: str = "") -> str:
@@ -635,6 +640,18 @@ def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def _words(region: str) -> str:
     return f"{region}: " if region else ""
+
+
+def _follow(values: dict[str, Any], changed: Mapping[str, Any], is_whole: bool) -> None:
+    """Take out what no longer fits to changed values; of a scene that has all values, a choice may be the run's own."""
+    tables = (values.get("output"), "times"), (values.get("time"), "end")
+    times, end = (table.get(key) if isinstance(table, dict) else None for table, key in tables)
+    if "time.end" in changed and "output.times" not in changed and is_number(end) and isinstance(times, list | tuple):
+        values["output"]["times"] = [time for time in times if not is_number(time) or time <= end]
+        if (dropped := len(times) - len(values["output"]["times"])) and is_first_rank():
+            log.warning("output.times: %d after time.end = %g dropped", dropped, end)
+    if is_whole:
+        presets.without_replaced(values, changed)
 
 
 def _check_sizes(value: Any, key: str) -> None:
@@ -802,6 +819,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
         values = merged(read, presets.nested(settings))
         for key, value in changes:
             put(values, key, value)
+        _follow(values, dict(changes), is_whole="format" in values)
         return scene_from_dict(_beside(values, Path(path).parent))
 
     if profile is None:
