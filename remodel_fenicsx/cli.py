@@ -182,6 +182,9 @@ def _done(arguments: list[str]) -> int:
 
 def _parsed(arguments: list[str]) -> argparse.Namespace:
     """The options, after the extensions; of several ranks only the first says what is wrong with them."""
+    for word in arguments:
+        if re.search("[\ud800-\udfff]", word):  # records and other programs could not name it
+            raise RemodelError(f"{ascii(word)}: must be UTF-8")
     first = _Parser(prog="remodel-fenicsx", add_help=False, allow_abbrev=False)
     _add(first, WITH)
     with contextlib.ExitStack() as stack:

@@ -26,7 +26,7 @@ from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.export import write_vtu
 from remodel_fenicsx.results.fields import Fields, field_names, local_fields
-from remodel_fenicsx.results.recording import LOG, RecordingError, SCENE, scene_as_run, versions_as_run
+from remodel_fenicsx.results.recording import LOCK, LOG, RecordingError, RunLock, SCENE, scene_as_run, versions_as_run
 from remodel_fenicsx.results.run_folder import (
     LastStep,
     RunFolder,
@@ -367,19 +367,22 @@ class _Report(Watcher):
 
 def write_unloaded(scene: Scene, folder: Path) -> str:
     """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found."""
-    if folder.exists():
-        raise TakenError(folder, "folder")
-    with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
-        found = unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False)
-        kept, files = with_files_kept(found)
-        part = part_of(folder)
-        shutil.rmtree(part, ignore_errors=True)  # of one that was killed
-        part.mkdir(parents=True)
-        for name, data in files.items():
-            (part / name).write_bytes(data)
-        (part / "scene.toml").write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
-        part.rename(folder)
-        return "unloaded: " + _in_words(scene, found)
+    part = part_of(folder)
+    with RunLock(part):
+        try:
+            if folder.exists():
+                raise TakenError(folder, "folder")
+            with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
+                found = unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False)
+                kept, files = with_files_kept(found)
+                for name, data in files.items():
+                    (part / name).write_bytes(data)
+                (part / SCENE).write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
+                (part / LOCK).unlink()
+                part.rename(folder)
+                return "unloaded: " + _in_words(scene, found)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
 
 
 def _in_words(scene: Scene, found: Scene) -> str:

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS, Chain
-from remodel_fenicsx.model.laws import COMPLEX_STEP
-from remodel_fenicsx.schema.settings import Cells, Material, Remodeling, STRESS_UNITS, in_region
+from remodel_fenicsx.model.laws import COMPLEX_STEP, LAWS
+from remodel_fenicsx.schema.settings import COUPLINGS, Cells, Material, Remodeling, STRESS_UNITS, in_region
 from remodel_fenicsx.schema.tables import fault, is_number, quoted
 from remodel_fenicsx.schema.text import merged, put
 
@@ -308,8 +308,17 @@ def with_own_numbers(values: Values) -> dict[str, Any]:
     return found
 
 
-def without_replaced(values: Values, changed: Collection[str]) -> None:
-    """Take out of the values what changed numbers of experiments replace."""
+def without_coupling(base: dict[str, Any], over: Mapping[str, Any]) -> None:
+    """Take out of the values a coupling that extrapolates where what lies over them has a law without a target."""
+    law, coupling = str(_of(over, "remodeling", "law")), str(_of(base, "remodeling", "coupling"))
+    if law in LAWS and LAWS[law].target is None and coupling in COUPLINGS and COUPLINGS[coupling].needs_a_target:
+        base["remodeling"] = {key: value for key, value in base["remodeling"].items() if key != "coupling"}
+
+
+def without_replaced(values: dict[str, Any], changed: Collection[str]) -> None:
+    """Take out of the values what changed numbers of experiments replace, and a coupling made for another law."""
+    if "remodeling.law" in changed and "remodeling.coupling" not in changed:
+        without_coupling(values, values)
     for name, part in parts_of(values):
         for table, key, replaces, *_ in EXPERIMENTS:
             place = f"{place_of(name)}{table}"

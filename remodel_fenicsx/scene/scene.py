@@ -7,6 +7,7 @@ keys.
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import os
 import re
@@ -63,12 +64,16 @@ from remodel_fenicsx.schema.tables import (
     VariantOf,
     allowed,
     fault,
+    is_number,
     named,
     quoted,
     shown,
 )
 from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, toml_text
 from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
+from remodel_fenicsx.system.interrupts import is_first_rank
+
+log = logging.getLogger(__name__)
 
 
 # ---------------------------------------------------------------- what a scene may say but hardly means
@@ -156,6 +161,8 @@ FORMAT = 2  # of recorded scenes: raised where a reader of the one before would 
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
 COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
+LARGEST_NUMBER = 1e60  # products of four are no overflow
+MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
 SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
 FORGOTTEN_AFTER = (
     1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
@@ -239,6 +246,9 @@ class Scene(Table):
         if not isinstance(values, dict):
             return handler(values)
         own = _with_measured_cells(_in_present_format(_plain(values)))
+        for name in ("regions", "loads", "cases", "supports"):
+            if isinstance(found := own.get(name), dict | list | tuple) and len(found) > MOST_TABLES:
+                raise fault(f"has {len(found)} tables; at most {MOST_TABLES} are allowed", name, None)
         presets.check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
@@ -253,10 +263,13 @@ class Scene(Table):
                 known = ", ".join(map(repr, presets.PRESETS[preset]))
                 raise fault(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
             base = merged(base, presets.PRESETS[preset][shape])
+        presets.without_coupling(base, own)
 
         def made(settings: Mapping[str, Any]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
-            return handler(presets.with_own_numbers(_in_own_units(values, SHAPES[shape])))
+            values = _in_own_units(values, SHAPES[shape])
+            _check_sizes(values, "")
+            return handler(presets.with_own_numbers(values))
 
         if profile is None:
             return made({})
@@ -553,7 +566,7 @@ class Scene(Table):
             if not isinstance(key, str):
                 raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
             put(values, key, value)
-        presets.without_replaced(values, changes)
+        _follow(values, changes, is_whole=True)
         return type(self)(**values)
 
     def to_toml(self, header: str = "") -> str:
@@ -627,6 +640,26 @@ def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def _words(region: str) -> str:
     return f"{region}: " if region else ""
+
+
+def _follow(values: dict[str, Any], changed: Mapping[str, Any], is_whole: bool) -> None:
+    """Take out what no longer fits to changed values; of a scene that has all values, a choice may be the run's own."""
+    tables = (values.get("output"), "times"), (values.get("time"), "end")
+    times, end = (table.get(key) if isinstance(table, dict) else None for table, key in tables)
+    if "time.end" in changed and "output.times" not in changed and is_number(end) and isinstance(times, list | tuple):
+        values["output"]["times"] = [time for time in times if not is_number(time) or time <= end]
+        if (dropped := len(times) - len(values["output"]["times"])) and is_first_rank():
+            log.warning("output.times: %d after time.end = %g dropped", dropped, end)
+    if is_whole:
+        presets.without_replaced(values, changed)
+
+
+def _check_sizes(value: Any, key: str) -> None:
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            _check_sizes(inner, f"{key}.{name}" if key else str(name))
+    elif is_number(value) and abs(value) > LARGEST_NUMBER:
+        raise fault(f"too large a number; must be at most {LARGEST_NUMBER:g}", key, value)
 
 
 def _check_name(key: str, name: Any, names: Iterable[str]) -> None:
@@ -786,6 +819,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
         values = merged(read, presets.nested(settings))
         for key, value in changes:
             put(values, key, value)
+        _follow(values, dict(changes), is_whole="format" in values)
         return scene_from_dict(_beside(values, Path(path).parent))
 
     if profile is None:

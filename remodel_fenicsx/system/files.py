@@ -135,6 +135,8 @@ def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
     """Descriptor of a regular file, and what the system knows of it."""
     try:
         descriptor = os.open(path, flags | NEVER_WAITING, 0o666)
+    except ValueError as error:  # a NUL, or what is no UTF-8
+        raise ForeignFileError(errno.EINVAL, f"has no name of a file: {error}", ascii(str(path))) from None
     except OSError as error:
         if error.errno in FOREIGN and (error.errno != errno.EEXIST or path.is_symlink()):
             raise ForeignFileError(error.errno, FOREIGN[error.errno], str(path)) from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, read_scene, run, unloaded
 from remodel_fenicsx.body.mesh_file import read_mesh
+from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.unloading import NoUnloadedShape
 from tests.conftest import Cases, Refused
 from tests.body.test_natural import scene
@@ -108,6 +110,9 @@ def test_every_node_of_an_own_body_comes_back(
     given = read_mesh(tmp_path / "loaded.msh").points
     np.testing.assert_allclose(nodes_of(found), given, rtol=0, atol=1e-9)
     refused("unload", of, "-o", tmp_path / "found")
+    with RunLock(tmp_path / "other.part"):  # as another process does
+        assert f"process {os.getpid()} on" in refused("unload", of, "-o", tmp_path / "other")
+    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == ["scene.toml", "unloaded.msh"]
     assert cli.main(["run", str(of), "-o", str(tmp_path / "run"), "-q"]) == 0
     same = [read_mesh(tmp_path / name / "unloaded.msh").points for name in ("found", "run")]
     np.testing.assert_allclose(*same, rtol=0, atol=1e-11)

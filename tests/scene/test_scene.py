@@ -438,3 +438,26 @@ def test_a_law_that_shares_of_passes_make_slower_is_said() -> None:
     assert "remodel at about 0.5 times the speed" in line and "'rate'" in line
     for quiet in (relaxed | {"law": "explicit"}, relaxed | {"law": "none"}, {"law": "rate"}):
         assert scene_from_dict(CUBE | {"remodeling": quiet}).warnings() == []
+
+
+@pytest.mark.parametrize("preset", ['preset = "consistent"\n', ""])
+def test_the_coupling_of_the_default_law_goes_with_it(tmp_path: Path, preset: str) -> None:
+    """In a scene as it was run, with its preset or without, and in the preset itself; not where it was asked for."""
+    path = tmp_path / "cube.toml"
+    as_run = preset_scene("consistent", "cube").to_toml()
+    path.write_text(as_run.replace('preset = "consistent"\n', preset))
+    for scene in (read_scene(path, ["remodeling.law=none"]), read_scene(path).with_values({"remodeling.law": "none"})):
+        assert scene.remodeling.coupling == "staggered"
+    path.write_text('preset = "consistent"\ngeometry.shape = "cube"\nremodeling.law = "none"\n')
+    assert read_scene(path).remodeling.coupling == "staggered"
+    with pytest.raises(SceneError, match="remodeling.coupling = 'extrapolated'"):
+        read_scene(path, ["remodeling.coupling=extrapolated"])
+
+
+def test_times_after_an_earlier_end_are_dropped_with_a_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "cube.toml"
+    path.write_text('preset = "consistent"\ngeometry.shape = "cube"\noutput.times = [2.0, 5.0, 6.0]\n')
+    assert read_scene(path, ["time.end=3"]).output.times == (2.0,)
+    assert caplog.messages == ["output.times: 2 after time.end = 3 dropped"]
+    with pytest.raises(SceneError, match="must be at most time.end"):
+        read_scene(path, ["time.end=3", "output.times=[5]"])
