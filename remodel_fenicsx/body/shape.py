@@ -580,6 +580,10 @@ class Shape(_Is):  # type: ignore[misc]
         """Ratios of lengths, which tell numbers in different units: key, words, ratio, decades where bodies have it."""
         return ()
 
+    def log_of_radii(self, wall: Any) -> float | None:
+        """ln(r_o/r_i) of a wall, of one on a mesh from areas `wall.area(face)`; None where it is not known."""
+        return None
+
     def strut(self, ends: str) -> reduced.Strut | None:
         """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""
         return None
