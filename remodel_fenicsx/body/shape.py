@@ -184,7 +184,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "stored_energy",
             "stress length^3",
-            "strain energy of the body, the integral of W",
+            "integral of W, where 0 is a matrix at rest without chains; those of the unloaded start have eq. (1) at r0",
             lambda m: m.equilibrium.stored_energy(),
         ),
         Column(
