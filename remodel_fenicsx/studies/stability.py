@@ -312,12 +312,12 @@ class Analysis(Answer):
 
     def lines(self) -> list[str]:
         """A row for each time."""
-        return aligned({name: v for name, v in self.columns.items() if name != "growing_factor"}, 8, 3)
+        return aligned(self.columns, 8, 5)
 
     def verdict(self) -> str:
         """Whether passes with the scene's coupling make small changes smaller; and what the analysis does not see."""
         unseen = unseen_by(self.scene)
-        return verdict(self.columns) + (f" But {unseen}." if unseen else "")
+        return verdict(self.columns, self.scene.time.step) + (f" But {unseen}." if unseen else "")
 
     def figure(self) -> Figure:
         """Factors over time."""
@@ -337,7 +337,7 @@ class Analysis(Answer):
         return figure
 
 
-def verdict(table: Table) -> str:
+def verdict(table: Table, step: float) -> str:
     """The answer in a sentence: whether passes with the scene's coupling make small changes smaller."""
     times, factors, growing = (np.array(table[name]) for name in ("time", "factor_of_coupling", "growing_factor"))
     unknown = ~np.isfinite(table["factor"])
@@ -353,7 +353,8 @@ def verdict(table: Table) -> str:
         worst = int(np.nanargmax(growing))
         return (
             f"Unstable: at {grows.sum()} of {len(times)} times a small change of the cells grows from pass to pass "
-            f"without swinging, first at {times[grows][0]:g}; by {growing[worst]:.3g} at time {times[worst]:g}."
+            f"without swinging, first at {times[grows][0]:g}; at time {times[worst]:g} by a factor of "
+            f"{growing[worst]:.6g} a pass, {growing[worst] ** (1 / step):.6g} a unit of time."
         )
     if unknown.any():
         return f"Not known: at {unknown.sum()} of {len(times)} times no mode was found (run.log); stable at all others."

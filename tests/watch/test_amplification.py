@@ -106,6 +106,7 @@ def test_the_command_writes_table_and_picture(
     assert {"history.csv", "scene.toml", "run.log"} <= {path.name for path in folder.iterdir()}
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].split()[:3] == ["time", "factor", "factor_of_coupling"] and len(printed) == 5
+    assert float(printed[2].split()[-1]) == pytest.approx(table["growing_factor"][1], rel=1e-4)  # the verdict's too
     assert printed[3].startswith("Unstable: passes over-correct at 1 of 2 times, first at 14; ")
     refused("stability", *arguments)  # the folder is taken
     nothing = ("--set", "remodeling.law=none", "-o", tmp_path / "none")
@@ -129,7 +130,9 @@ def table(factors: list[float], growing: float = 0.5, share: float = 1.0) -> dic
      "small change by -3 at time 3. The coupling 'relaxed' with a relaxation_factor below 0.5 does not."),
     (table([-0.5, -1.5, -2.9], share=0.5), "Stable: at all 3 times"),
     (table([-0.5, 0.2], growing=1.2), "Unstable: at 2 of 2 times a small change of the cells grows from pass to pass"),
+    (table([0.5, 0.5], growing=1.0023), "Unstable: at 2 of 2 times a small change of the cells grows from pass to pass "
+     "without swinging, first at 1; at time 1 by a factor of 1.0023 a pass, 1.00115 a unit of time."),
     (table([-0.5, np.nan]), "Not known: at 1 of 2 times no mode was found"),
 ])  # fmt: skip
 def test_the_verdict(found: dict[str, list[float]], words: str) -> None:
-    assert verdict(found).startswith(words)
+    assert verdict(found, 2.0).startswith(words)
