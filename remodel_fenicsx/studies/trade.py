@@ -26,6 +26,7 @@ from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import COLOURS, Answer
 from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, Study, TooFewRuns
 from remodel_fenicsx.system.files import make_own_folder, write_whole
+from remodel_fenicsx.system.terminal import duration
 
 log = logging.getLogger(__name__)
 
@@ -235,8 +236,8 @@ def typical(values: Array) -> float:
 
 
 def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
-    """Which of some settings no other one beats in cost and error."""
-    pairs = list(zip(costs, errors, strict=True))
+    """Which of some settings no other one beats in cost and error, as a table shows them."""
+    pairs = [(float(f"{cost:.3g}"), float(f"{error:.2g}")) for cost, error in zip(costs, errors, strict=True)]
     return [
         np.isfinite(error) and not any((c <= cost and e < error) or (c < cost and e <= error) for c, e in pairs)
         for cost, error in pairs
@@ -461,17 +462,36 @@ class _TradeStudy(Study):
         """The table of what was run."""
         if len(self.results) < FEWEST_RUNS:
             reached = f"{len(self.results)} of {len(self.settings)} settings reached the end"
-            advice = "a larger budget goes on" if self.left else "the same command tries again what has failed"
+            advice = (
+                f"a larger --budget goes on: about {self._needed()} more"
+                if self.left
+                else "the same command tries again what has failed"
+            )
             raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, advice)
         rows, notes = estimated(self.results)
         if self.left:
-            notes = [*notes, f"left out, over the budget: {', '.join(setting.name for setting in self.left)}"]
+            notes = [
+                *notes,
+                f"left out, over the budget by about {self._needed()}: {', '.join(one.name for one in self.left)}",
+            ]
         return Trade(self.scene, rows, notes, self.failed)
 
     def fits(self, run: Run) -> bool:
         """Whether a run that begins now would end in time, by what others have taken."""
         setting = self._setting_of[run.name]
-        return clock.monotonic() + self._pace.get(setting.way, 1.0) * setting.expected_seconds < self.deadline
+        return clock.monotonic() + self._seconds(setting) < self.deadline
+
+    def _seconds(self, setting: Setting) -> float:
+        """Of one of its runs, as those before have taken, or the slowest way where its own is not known."""
+        slowest = max(self._pace.values(), default=1.0)
+        return self._pace.get(setting.way, slowest) * setting.expected_seconds
+
+    def _needed(self) -> str:
+        """How long what is left takes."""
+        return duration(sum(len(one.seeds) * self._seconds(one) for one in self.left) / self.jobs)
+
+    def _progress(self) -> str:
+        return f"{super()._progress()}; all others take about {self._needed()}, the budget is {duration(self.budget)}"
 
     def learn(self) -> None:
         """Read what is new, and how long it took."""
