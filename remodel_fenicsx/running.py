@@ -270,7 +270,7 @@ def _record(
         unknowns = simulation.unknown.x.petsc_vec.getSize()
         if comm.size > 1 and unknowns < WORTH_RANKS:
             log.info("%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)", unknowns, comm.size)
-        for warning in simulation.scene.warnings():  # the one whose files have places
+        for warning in simulation.scene.warnings(simulation.domain):  # the one whose files have places
             log.warning("%s", warning)
         followers, kept = list(watchers), [record.flush]
         if scene.output.fields:
@@ -283,6 +283,7 @@ def _record(
         pause = Pause(comm, place, lambda: stop.pause, deadline)
         followers += [record, _Report(scene, progress), checkpoints, pause]
         leave_report = partial(_leave_report, place) if wants_report else lambda: None
+        simulation.state.tell = progress.show
         simulation.state.stop_signal = lambda: stop.number
         try:
             with _options_blamed(scene):

@@ -232,6 +232,7 @@ class State:
         self.others: Sequence[State] = ()
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
+        self.tell: Callable[[str], object] = lambda words: None  # of a step that is solved in parts
         self.settle_cells()
         solved = self.equilibrium_cells
         self._functions: dict[str, Any] = {}

@@ -29,7 +29,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, factorised, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
 from remodel_fenicsx.fem.assembly import agreed
-from remodel_fenicsx.scene import Scene, SceneError
+from remodel_fenicsx.scene.scene import Scene, SceneError, too_soft
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
@@ -95,6 +95,7 @@ def unloaded(
         return scene
     with Line(f"{scene.name} unloaded", silent=quiet or comm.rank != 0) as line:
         if isinstance(scene.geometry, RoundWall):
+            _warn(scene)
             return unloaded_tube(scene, comm, line.show)
         if folder is None:
             raise SceneError("geometry.is = 'loaded': a folder is needed for the unloaded mesh")
@@ -308,9 +309,15 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
     return scene.with_values(changes)
 
 
+def _warn(scene: Scene, wall: Any = None) -> None:
+    for words in too_soft(scene, wall):
+        log.warning("%s", words)
+
+
 def _read(scene: Scene) -> tuple[MeshFile, dict[str, int]]:
     shape: Any = scene.geometry
-    file, _, regions = shape.checked(scene.mesh)
+    file, boundary, regions = shape.checked(scene.mesh)
+    _warn(scene, boundary)
     return file, regions
 
 

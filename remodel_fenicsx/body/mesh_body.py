@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
@@ -35,7 +36,7 @@ from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
-from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, STRESS
+from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -52,7 +53,6 @@ ON_FACES: dict[str, Callable[[str], LoadKind]] = {
     "displacement": lambda face: LoadKind(_by_hold_faces, f"way of the face {face} along its normal, outwards", LENGTH),
 }
 ROLES = ("inner", "outer", "inlet", "outlet")
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 Names = tuple[str | int, ...]
 _ENTRY: JsonDict = {"type": ["string", "integer"]}
 _GROUPS: JsonDict = {
@@ -474,6 +474,11 @@ class WalledMesh(Walled):
     axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
     constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
     defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
+
+    def log_of_radii(self, wall: Any) -> float | None:
+        """Faces are as their radii; None if the wall does not go around."""
+        ratio = wall.area("outer") / wall.area("inner") if wall is not None else 0.0
+        return math.log(ratio) if ratio > 1.0 else None
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
         """Found on the mesh by a few linear solves. Collective."""

@@ -188,7 +188,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "stored_energy",
             "stress length^3",
-            "strain energy of the body, the integral of W",
+            "integral of W, where 0 is a matrix at rest without chains; those of the unloaded start have eq. (1) at r0",
             lambda m: m.equilibrium.stored_energy(),
         ),
         Column(
@@ -583,6 +583,10 @@ class Shape(_Is):  # type: ignore[misc]
     def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
         """Ratios of lengths, which tell numbers in different units: key, words, ratio, decades where bodies have it."""
         return ()
+
+    def log_of_radii(self, wall: Any) -> float | None:
+        """ln(r_o/r_i) of a wall, of one on a mesh from areas `wall.area(face)`; None where it is not known."""
+        return None
 
     def strut(self, ends: str) -> reduced.Strut | None:
         """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""

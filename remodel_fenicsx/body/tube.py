@@ -472,6 +472,10 @@ class Tube(RoundWall):
             ("length", "length / outer_radius", self.length / outer, (-2, 3)),
         )
 
+    def log_of_radii(self, wall: Any) -> float:
+        """Of the unloaded tube, or of the loaded one where that is given."""
+        return math.log(self.outer_radius / self.inner_radius)
+
     def strut(self, ends: str) -> reduced.Strut:
         """Its ends keep their planes; one of them moves sideways unless they are clamped."""
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # it takes half a second to start, and most scenes have no un
 STRESS_UNIT, LENGTH_UNIT = "material.stress_unit", "geometry.length_unit"
 _LENGTH_UNITS = Literal["m", "cm", "mm", "um"]
 LENGTH_UNITS: tuple[str, ...] = get_args(_LENGTH_UNITS)
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
 # the type of geometry.length_unit, for every shape
 LengthUnit = Annotated[

@@ -148,10 +148,14 @@ class Change:
         """Go from 0 to 1."""
         # A part that ends far from where its tangent points to is halved like one that fails. If it is the smallest,
         # the way ends here: this is said, and the change goes on beyond the jump.
-        done = 0.0
+        done, attempts = 0.0, 0
         if failure is not None:
             part = self._halved(part, done, failure, work)
         while done < 1.0:
+            attempts += 1
+            self.state.tell(
+                f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, attempt {attempts}: {100 * part:.2g} %"
+            )
             before = self.state.unknown.x.array.copy()
             part = self._started(min(part, 1.0 - done), done, work)
             is_last = done + part > 1.0 - 1e-12

@@ -73,6 +73,13 @@ class Progress:
         else:
             self._say(_joined(f"step {count}", at, load_text, newton, left), at_once=index >= self._total)
 
+    def show(self, text: str) -> None:
+        """Show a line; where lines stay, only now and then."""
+        if self._bar is not None:
+            self._bar.update(0, state=text)
+        elif not self._silent:
+            self._say(text, at_once=False)
+
     def _say(self, text: str, at_once: bool) -> None:
         """A line that stays, if it is time for one; the last one is said at the end."""
         self._pending = f"{self._title}: {text}"
@@ -112,13 +119,6 @@ class Line(Progress):
     def __exit__(self, *error: object) -> None:
         self._pending = None
         super().__exit__(*error)
-
-    def show(self, text: str) -> None:
-        """Show a line; where lines stay, only now and then."""
-        if self._bar is not None:
-            self._bar.update(0, state=text)
-        elif not self._silent:
-            self._say(text, at_once=False)
 
 
 def _bar(title: str, total: int | None, done: float) -> Any:

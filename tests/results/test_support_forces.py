@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, SceneError
+from remodel_fenicsx import Scene, SceneError, preset_scene
 from remodel_fenicsx.body.tube import whole_tube
+from remodel_fenicsx.results.recording import unit_of
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import SELF, last_row, rows_of
 from tests.values import ramped
@@ -62,6 +63,16 @@ def test_a_pressure_on_an_end_is_what_its_support_bears(tube: Path) -> None:
     elastic = {"outlet": {"kind": "elastic", "stiffness": 2.0}, "inlet": {"kind": "elastic", "stiffness": 2.0}}
     row = last_row(scene(tube, ENDS, supports=elastic, loads={"push": {**loads["push"], "face": "inlet"}}))
     assert row[ENDS[0]] - row[ENDS[1]] == pytest.approx(0.2 * area, rel=0.05)
+
+
+@pytest.mark.parametrize(("stress", "length", "unit"), [
+    ("kPa", "mm", "mN"), ("MPa", "mm", "N"), ("Pa", "mm", "µN"), ("kPa", "um", "nN"), ("Pa", "m", "N"),
+    ("MPa", "cm", "MPa cm²"), ("kPa", None, ""),
+])  # fmt: skip
+def test_forces_have_a_unit_of_force_where_there_is_one(stress: str, length: str | None, unit: str) -> None:
+    tube = preset_scene("consistent", "tube")
+    values = {"material.stress_unit": stress} | ({"geometry.length_unit": length} if length else {})
+    assert unit_of(tube.with_values(values), "force") == unit
 
 
 def test_what_is_refused(tube: Path) -> None:

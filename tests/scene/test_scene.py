@@ -16,10 +16,11 @@ from remodel_fenicsx.body import SHAPES, Cube, Tube
 from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
-from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict
+from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict, too_soft
 from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Time
 from remodel_fenicsx.schema.tables import SceneError, allowed, locate, shown
 from remodel_fenicsx.schema.text import put
+from tests.runs import rows_of
 from tests.tables import rows, values
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -389,8 +390,30 @@ def test_a_chain_density_of_another_stress_unit_is_warned_of():
     assert len(soft.with_values({"material.chain_density": 2.1e21}).warnings()) == 1
     assert soft.with_values({"material.stress_unit": "MPa"}).warnings()[0].count("is 910000 times (6.0 decades)") == 1
     softer = {"material.lame_mu": "3.103 Pa", "loads.pressure.value": "4.8 Pa"}
-    for remedy in ({"material.chain_density": 2e24}, {"material.chain_density": 0.0}, softer):
+    for remedy in (
+        {"material.chain_density": 2e24},
+        {"material.chain_density": 0.0, "loads.pressure.value": 3.0},
+        softer,
+    ):
         assert soft.with_values(remedy).warnings() == [], remedy
+
+
+def test_a_wall_too_soft_for_its_pressure_is_warned_of():
+    """At the pressure at which the chains of a thin wall come to 90 % of their length; one without them at mu h/r."""
+    changes = {"geometry.outer_radius": 1.02, "model.kinematics": "radial", "loads.elongation.value": 0.0}
+    changes |= {"cells.initial": "isotropic", "remodeling.law": "none", "material.lame_lambda": 3000.0}
+    thin = preset_scene(PAPER, "tube").with_values(
+        {**changes, "time.end": 1.0, "loads.pressure.ramp": [[0, 0], [1, 1]]}
+    )
+    wall = math.log(1.02)
+    (words,) = too_soft(thin.with_values({"loads.pressure.value": 600.0 * wall}))
+    borne = float(re.search("the tissue bears ([0-9.]+) Pa", words)[1])
+    row = rows_of(thin.with_values({"loads.pressure.value": borne * wall}))[-1]
+    assert row["max_chain_extension"] == pytest.approx(0.9, abs=6e-3)  # at the inner face
+    soft = thin.with_values({"material.chain_density": 0.0, "loads.pressure.value": 1.001 * 3.103 * wall})
+    assert len(soft.warnings()) == 1 and not soft.with_values({"loads.pressure.value": 3.1 * wall}).warnings()
+    stiff = thin.with_values({"loads.pressure.value": 0.99 * borne * wall})
+    assert not [*too_soft(stiff), *too_soft(stiff.with_values({"geometry.is": "loaded"}))]
 
 
 def test_a_preset_with_units_in_another_stress_unit(monkeypatch):
@@ -416,7 +439,7 @@ def test_bodies_of_plausible_tissue_are_not_warned_of():
         assert read_scene(demo).warnings() == [], demo
     tube = preset_scene(PAPER, "tube")
     for quiet in (
-        {"geometry.inner_radius": 2.99}, {"loads.pressure.value": 0.01}, {"loads.elongation.value": 0.9},
+        {"geometry.inner_radius": 2.99, "loads.pressure.value": 0.01}, {"loads.elongation.value": 0.9},
         {"material.temperature": "20 degC"}, {"material.chain_density": 2e22}, {"material.lame_mu": 50.0},
         {"loads.pressure.value": 0.0}, {"geometry.length": 300.0},
     ):  # fmt: skip

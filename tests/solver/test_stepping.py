@@ -77,7 +77,11 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
     with pytest.raises(SolveFailure):
         coupling.newton.solve()
     assert "equilibrium" not in vars(coupling.blend)  # what parts are solved with is compiled when a step has some
+    said: list[str] = []
+    coupling.state.tell = said.append
     assert solve(stepper, FORCE + 1.0).substeps > 1
+    assert said[0].startswith("t = 15, 0 % of the change of the cells, attempt 1: ")
+    assert any(" % of the change of the loads, attempt " in words for words in said)
     assert coupling.equilibrium.extension().admissible
     assert made.loading.values == {"force": FORCE + 1.0}
     energy, found = coupling.equilibrium.stored_energy(), made.displacement.x.array.copy()
