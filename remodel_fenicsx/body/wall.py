@@ -208,7 +208,9 @@ def _stress(mean: AngleOf, component: int, m: Any) -> float:
 
 
 FACES = ("inner", "outer")
-FITTED_TO_FACE = "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
+FITTED_TO_FACE = (
+    "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
+)
 ON_THE_FACE = 1e-6  # normalised depth: rounding of coordinates
 SECOND_LAYER = 1.5  # layers: deeper than this the third begins, and the second begins above
 

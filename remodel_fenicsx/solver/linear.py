@@ -404,27 +404,6 @@ class EveryTangent:
         """Free PETSc's objects."""
 
 
-class Preconditioned(EveryTangent):
-    """GMRES with the factor of an earlier tangent; in each solve the second tangent makes a new one."""
-
-    # The first stands where loads and time have jumped, which may be an indefinite place beside the way of the body.
-    # One is also made after a system that took as many iterations as a factor costs.
-
-    _before = 0  # tangents before the solve
-
-    def begin(self) -> None:
-        self._before = self.tangents
-
-    def renew(self) -> None:
-        super().renew()
-        slow = self.snes.getKSP().getIterationNumber() > WORTH_A_FACTOR
-        if self._always or slow or self.tangents in (1, self._before + 2):
-            self._set_up()
-
-    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return "with a factor of every tangent", self._anew()
-
-
 class Multigrid(EveryTangent):
     """GMRES with levels: of degree 1 below degree 2, made anew with each tangent, or kept as PETSc's options say."""
 

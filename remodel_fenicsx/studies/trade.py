@@ -20,7 +20,7 @@ from remodel_fenicsx.body.shape import FromFile, PROFILE
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.scene.presets import EXACT, PROFILES, profile_for
+from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import COLOURS, Answer
@@ -34,7 +34,6 @@ Array = NDArray[np.float64]
 
 # ---------------------------------------------------------------- settings of a scene from coarse to fine
 SECONDS_PER_POINT = 3e-5  # of a step: a first guess, corrected by the runs
-COST_OF_EXACT = 20.0  # of a step with the coupling that has no error in time, in others, as measured on the artery
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
 STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
@@ -42,7 +41,7 @@ MESHES = ((1, 1), (2, 1), (4, 1), (8, 1), (1, 2), (2, 2), (4, 2))  # refinement,
 TOGETHER = ((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25))  # both finer: refinement, degree, step in the scene's
 SEEDS = 3  # where another mesh draws other cells
 COMPARED = 8  # times at which rows are compared, beside corners of ramps and the end
-STRETCH, COUPLING, KINEMATIC = "mean_stretch", "remodeling.coupling", "model.kinematics"
+STRETCH, KINEMATIC = "mean_stretch", "model.kinematics"
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,7 @@ class Setting:
     def key(self) -> str:
         """What it is: kinematics, mesh, steps, and a coupling of its own."""
         kinematics, refinement, degree = self.mesh
-        coupling = f"-{self.way[1]}" if COUPLING in self.changes else ""
-        return f"{kinematics}-{refinement}-degree-{degree}-{self.steps_in_words.replace(' ', '-')}{coupling}"
+        return f"{kinematics}-{refinement}-degree-{degree}-{self.steps_in_words.replace(' ', '-')}"
 
     @property
     def name(self) -> str:
@@ -84,12 +82,9 @@ class Setting:
     @property
     def expected_seconds(self) -> float:
         """Of one of its runs, roughly."""
-        time, is_exact = self.scene.time, self.scene.remodeling.coupling == EXACT
-        steps: float = time.number_of_steps
-        if time.tolerance is not None:  # where steps have no error they are as long as they may be
-            steps = COMPARED if is_exact else DEGREES_PER_RUN / time.tolerance
-        cost = step_cost(self.scene, self.scene.model.kinematics) * (COST_OF_EXACT if is_exact else 1.0)
-        return SECONDS_PER_POINT * cost * steps
+        time = self.scene.time
+        steps = time.number_of_steps if time.tolerance is None else DEGREES_PER_RUN / time.tolerance
+        return SECONDS_PER_POINT * step_cost(self.scene, self.scene.model.kinematics) * steps
 
     @property
     def steps_in_words(self) -> str:
@@ -112,13 +107,6 @@ def ladder(scene: Scene) -> list[Setting]:
     wanted += [finer(refinement, degree) | {"time.step": factor * step} for refinement, degree, factor in TOGETHER]
     for tolerance in TOLERANCES if remodels else ():
         wanted += [finer(2, 2) | {"time.tolerance": tolerance}, {"time.tolerance": tolerance}]
-    if base.has_exact_coupling and base.remodeling.coupling != EXACT:  # long steps are as good as short ones, and pay
-        longer = [{COUPLING: EXACT, "time.step": factor * step} for factor in STEPS if factor > 1]
-        allowed = [values["time.step"] for values in longer if _setting(base, values)]
-        wanted += longer + [
-            {COUPLING: EXACT, "time.step": max(allowed, default=step)} | finer(*mesh) for mesh in MESHES
-        ]
-        wanted += [{COUPLING: EXACT, "time.tolerance": tolerance} | finer(2, 2) for tolerance in TOLERANCES[:1]]
     for name in dict.fromkeys((choice(scene).name, "sector", "full")):
         if name == choice(scene).name or not (objections(scene, name) or is_for_means(scene, name)):
             wanted.append({KINEMATIC: name})
