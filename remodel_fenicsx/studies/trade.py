@@ -55,7 +55,7 @@ class Setting:
 
     @property
     def key(self) -> str:
-        """What it is: kinematics, mesh, steps, and a coupling of its own."""
+        """What it is: kinematics, mesh and steps."""
         kinematics, refinement, degree = self.mesh
         return f"{kinematics}-{refinement}-degree-{degree}-{self.steps_in_words.replace(' ', '-')}"
 
@@ -75,9 +75,9 @@ class Setting:
         return self.scene.model.kinematics, self.scene.mesh.refinement, self.scene.mesh.degree
 
     @property
-    def way(self) -> tuple[str, str]:
-        """Kinematics and coupling: what a step costs goes by them."""
-        return self.scene.model.kinematics, self.scene.remodeling.coupling
+    def kinematics(self) -> str:
+        """What a step costs goes by them."""
+        return self.scene.model.kinematics
 
     @property
     def expected_seconds(self) -> float:
@@ -257,33 +257,28 @@ class Row:
 
 
 class _Guess(NamedTuple):
-    """Of the exact result: what settings of one coupling tend to."""
+    """Of the exact result: what settings with fixed steps tend to."""
 
     angles: Array
     lengths: Array
     unknown: float
-    beyond: float
     notes: list[str]
 
 
 def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
     """Rows with errors against the best guess of the exact result, and what it rests on."""
     results = _on_the_mean(results)
-    by_coupling: dict[str, list[Result]] = {}
-    for result in results:
-        if result.setting.step is not None:
-            by_coupling.setdefault(result.setting.way[1], []).append(result)
-    if not by_coupling:
+    fixed = [result for result in results if result.setting.step is not None]
+    if not fixed:
         return [Row(result, np.nan, np.nan, doubt="nothing to compare with") for result in results], []
-    guesses = [_guess(same) for same in by_coupling.values()]
-    best = min(guesses, key=lambda guess: float(np.hypot(guess.unknown, guess.beyond)))
-    rows = sorted((_row(result, best) for result in results), key=lambda row: row.result.seconds)
+    guess = _guess(fixed)
+    rows = sorted((_row(result, guess) for result in results), key=lambda row: row.result.seconds)
     on_front = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
-    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], best.notes
+    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], guess.notes
 
 
 def _guess(fixed: Sequence[Result]) -> _Guess:
-    """What settings with fixed steps, and one coupling, tend to."""
+    """What settings with fixed steps tend to."""
     finest = min(fixed, key=_fineness)
     angles, lengths, unknown, notes = finest.angles, finest.lengths, 0.0, []
     sweeps = [_time_sweep(fixed)]
@@ -303,7 +298,7 @@ def _guess(fixed: Sequence[Result]) -> _Guess:
         notes.append(_in_words(sweep, found))
         if not found.trusted:
             unknown = max(unknown, typical(found.last)) if np.isfinite(found.last).any() else np.inf
-    return _Guess(angles, lengths, unknown, typical(angles - finest.angles), notes)
+    return _Guess(angles, lengths, unknown, notes)
 
 
 def _row(result: Result, guess: _Guess) -> Row:
@@ -432,7 +427,7 @@ class _TradeStudy(Study):
         self.deadline = clock.monotonic() + budget
         self._setting_of = {name: setting for name, (setting, _) in of_run.items()}
         self._results: dict[str, Result] = {}
-        self._pace: dict[tuple[str, str], float] = {}  # seconds over those expected, by kinematics and coupling
+        self._pace: dict[str, float] = {}  # seconds over those expected, by kinematics
 
     @property
     def results(self) -> list[Result]:
@@ -459,7 +454,7 @@ class _TradeStudy(Study):
     def fits(self, run: Run) -> bool:
         """Whether a run that begins now would end in time, by what others have taken."""
         setting = self._setting_of[run.name]
-        return clock.monotonic() + self._pace.get(setting.way, 1.0) * setting.expected_seconds < self.deadline
+        return clock.monotonic() + self._pace.get(setting.kinematics, 1.0) * setting.expected_seconds < self.deadline
 
     def learn(self) -> None:
         """Read what is new, and how long it took."""
@@ -468,7 +463,7 @@ class _TradeStudy(Study):
             with suppress(RecordingError):  # one that is damaged will be among those that have failed
                 if all(run.is_complete() for run in runs):
                     result = self._results[setting.name] = read(setting, runs, self.times)
-                    self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
+                    self._pace[setting.kinematics] = max(result.wall_seconds / setting.expected_seconds, 0.1)
 
 
 def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Result:
@@ -563,7 +558,7 @@ class Trade(Answer):
         """Cost against error; points of the front have numbers, and beside the axes stands what they are."""
         shown = [row for row in self.rows if row.angle_error > 0]
         front = [row for row in shown if row.on_front]
-        kinds = dict(zip(dict.fromkeys(row.result.setting.way for row in shown), COLOURS, strict=False))
+        kinds = dict(zip(dict.fromkeys(row.result.setting.kinematics for row in shown), COLOURS, strict=False))
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         axes = figure.subplots()
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
@@ -571,9 +566,9 @@ class Trade(Answer):
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
         axes.plot(*_places(front), color="0.6", zorder=0, lw=0.8)
-        for way, colour in kinds.items():
-            same = [row for row in shown if row.result.setting.way == way]
-            axes.plot(*_places(same), "o", color=colour, markerfacecolor="white", markersize=4, label=", ".join(way))
+        for kinematics, colour in kinds.items():
+            same = [row for row in shown if row.result.setting.kinematics == kinematics]
+            axes.plot(*_places(same), "o", color=colour, markerfacecolor="white", markersize=4, label=kinematics)
             axes.plot(*_places([row for row in same if row.on_front]), "o", color=colour, markersize=5)
         if kinds:
             figure.legend(loc="outside lower left", ncols=3)

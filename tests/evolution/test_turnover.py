@@ -157,7 +157,7 @@ def test_a_growth_that_rests_is_no_instability_however_large(
     [("staggered", {}), ("extrapolated", {"tolerance": 1.0})],
 )
 def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], tmp_path: Path) -> None:
-    room = {"rates": "cauchy", "volume": 0.5, "time": 40.0} if time else {}
+    room = {"rates": "cauchy", "volume": 0.5} if time else {}
     values = wall(24.0, 4.0, {"time": 10.0, "gain": 1.0} | room, COLUMNS, coupling=coupling)
     values["time"] |= time
     values["mesh"] = {"refinement": 1, "degree": 2}
@@ -233,6 +233,11 @@ def test_steps_that_are_too_long_for_the_turnover_are_said() -> None:
     chosen = long | {"time": {"end": 100.0, "tolerance": 1.0}}
     for fine in (cube(100.0, 10.0, {}), chosen):
         assert not [line for line in scene_from_dict(fine).warnings() if "turnover.time" in line]
+
+
+def test_cells_that_stay_are_said_to_take_staggered_turnover(caplog: pytest.LogCaptureFixture) -> None:
+    Simulation(scene_from_dict(cube(10.0, 5.0, {}, kappa=0.0, coupling="extrapolated"))).close()
+    assert "kappa is 0" in caplog.text and "in place of 'extrapolated'" in caplog.text
 
 
 def test_the_wall_does_not_thicken_under_more_pressure() -> None:
