@@ -73,7 +73,9 @@ class Homeostasis:
         """Equilibrium of forces and of cells."""
         state, work = self.state, Work()
         start, number, self.steps, self._held = state.time, state.number, 0, None
-        coarsens = not self.stepper.coupling.traits.accumulates and self.tolerance < UNCHECKED and self.turnover is None
+        # turnover and a threshold remember the way
+        remembers = self.turnover is not None or self.remodeling.settings.threshold > 0.0
+        coarsens = not (self.stepper.coupling.traits.accumulates or self.tolerance >= UNCHECKED or remembers)
         if self.first is not None:
             self._rest_before(*self.first, work)
         self._go(time, loads, max(start, self.held_from), coarsens, work)

@@ -135,7 +135,7 @@ class Law:
     target, follow
         Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
         `update` is made; r0 and kappa dt are (n,) or numbers. A scheme of second order needs them apart.
-    by_rank
+    is_ranked
         Whether dimensions follow the rank of principal values (`ranked`).
     keeps_symmetry
         Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
@@ -177,7 +177,7 @@ class Law:
     target: Callable[[Drive], tensor_law.Target] | None = None
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, Array | float], UnitCell] | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
-    by_rank: bool = False
+    is_ranked: bool = False
     keeps_symmetry: bool = False
     asks_kappa: bool = False
     over_corrects: bool = False
@@ -226,7 +226,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         of_absolute_time=of_absolute_time,
         keeps_symmetry=True,
         asks_kappa=True,
-        by_rank=True,
+        is_ranked=True,
     )
 
 

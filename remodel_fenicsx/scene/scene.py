@@ -383,7 +383,7 @@ class Scene(Table):
     @property
     def jumps_by_rank(self) -> bool:
         """Whether cells whose lengths differ from point to point go from rank to rank, under a law of lengths."""
-        return LAWS[self.remodeling.law].by_rank and (self.has_random_cells or bool(self.measured_cells))
+        return LAWS[self.remodeling.law].is_ranked and (self.has_random_cells or bool(self.measured_cells))
 
     @property
     def is_as_run(self) -> bool:

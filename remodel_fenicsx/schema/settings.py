@@ -40,6 +40,7 @@ from remodel_fenicsx.schema.tables import (
     IN_A_LIST,
     KeysOfParts,
     OneOf,
+    SceneError,
     Table,
     fault,
     named,
@@ -609,7 +610,8 @@ IN_ITS_PLACE = "take 'extrapolated' with remodeling.law = 'tensor', or 'staggere
 
 
 def _refuse_implicit(*parts: Any) -> Any:
-    raise fault(f"this run can only be continued by version 0.4.0; {IN_ITS_PLACE}", "remodeling.coupling", IMPLICIT)
+    text = f"this run can only be continued by version 0.4.0; {IN_ITS_PLACE}"
+    raise SceneError(f"remodeling.coupling = {IMPLICIT!r}: {text}")
 
 
 COUPLINGS = {

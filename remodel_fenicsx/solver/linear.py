@@ -105,7 +105,6 @@ SINGLE_ERROR = 0.5  # relative, of the answer to the softest motion: 0.36 (40,80
 # L-BFGS learns such motions; above 1 a factor may even have another sign there
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; Newton's method goes on, as often again
 
-WORTH_A_FACTOR = 10  # iterations of GMRES with a factor: 4 of 40 ms (a tube in 3D, 5,600 unknowns)
 LAST, SURELY = 1e-5, 0.3  # relative, of a linear solve that ends it all: tried down to LAST; share of what is needed
 
 

@@ -63,6 +63,24 @@ def test_it_is_where_time_leads(driver: str) -> None:
     assert row["inner_radius"] > 1.3  # remodeled, and loaded
 
 
+@pytest.mark.parametrize("target, end, away", [
+    ({"exponent": 1.0}, 2e3, 1e-5), ({"threshold": 2.0, "coupling": "staggered"}, 2e4, 2e-3),
+])  # fmt: skip
+def test_other_targets_come_to_rest_where_time_leads(target: dict[str, Any], end: float, away: float) -> None:
+    """Points near a threshold rest late; not where the target of exponent 2 leads."""
+    times = ({"end": last, "tolerance": 0.5} for last in ("equilibrium", end))
+    scenes = [artery(preset="consistent", remodeling=target, time=time) for time in times]
+    scenes.append(artery(preset="consistent"))
+    found = []
+    for scene in scenes:
+        simulation = Simulation(scene, SELF)
+        residual = list(simulation.steps())[-1].row["pass_residual"]
+        found.append(simulation.state.equilibrium_cells.structure_tensor())
+        assert residual < away
+    np.testing.assert_allclose(found[0], found[1], atol=away)
+    assert np.abs(found[0] - found[2]).max() > 0.01
+
+
 def test_relaxation_and_tensor_have_the_same_limit_as_eq_11() -> None:
     """In a body whose axes are those of its loads; A has no memory of the start."""
     found = []
@@ -71,8 +89,8 @@ def test_relaxation_and_tensor_have_the_same_limit_as_eq_11() -> None:
         simulation = Simulation(artery(remodeling={"law": law, "frame": "material"}, material=material), SELF)
         assert solved(simulation)["pass_residual"] < 1e-6
         found.append(simulation.cells.structure_tensor())
-    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
-    np.testing.assert_allclose(found[2], found[0], atol=1e-9)
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-7)
 
 
 @pytest.mark.parametrize("law", ["explicit", *slowly("relaxation")])
@@ -83,7 +101,7 @@ def test_random_cells_come_to_the_same_state(law: str) -> None:
         simulation = coarse(cells, law=law)
         assert solved(simulation)["pass_residual"] < 1e-6
         found.append(simulation.cells.structure_tensor())
-    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
     assert np.abs(found[0] - np.eye(3) / 3).max() > 0.3
 
 

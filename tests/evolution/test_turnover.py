@@ -15,7 +15,7 @@ from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure
-from tests.runs import goes_on, last_row, made, opening_angle, rows_of, simulated, taylor_orders
+from tests.runs import goes_on, last_row, made, opening_angle, rows_of, simulated
 from tests.values import ANGLES, TENSION, ramped, isotropic
 
 COLUMNS = ["content", "natural_length"]
