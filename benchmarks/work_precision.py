@@ -4,7 +4,7 @@
     ./with-fenicsx benchmarks/work_precision.py [--folder DIR] [--budget SECONDS] [--only PART...] [--report]
 
 Parts: `artery`, the settings of `remodel-fenicsx trade` and the profiles on the paper's artery with isotropic cells,
-for the printed coupling, the implicit one and the consistent variant, against the one-dimensional solver of
+for the printed coupling and the consistent variant, against the one-dimensional solver of
 tests/reference with steps of 1/8 and 1/16 (1/2 and 1/4 for the law tensor), extrapolated; `paper`, the paper's own mesh
 there; `whole`, the whole tube in three dimensions, up to 20 minutes a run. An hour or more of one core, most of it the
 whole tube. Then makes tables and picture of docs/speed_and_accuracy.md, and tables.md beside what is recorded; --only
@@ -56,7 +56,6 @@ class Method:
 
 METHODS = {
     "printed": Method("printed: explicit law, staggered", "kuhl-holzapfel-2007", "staggered", "explicit"),
-    "implicit": Method("explicit law, implicit coupling", "kuhl-holzapfel-2007", "implicit", "explicit"),
     "consistent": Method("law tensor, extrapolated", "consistent", "extrapolated", "tensor"),
 }
 
@@ -89,10 +88,7 @@ def settings(method: Method) -> list[rungs.Setting]:
         rungs.Setting(profile.values, base.with_values({**profile.values, **RADIAL}), (1,), name)
         for name, profile in PROFILES.items()
     ]
-    same = [one for one in rungs.ladder(base) if not one.profile and rungs.COUPLING not in one.changes]
-    every = [*coarse(base), *same, *profiles]
-    exact = method.coupling == "implicit" and method.law == "explicit"  # no error in time: short steps buy nothing
-    return [one for one in every if one.step is None or one.step >= base.time.step or not exact]
+    return [*coarse(base), *(one for one in rungs.ladder(base) if not one.profile), *profiles]
 
 
 def coarse(base: Scene) -> list[rungs.Setting]:
@@ -196,7 +192,12 @@ def paper_rows(found: Sequence[Point]) -> str:
     """The paper's own setting beside the wall alone on the same elements."""
     printed = {point.name: point.found for point in found if point.method == "printed"}
     whole, wall = printed["full-1-degree-1-step-1"], printed["radial-1-degree-1-step-1"]
-    own = ["the whole tube, every tangent factorised", f"{whole.seconds:.3g}", f"{whole.typical:.2g}", f"{whole.anywhere:.2g}"]
+    own = [
+        "the whole tube, every tangent factorised",
+        f"{whole.seconds:.3g}",
+        f"{whole.typical:.2g}",
+        f"{whole.anywhere:.2g}",
+    ]
     alone = ["the wall alone on the same elements", f"{wall.seconds:.1g}", f"{wall.typical:.2g}", ""]
     return markdown(["the printed method", "seconds", "degrees", "largest"], [own, alone])
 

@@ -96,7 +96,7 @@ from remodel_fenicsx.model.energy import (
 from remodel_fenicsx.model.laws import LAWS as LAWS, Drive as Drive, Law as Law, ranked as ranked
 from remodel_fenicsx.model.axes import AXES as AXES, LocalAxes as LocalAxes
 from remodel_fenicsx.model.spectral import PAIRINGS as PAIRINGS, principal as principal
-from remodel_fenicsx.model.tensors import linear_map as linear_map, ln as ln
+from remodel_fenicsx.model.tensors import ln as ln
 from remodel_fenicsx.schema.settings import COUPLINGS as COUPLINGS, CouplingKind as CouplingKind
 from remodel_fenicsx.schema.units import (
     AREA as AREA,

@@ -29,7 +29,7 @@ from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.scene.scene import in_region
-from remodel_fenicsx.schema.settings import Cells, Properties, Turnover, missing_for_steps_of_cells
+from remodel_fenicsx.schema.settings import Cells, Properties, Turnover
 from remodel_fenicsx.state import Snapshot, State, UnitCells, by_region
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
@@ -151,9 +151,9 @@ class Simulation:
 
     def close(self) -> None:
         """Free PETSc's objects and options."""
-        for part in (*self.watchers, self.rest, self.stepper):
-            if part is not None:
-                part.close()
+        for watcher in self.watchers:
+            watcher.close()
+        self.stepper.close()
 
 
 @dataclass(frozen=True)
@@ -308,12 +308,8 @@ def _way_to_rest(scene: Scene, stepper: Stepper) -> Any:
     if scene.has_random_cells and scene.jumps_by_rank:
         tolerance = homeostasis.UNCHECKED
     control = StepControl(stepper, tolerance, scene.time.step, stops, homeostasis.LONGEST)
-    limit = None
-    if missing_for_steps_of_cells(scene) is None:
-        until = scene.solver.model_copy(update={"maximum_iterations": homeostasis.LIMIT_ITERATIONS})
-        limit = homeostasis.Limit(stepper.state, stepper.tissue, stepper.remodeling, until)
     first = scene.last_hold if scene.remodeling.turnover.starts_at_rest else None
-    return homeostasis.Homeostasis(control, max(stops[:-1], default=0.0), limit, first)
+    return homeostasis.Homeostasis(control, max(stops[:-1], default=0.0), first)
 
 
 def on_mesh_alone(scene: Scene, domain: Domain) -> Any:

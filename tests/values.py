@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 PAPER = "kuhl-holzapfel-2007"
 
@@ -22,3 +25,10 @@ def isotropic(preset: str | None = PAPER, kinematics: str = "radial", **tables: 
 
 TENSION = {"rates": "tension", "volume": 0.0}
 """Turnover as version 0.3.0 has it."""
+
+
+def deformations(number: int, rng: np.random.Generator) -> np.ndarray:
+    """Stretches apart, with a rotation: under tension."""
+    R = Rotation.random(2 * number, random_state=rng).as_matrix()
+    stretches = np.array([1.35, 1.12, 0.8]) + rng.uniform(-0.06, 0.06, (number, 3))
+    return R[:number] @ (stretches[:, :, None] * R[number:])

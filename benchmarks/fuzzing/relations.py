@@ -168,15 +168,13 @@ def _tolerance(scene: Values, random: Random) -> Other | None:
 
 
 def _half(scene: Values, random: Random) -> Other | None:
-    """The coupling `extrapolated` is of second order, and eq. (11) solved with its cells has no error in time."""
+    """The coupling `extrapolated` is of second order."""
     r, t = scene["remodeling"], scene["time"]
     rate = r["kappa"] * t["step"]
-    second = r["coupling"] == "extrapolated" and rate < 0.1
-    exact = (r["coupling"], r["law"]) == ("implicit", "explicit") and scene["cells"]["initial"] == "isotropic"
-    if t["end"] == "equilibrium" or "tolerance" in t or not (second or exact):
+    if t["end"] == "equilibrium" or "tolerance" in t or r["coupling"] != "extrapolated" or rate >= 0.1:
         return None
     # a step in which tension comes or goes is off by up to kappa dt
-    error = max(20 * rate**2, rate) if second else SOLVED
+    error = max(20 * rate**2, rate)
     finer = with_values(scene, {"time.step": t["step"] / 2})
     return Other("half of the step", finer, tolerance=error, degrees=60 * error, last_only=True)
 
@@ -193,11 +191,8 @@ def _elements(scene: Values) -> Other | None:
     if scene.get("name") != STIFF_NAME:
         return None
     changes = {"mesh.formulation": "selective-integration", "mesh.element": "hexahedron"}
-    implicit = scene["remodeling"].get("coupling") == "implicit"
-    if implicit:  # it needs the other formulation, and has no error in time
-        changes |= {"remodeling.coupling": "extrapolated", "time.step": scene["time"]["step"] / 8}
-    last = implicit or "profile" in scene
-    return Other("by selective integration", with_values(scene, changes), tolerance=5e-3, degrees=1.0, last_only=last)
+    finer = with_values(scene, changes)
+    return Other("by selective integration", finer, tolerance=5e-3, degrees=1.0, last_only="profile" in scene)
 
 
 RELATIONS: tuple[tuple[int, Relation], ...] = (

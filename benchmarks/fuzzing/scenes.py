@@ -41,11 +41,8 @@ def made(seed: int) -> tuple[Values, Values]:
         scene["preset"] = random.choice(("kuhl-holzapfel-2007", "consistent", "sun-2002"))
     scene["geometry"] = _geometry(random, shape)
     scene["material"], r0, stiffness = _material(random)
-    scene["remodeling"] = _remodeling(random, scene["material"]["chain_density"] > 0)
+    scene["remodeling"] = _remodeling(random)
     scene["cells"] = _cells(random, shape, r0)
-    if scene["cells"]["initial"] == "random" and scene["remodeling"]["law"] != "tensor":
-        if scene["remodeling"]["coupling"] == "implicit":  # by rank such cells jump, which is refused
-            scene["remodeling"]["coupling"] = "relaxed"
     scene["supports"] = {
         "ends": random.choices(("free", "clamped", "closed"), (12, 1, 2))[0] if shape == "tube" else "free"
     }
@@ -68,7 +65,7 @@ def _stiff(random: Random) -> tuple[Values, Values]:
     wall, mu = rounded(random.uniform(0.2, 2.0)), 3.103
     kinematics = random.choices(("radial", "axisymmetric", "sector", "full"), (12, 4, 2, 1))[0]
     law = random.choice(("tensor", "tensor", "explicit", "rate", "relaxation"))
-    couplings = ["staggered"] + ["extrapolated", "implicit"] * (law == "tensor")
+    couplings = ["staggered"] + ["extrapolated"] * 2 * (law == "tensor")
     pressure = mu * math.log(1 + wall) * random.uniform(0.1, 1.5)
     scene: Values = {
         "name": STIFF_NAME,
@@ -103,7 +100,7 @@ def cheap(scene: Values) -> bool:
 def cost(scene: Values) -> tuple[bool, bool]:
     """To sort by: whether a step costs much, whether there may be many."""
     long = "tolerance" in scene["time"] or scene["time"]["end"] == "equilibrium"
-    return not cheap(scene), long or scene["remodeling"].get("coupling") == "implicit"
+    return not cheap(scene), long
 
 
 def _geometry(random: Random, shape: str) -> Values:
@@ -139,10 +136,9 @@ def _material(random: Random) -> tuple[Values, float, float]:
     return table, r0, 3 * mu + network
 
 
-def _remodeling(random: Random, chains: bool) -> Values:
+def _remodeling(random: Random) -> Values:
     law = random.choices(("explicit", "rate", "relaxation", "tensor", "rotation", "none"), (4, 2, 3, 6, 1, 1))[0]
-    couplings = ["staggered", "staggered", "relaxed"]
-    couplings += ["extrapolated"] * 3 * (law == "tensor") + ["implicit"] * (law not in ("rotation", "none") and chains)
+    couplings = ["staggered", "staggered", "relaxed"] + ["extrapolated"] * 4 * (law == "tensor")
     return {
         "law": law, "driver": random.choices(("cauchy", "pk2", "finger"), (3, 1, 1))[0],
         "frame": random.choice(("material", "spatial")), "coupling": random.choice(couplings),
@@ -180,7 +176,7 @@ def _mesh(random: Random, scene: Values) -> tuple[Values, Values]:
     elif same:
         kinematics = random.choices(("auto", "point", "full"), (2, 3, 1))[0]
     formulation = "displacement"
-    if remodeling["coupling"] != "implicit" and random.random() < 0.15:
+    if random.random() < 0.15:
         formulation = "selective-integration"
     reduced = kinematics in ("radial", "point")
     mesh = {
@@ -203,8 +199,7 @@ def _time(random: Random, scene: Values) -> Values:
     time: Values = {"end": steps * step, "step": step}
     chosen = random.random()
     if chosen < 0.12 and scene["remodeling"]["law"] in ("explicit", "relaxation", "tensor") and not few:
-        implicit = scene["mesh"]["formulation"] == "displacement" and scene["material"]["chain_density"]
-        return {"end": "equilibrium", "step": step} if implicit else time
+        return {"end": "equilibrium", "step": step} if scene["material"]["chain_density"] else time
     if chosen < 0.3 and not few:
         time["tolerance"] = random.choice((0.5, 1.0, 2.0))
     return time
@@ -297,14 +292,14 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
     if turns and plain and not locked and scene["material"]["chain_density"] and random.random() < 0.2:
         numbers = {"time": rounded(random.uniform(20, 80)), "deposition_stretch": rounded(random.uniform(1.02, 1.2))}
         numbers |= {"gain": rounded(random.uniform(0.5, 2)), "rates": random.choice(("cauchy", "tension"))}
-        grows = scene["geometry"]["shape"] == "tube" and scene["remodeling"]["coupling"] != "implicit"
+        grows = scene["geometry"]["shape"] == "tube"
         grows = grows and scene.get("mesh", {}).get("formulation", "displacement") == "displacement"
         scene["remodeling"]["turnover"] = numbers | {"volume": random.choice((0.0, 0.3, 0.6)) if grows else 0.0}
     if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.05:
         scene["geometry"]["is"] = "loaded"
         if scene["time"]["end"] == "equilibrium":
             scene.setdefault("natural", {})["cells"] = "equilibrium"
-    if "profile" not in scene and "is" not in scene["geometry"] and scene["remodeling"]["coupling"] != "implicit":
+    if "profile" not in scene and "is" not in scene["geometry"]:
         _cases(random, scene)
 
 
@@ -324,7 +319,7 @@ def _cases(random: Random, scene: Values) -> None:
 def _set_points(random: Random, scene: Values, stiffness: float) -> None:
     """Exponent and threshold of the law that has them."""
     remodeling = scene["remodeling"]
-    if remodeling["law"] != "tensor" or remodeling["coupling"] == "implicit" or scene["time"]["end"] == "equilibrium":
+    if remodeling["law"] != "tensor":
         return
     if random.random() < 0.15:
         remodeling["exponent"] = random.choice((1.0, 3.0))

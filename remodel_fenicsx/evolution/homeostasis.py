@@ -1,28 +1,28 @@
-"""The biological equilibrium at once: the state that remodeling comes to under the loads at the end.
+"""The homeostatic state: the cells to which remodeling tends under the loads at the end.
 
-Laws with a limit come to rest where the cells are those of their own stress: l = r0 e with n its axes, or A = r0^2 E.
-A body may have several such states, and a point without tension keeps its cells: the way there decides. So the way is
-gone, in steps of chosen lengths, until the rest of it is one step of Newton's method (docs/theory.md, "Equilibrium at
-once").
+Laws with a limit reach a state in which the cells are those of their own stress: l = r0 e with n its axes, or
+A = r0^2 E. A body may have several such states, and a point without tension keeps its cells: the path decides. So the
+path is followed in chosen steps, which grow under constant loads, until the cells hardly change; the tail of their
+exponential decay is extrapolated (docs/theory.md, "Equilibrium at once").
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.implicit import RESIDUAL, Implicit
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem import assembly
 from remodel_fenicsx.model.cells import structure_tensor
-from remodel_fenicsx.solver.continuation import Work
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.model.laws import relaxed
+from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.system import NOTICE
 
@@ -34,47 +34,32 @@ PATH_TOLERANCE, UNLOADING = 3.0, 0.5
 There points lose their tension, and their cells stay as exact as the way. The paper's artery takes 25 solves."""
 UNCHECKED = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
-LIMIT_ITERATIONS = 10
-"""Of Newton's method in the step to the limit: from near it takes 3 to 7, and one that fails costs more than steps."""
-NEAR_REST, AGAIN, TRIES = 0.05, 0.7, 6
-"""Change of A over r0^2 by a pass to the limit from which on the rest is tried in one step, how much nearer the cells
-are at the next try, and how often. Where there are points that gain and lose their tension, none is solved."""
-SAME_WAY, NO_CHANGE = 0.5, 0.03
-"""The step leads where time does if it changes A at each point in the direction of that pass: cosine, and change over
-r0^2 that needs none. Measured on tubes: steps to another state had points with a cosine of -0.7 and below. Right ones
-from afar had some too (-0.6), and are made from nearer."""
+GROWTH_OF_STEPS, LONGEST_AT_END = 1.5, 8.0
+"""Under constant loads each step may be longer by this factor while changes fall, up to so many times 1/kappa: then a
+step is a pass to the limit but for 0.03 %."""
 FRONT = 1.2
 """Difference of A over r0^2 between neighbouring points from which on a front lies between them: chains of one
 direction that turn by 58 degrees. The paper's artery has 0.67 at most, tubes with a front had 1.35 to 1.41."""
 REST = 1e-4
-"""Change of A over r0^2 in a time of 1/kappa at which cells rest. The slowest bodies seen forget at a twentieth of
-kappa: what is left is 0.002, a tenth of a degree."""
+"""Change of A over r0^2 in a time of 1/kappa at which the path ends. The slowest bodies seen forget at a twentieth of
+kappa: what is left is 0.002, a tenth of a degree, before the tail."""
 LONGEST_HOLD = 100.0  # times 1/kappa under held loads after which cells that do not rest are left
-
-
-class Limit(Implicit):
-    """A step over a time without end, in one piece or not at all."""
-
-    def _go(
-        self, time: float, stage: str, set_fraction: Callable[[float], None], newton: GuardedNewton, work: Work
-    ) -> None:
-        set_fraction(1.0)
-        work.add(newton.solve())
-        work.substeps += 1
+NEAR_REST, AGAIN = 0.01, 0.5  # change of A over r0^2 from which on the tail is tried, and how much nearer the next time
+TAIL_PASSES, TAIL = 15, 1e-9  # passes to the limit after the path, at most, and the change over r0^2 that ends them
+LARGEST_RATIO = 0.95  # of two changes, for Aitken's extrapolation: it then goes 20 times as far as the last change
 
 
 class Homeostasis:
     """The way through ramps and held loads until the cells rest, as one step of a stepper."""
 
-    def __init__(
-        self, control: StepControl, held_from: float, limit: Limit | None, first: tuple[float, float] | None = None
-    ):
-        self.control, self.held_from, self.limit = control, held_from, limit
+    def __init__(self, control: StepControl, held_from: float, first: tuple[float, float] | None = None):
+        self.control, self.held_from = control, held_from
         self.first = first  # hold of the loads in which the way rests once before, from and to
         self.stepper, self.state, self.tolerance = control.stepper, control.state, control.tolerance
         self.remodeling, self.turnover = self.stepper.remodeling, self.stepper.turnover
         self.quadrature = self.state.cells.quadrature
         control.level = logging.INFO  # no row of the way is a result; of points that turn over at once fronts tell
+        self.longest = control.longest
         self.steps, self._residual = 0, 0.0
         self._held: Snapshot | None = None  # the first state on the way under held loads
 
@@ -84,16 +69,13 @@ class Homeostasis:
         if self.state.time < time:
             yield self.stepper.advance(time, watchers, is_last=True, way=self)
 
-    def close(self) -> None:
-        """Free PETSc's objects."""
-        if self.limit is not None:
-            self.limit.close()
-
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Equilibrium of forces and of cells."""
         state, work = self.state, Work()
         start, number, self.steps, self._held = state.time, state.number, 0, None
-        coarsens = not self.stepper.coupling.traits.accumulates and self.tolerance < UNCHECKED and self.turnover is None
+        # turnover and a threshold remember the way
+        remembers = self.turnover is not None or self.remodeling.settings.threshold > 0.0
+        coarsens = not (self.stepper.coupling.traits.accumulates or self.tolerance >= UNCHECKED or remembers)
         if self.first is not None:
             self._rest_before(*self.first, work)
         self._go(time, loads, max(start, self.held_from), coarsens, work)
@@ -128,9 +110,11 @@ class Homeostasis:
         """From where the state is until the cells rest."""
         # The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
         # collagen comes to rest depends on the way.
-        state, self.near, self.tries, self._slowing = self.state, NEAR_REST, TRIES, Slowing(dict(Slowing.INITIAL))
-        self.control.tolerance = self.tolerance
-        for step in self.control.march():
+        state, control, before, waiting, near = self.state, self.control, np.inf, 0.0, NEAR_REST
+        self._slowing = Slowing(dict(Slowing.INITIAL))
+        control.tolerance, control.longest = self.tolerance, self.longest
+        start = held
+        for step in control.march():
             self.steps += 1
             work.add(step.work)
             work.substeps += step.work.substeps
@@ -139,26 +123,30 @@ class Homeostasis:
             if state.time < held:
                 continue
             if coarsens:
-                self.control.tolerance = UNCHECKED
+                control.tolerance = UNCHECKED
             ahead, solved = state.snapshot(), state.equilibrium_cells
             self._held = self._held or ahead
             state.cells.set(solved.dimension_values, solved.axis_values)  # those that the stress belongs to
-            if self._is_over(time, loads, self.stepper.slowest * (state.time - held), work):
+            left, residual = self._left(work.residual), work.residual
+            waiting += min(1.0, self.stepper.slowest * (state.time - start))  # a long step forgets as much as one
+            start = state.time
+            is_over = self._is_over(left, waiting, time, work.residual)
+            if (is_over or left <= near) and (self._add_tail(time, loads, work) or is_over):
                 return
+            work.residual, near = residual, min(near, AGAIN * left)
             state.restore(ahead)
+            if coarsens:
+                longer = min(GROWTH_OF_STEPS * control.longest, LONGEST_AT_END)
+                control.longest, before = longer if left < before else self.longest, left
 
-    def _is_over(self, time: float, loads: LoadValues, waiting: float, work: Work) -> bool:
-        """Whether the cells rest, or the rest of the way was made in one step."""
-        towards = self._change_by_a_pass(time, work.residual)
-        towards[self.remodeling.without_tension(work.residual).reshape(self.quadrature.shape)] = 0.0
-        rest = self._largest(towards)
-        far = max(rest, self._growth())
-        if self.limit is not None and self.tries and far <= self.near:
-            self.near, self.tries = AGAIN * far, self.tries - 1
-            if self._arrived(self.limit, time, loads, towards, work):
-                return True
+    def _left(self, residual: float) -> float:
+        """By how much A changes, over r0^2, or content and natural length, in a time of 1/kappa from here."""
         soon = self.state.time + 1 / self.stepper.slowest
-        if max(self._largest(self._change_by_a_pass(soon, work.residual)), self._growth()) <= REST:
+        return max(self._largest(self._change_by_a_pass(soon, residual)), self._growth())
+
+    def _is_over(self, left: float, waiting: float, time: float, residual: float) -> bool:
+        """Whether the path ends: the cells hardly change, or do not come to rest."""
+        if left <= REST:
             return True
         if self._grows_on(waiting):
             text = (
@@ -172,13 +160,68 @@ class Homeostasis:
             self._say(
                 logging.WARNING,
                 "the cells do not come to rest: a pass to its limit changes the structure tensor A by up to %.2g r0^2",
-                rest,
+                self._largest(self._towards(time, residual)),
             )
             if self.turnover is not None:
                 self._say(
                     logging.WARNING, "content or natural length change by up to %.2g in a time of T", self._growth()
                 )
         return waiting > LONGEST_HOLD
+
+    # ------------------------------------------------------------ the tail of the decay
+    def _add_tail(self, time: float, loads: LoadValues, work: Work) -> bool:
+        """Extrapolate what is left of the path; return whether nothing is left.
+
+        Passes to the limit with Aitken's factor, each in equilibrium, while the change that they make falls.
+        """
+        state, factor = self.state, 1.0
+        coupling: Any = self.stepper.coupling
+        change, rates = self._towards(time, work.residual), self._rates()
+        for _ in range(TAIL_PASSES):
+            left = max(self._largest(change), self._growth())
+            if left <= TAIL:
+                return True
+            before, residual = state.snapshot(), work.residual
+            asked, _ = self.remodeling.updated_cells(state.time, time, residual)
+            state.cells.set(*relaxed(state.cells.point_cells.copy(), asked, factor)[:2])
+            if self.turnover is not None:
+                self.turnover.change(rates.reshape(-1, 2).T, factor)
+            try:
+                found = coupling.balanced(state.time + 1 / self.stepper.slowest, loads, again=True)
+            except StepFailure as failure:
+                log.info("the tail of the path is not extrapolated further: %s", failure)
+                state.restore(before)
+                return False
+            work.add(found)
+            work.substeps, self.steps = work.substeps + found.substeps, self.steps + 1
+            before_it, change, rates = (change, rates), self._towards(time, found.residual), self._rates()
+            if max(self._largest(change), self._growth()) >= left:
+                state.restore(before)
+                work.residual = residual
+                return False
+            work.residual = found.residual
+            # a change d that falls to s d when d/(1 - s_0) was added leaves s d/(1 - s): s of the last factor
+            pairs = zip(before_it, (change, rates), strict=True)
+            ratios = [self._dot(one, other) / square for one, other in pairs if (square := self._dot(one, one))]
+            ratio = 1 - (1 - max(ratios)) / factor
+            factor = 1 / (1 - min(max(ratio, -1.0), LARGEST_RATIO))
+        return False
+
+    def _towards(self, time: float, residual: float) -> Array:
+        """Change of A by a pass to the limit at all points that have tension."""
+        change = self._change_by_a_pass(time, residual)
+        change[self.remodeling.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
+        return change
+
+    def _rates(self) -> Array:
+        """Changes of ln m and ln rho in a time of 1/kappa, (elements, points, 2); none where nothing is turned over."""
+        if self.turnover is None:
+            return np.zeros((self.quadrature.shape[0], 0, 2))
+        return np.asarray(self.turnover.rates().T / self.stepper.slowest).reshape(*self.quadrature.shape, 2)
+
+    def _dot(self, one: Array, other: Array) -> float:
+        """Sum of products over all ranks."""
+        return float(self.state.comm.allreduce(float(self.quadrature.owned(one * other).sum())))
 
     def _growth(self) -> float:
         """Largest relative change of content or natural length in the time in which `REST` is asked for."""
@@ -192,41 +235,6 @@ class Homeostasis:
             return False
         goes_on = self._slowing.goes_on(waiting, self._growth())
         return goes_on and self.quadrature.maximum(self.turnover.factors("natural_length")) > MUCH
-
-    def _arrived(self, limit: Limit, time: float, loads: LoadValues, towards: Array, work: Work) -> bool:
-        """Make the rest of the way in one step; if it is not solved or leads elsewhere, all is as before."""
-        state, before, residual = self.state, self.state.snapshot(), work.residual
-        structure = state.cells.structure_tensor()
-        grown = None if self.turnover is None else (self.turnover.logarithms(), self.turnover.rates())
-        state.numbers[RESIDUAL] = residual
-        try:
-            found = limit.solve(time, loads)
-        except SolveFailure as failure:
-            work.add(failure)
-            log.info("the rest of the path was not solved in one step: %s", failure.reason)
-            state.restore(before)
-            return False
-        work.add(found)
-        leads_on = self._is_along(state.cells.structure_tensor() - structure, towards)
-        if not leads_on or (grown is not None and not self._grows_along(*grown)):
-            work.residual = residual
-            log.info("one step for the rest of the path led to another state; it is not used")
-            state.restore(before)
-            return False
-        self.steps, work.substeps, work.residual = self.steps + 1, work.substeps + 1, found.residual
-        return True
-
-    def _is_along(self, change: Array, towards: Array) -> bool:
-        """Whether a change of A goes where a pass does, at all points where it counts."""
-        size, pass_size = (np.linalg.norm(tensors, axis=(-1, -2)) for tensors in (change, towards))
-        aside = (change * towards).sum(axis=(-1, -2)) < SAME_WAY * size * pass_size
-        return self._largest(np.where((aside | (pass_size == 0.0))[..., None, None], change, 0.0)) <= NO_CHANGE
-
-    def _grows_along(self, before: Array, rates: Array) -> bool:
-        """Whether ln m and ln rho have changed as their rates did, at all points where it counts."""
-        change = self.turnover.logarithms() - before
-        against = np.where(change * rates < 0.0, np.abs(change), 0.0).max(axis=0)
-        return self.quadrature.maximum(against.reshape(self.quadrature.shape)) <= NO_CHANGE
 
     def _change_by_a_pass(self, time: float, residual: float) -> Array:
         """Of A up to a time, at all points."""

@@ -134,7 +134,7 @@ class TurnoverPass:
     # ------------------------------------------------------------ over a step
     def lag(self, time: float) -> None:
         """Before a step to `time` is solved: m and rho change with the rates of the last row, over its step."""
-        self._change(self.rates(), self._numbers["duration"])
+        self.change(self.rates(), self._numbers["duration"])
         self._numbers["duration"], self._start_rates = time - self.state.time, None
 
     def extrapolate(self, time: float) -> None:
@@ -146,18 +146,10 @@ class TurnoverPass:
             mean = start + duration / (2 * self._numbers["duration"]) * (start - before)
         self._earlier.push(np.ravel(start.T))
         self._numbers["duration"], self._start_rates = duration, start
-        self._change(mean, duration)
+        self.change(mean, duration)
 
-    def begin(self) -> None:
-        """Before a step is solved that finds m and rho of its end itself, and gives them to `take`."""
-        self._start, self._start_rates = self.logarithms(), self.rates()
-
-    def take(self, logarithms: Array) -> None:
-        """ln m and ln rho (2, n) that were found with the state."""
-        self._before = self.row = logarithms
-        self.set(logarithms)
-
-    def _change(self, rates: Array, duration: float) -> None:
+    def change(self, rates: Array, duration: float) -> None:
+        """Other m and rho, after a time with rates (2, n)."""
         self._before = self._start = self.logarithms()
         self.row = changed(self._start, rates, duration)
         self.set(self.row)

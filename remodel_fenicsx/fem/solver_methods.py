@@ -14,7 +14,6 @@ from remodel_fenicsx.schema.tables import SceneError
 
 AUTO = "auto"
 LAGGED = "lagged"  # whose factor may be of an earlier tangent (`solver.linear`)
-PRECONDITIONED = "preconditioned"
 
 
 @dataclass(frozen=True)
@@ -78,20 +77,6 @@ SOLVER_METHODS = {
         "Newton's method; MUMPS factorises each system, and runs repeat to the last digit",
         on_several_ranks=ON_ONE_RANK,
     ),
-    # Where tangents are unsymmetric, and dear: three iterations for a system, each a tenth of what a factor costs
-    PRECONDITIONED: SolverMethod(
-        NEWTON
-        | {
-            "snes_lag_preconditioner": -2,  # the first; of the next ones the class says when
-            "ksp_type": "gmres",
-            "ksp_rtol": 1e-5,
-            "ksp_max_it": 30,
-            **BY_MUMPS,
-        },
-        "Newton's method with GMRES and a factor of an earlier tangent",
-        linear="remodel_fenicsx.solver.linear.Preconditioned",
-        on_several_ranks=ON_ONE_RANK,
-    ),
     LAGGED: SolverMethod(
         NEWTON | {"ksp_type": "preonly"},
         "few factorisations, and quasi-Newton steps (L-BFGS)",
@@ -119,7 +104,10 @@ SOLVER_METHODS = {
     ),
 }
 
-REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"}
+REMOVED = {
+    name: "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"
+    for name in ("exact", "preconditioned")
+}
 """Methods of earlier versions, and what to take in their place."""
 
 # Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused

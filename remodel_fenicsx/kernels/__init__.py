@@ -20,8 +20,6 @@ room                kernels.PointKernels.room
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
-solve               model.local_problem.LocalProblem.solve
-tangent             model.local_problem.LocalProblem.tangent
 factor_new          kernels.SingleFactor
 factor_renew        kernels.SingleFactor.renew
 factor_solve        kernels.SingleFactor.solve
@@ -133,7 +131,7 @@ class Library:
 
 def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
     """The tissue with its repulsion in C, where it is `log`."""
-    if tissue.chain is None or tissue.repulsion.compiled != "LOG" or in_numpy():
+    if tissue.chain is None or tissue.repulsion.sum is not energy.log_sum or in_numpy():
         return tissue
     from remodel_fenicsx.kernels.tensor import TensorKernels  # with the law `tensor`: most runs need neither
 

@@ -9,27 +9,11 @@
 #define ROOT_2 1.4142135623730951
 #define ALL(i) for (int i = 0; i < 3; ++i)
 #define MANDEL(i) for (int i = 0; i < 6; ++i)
-typedef double vector[6];      /* Mandel components of a symmetric tensor */
 typedef double tensor[3][3];
 typedef double matrix[6][6];   /* a linear map between symmetric tensors */
 
 static const int ROW[6] = {0, 1, 2, 1, 0, 0}, COLUMN[6] = {0, 1, 2, 2, 2, 1};
-static const int PLACE[3][3] = {{0, 5, 4}, {5, 1, 3}, {4, 3, 2}};
 static const double FACTOR[6] = {1, 1, 1, ROOT_2, ROOT_2, ROOT_2};
-
-static inline void to_vector(tensor t, vector v) { MANDEL(a) v[a] = FACTOR[a] * t[ROW[a]][COLUMN[a]]; }
-
-static inline void to_tensor(const vector v, tensor t)
-{
-    ALL(i) ALL(j) t[i][j] = v[PLACE[i][j]] / FACTOR[PLACE[i][j]];
-}
-
-static inline double norm(tensor t)
-{
-    double sum = 0;
-    ALL(i) ALL(j) sum += t[i][j] * t[i][j];
-    return sqrt(sum);
-}
 
 /* tensors.rotated: Q^T t Q, or Q t Q^T. */
 static inline void rotated(tensor t, tensor q, int back, tensor result)
@@ -89,35 +73,6 @@ static void turned(matrix turn, matrix m, matrix result)
         MANDEL(k) sum += half[i][k] * turn[j][k];
         result[i][j] = sum;
     }
-}
-
-/* The columns of x become those of m^-1 x, by elimination; m is lost. */
-static void divide(matrix m, double *x, int columns)
-{
-    for (int p = 0; p < 6; ++p) {
-        int pivot = p;
-        for (int i = p + 1; i < 6; ++i)
-            if (fabs(m[i][p]) > fabs(m[pivot][p])) pivot = i;
-        for (int j = p; j < 6; ++j) {
-            const double swap = m[p][j];
-            m[p][j] = m[pivot][j], m[pivot][j] = swap;
-        }
-        for (int j = 0; j < columns; ++j) {
-            const double swap = x[p * columns + j];
-            x[p * columns + j] = x[pivot * columns + j], x[pivot * columns + j] = swap;
-        }
-        const double inverse = 1 / m[p][p];
-        for (int i = p + 1; i < 6; ++i) {
-            const double share = m[i][p] * inverse;
-            for (int j = p + 1; j < 6; ++j) m[i][j] -= share * m[p][j];
-            for (int j = 0; j < columns; ++j) x[i * columns + j] -= share * x[p * columns + j];
-        }
-    }
-    for (int p = 5; p >= 0; --p)
-        for (int j = 0; j < columns; ++j) {
-            for (int k = p + 1; k < 6; ++k) x[p * columns + j] -= m[p][k] * x[k * columns + j];
-            x[p * columns + j] /= m[p][p];
-        }
 }
 
 /* tensors.eigen of up to W tensors: ascending values, vectors as columns. */

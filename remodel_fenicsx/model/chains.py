@@ -11,7 +11,6 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
-from remodel_fenicsx._lazy import resolved
 
 BOLTZMANN_CONSTANT = 1.381e-23  # J/K, as printed in the paper
 
@@ -75,7 +74,7 @@ class WithParameters:
         if not values:
             return self
         functions = {name: getattr(self, name) for name in self.functions}
-        bound = {name: partial(resolved(function), **values) for name, function in functions.items() if function}
+        bound = {name: partial(function, **values) for name, function in functions.items() if function}
         return replace(self, values=values, **bound)  # type: ignore[type-var]
 
 
@@ -95,8 +94,6 @@ class Chain(WithParameters):
         Whether a chain cannot become longer than L. Where it can, nothing is held below L, and r0 may be above it.
     parameters
         Numbers of its own, keys of `[material]`. Both functions take them by their names.
-    compiled
-        Under which name tensor.c has the law; "": numpy computes what others do in C.
     values
         Of its parameters (`of`).
 
@@ -118,7 +115,6 @@ class Chain(WithParameters):
     stiffness: Callable[[Any, Any], Any]
     locks: bool = True
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
-    compiled: str = ""
     values: Mapping[str, Any] = field(default=NO_VALUES, compare=False)
     functions = ("energy", "stiffness")
 
@@ -135,4 +131,4 @@ class Chain(WithParameters):
         return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
 
 
-CHAINS: dict[str, Chain] = {"wormlike": Chain(wormlike_energy, wormlike_stiffness, compiled="WORMLIKE")}
+CHAINS: dict[str, Chain] = {"wormlike": Chain(wormlike_energy, wormlike_stiffness)}

@@ -15,7 +15,6 @@ from remodel_fenicsx.model.energy import Stresses
 
 ufl = Late("ufl")
 Array = NDArray[np.float64]
-Derivatives = tuple[Array, Any, Any]  # D, and as Mandel matrices dD/dS and dD/dC or None
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,6 @@ class Driver:
     is_stress
         Whether it is a stress, zero up to the rounding of stresses and to the residual that was accepted; else it is a
         number near one, zero up to its own rounding.
-    derivatives
-        For the coupling "implicit": the driver in material space, a spatial one as R^T t R with F = R U, and its
-        derivatives, from (eigenvalues of C (n, 3), S (n, 3, 3), whether derivatives are asked for), all in the
-        eigenbasis of C: D (n, 3, 3), dD/dS and dD/dC (`linear_map`; (1, 6, 6) where all points have the same), None
-        where they are not asked for.
-    compiled
-        Under which name tensor.c has it; "": numpy computes what others do in C.
     over_corrects
         Whether the coupling "staggered" may leave a symmetric solution with it.
 
@@ -57,8 +49,6 @@ class Driver:
     tensor: Callable[[Any, Stresses], Any]
     material: bool
     is_stress: bool = True
-    derivatives: Callable[[Array, Array, bool], Derivatives] | None = None
-    compiled: str = ""
     over_corrects: bool = False
 
 
@@ -67,46 +57,17 @@ def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
     return ufl.dot(deformation_gradient, deformation_gradient.T)
 
 
-def cauchy_derivatives(squared: Array, stress: Array, second: bool) -> Derivatives:
-    """U S U / J."""
-    u = np.sqrt(squared)
-    jacobian = u.prod(axis=1)[:, None, None]
-    scales = u[:, :, None] * u[:, None, :] / jacobian
-    D = scales * stress
-    if not second:
-        return D, None, None
-    # dD = 2 sym(dU S U) / J - D C^-1 : dC / 2
-    by_stretch = 2 * tensors.linear_map(lambda H: H @ (stress * u[:, None, :] / jacobian))
-    by_volume = tensors.dyads(tensors.to_mandel(D), tensors.on_diagonal(1 / squared / 2))
-    stretch_by_strain = tensors.diagonal(1 / (u[:, :, None] + u[:, None, :]))
-    return D, tensors.diagonal(scales), by_stretch @ stretch_by_strain - by_volume
-
-
-def pk2_derivatives(squared: Array, stress: Array, second: bool) -> Derivatives:
-    """S."""
-    return stress, np.eye(6)[None], np.zeros((1, 6, 6))
-
-
-def finger_derivatives(squared: Array, stress: Array, second: bool) -> Derivatives:
-    """C: R^T b R."""
-    return squared[:, :, None] * np.eye(3), np.zeros((1, 6, 6)), np.eye(6)[None]
-
-
 DRIVERS: dict[str, Driver] = {
-    "cauchy": Driver(lambda F, s: s.cauchy, material=False, derivatives=cauchy_derivatives, compiled="CAUCHY"),
+    "cauchy": Driver(lambda F, s: s.cauchy, material=False),
     "pk2": Driver(
         lambda F, s: s.second_piola_kirchhoff,
         material=True,
-        derivatives=pk2_derivatives,
-        compiled="PK2",
         over_corrects=True,
     ),
     "finger": Driver(
         finger_tensor,
         material=False,
         is_stress=False,
-        derivatives=finger_derivatives,
-        compiled="FINGER",
         over_corrects=True,
     ),
 }
@@ -132,9 +93,6 @@ class Frame:
         Whether the cells' axes move with the material, so that F n_I are the previous axes in space.
     tensor
         A spatial tensor as one in material space, from (F (n, 3, 3), tensor (n, 3, 3)): for laws that need no axes.
-    has_derivatives
-        Whether the coupling "implicit" knows those of `axes`: of the frames of the package it does.
-
     Examples
     --------
     A frame that turns spatial axes back with the rotation R of F = R U:
@@ -155,7 +113,6 @@ class Frame:
     axes: Callable[[Array, Array], Array]
     carries_axes: bool
     tensor: Callable[[Array, Array], Array] = rotated_back
-    has_derivatives: bool = False
 
 
 def spatial_frame(F: Array, spatial_axes: Array) -> Array:
@@ -174,8 +131,8 @@ def material_frame(F: Array, spatial_axes: Array) -> Array:
 
 
 FRAMES: dict[str, Frame] = {
-    "material": Frame(material_frame, carries_axes=True, has_derivatives=True),
-    "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor, has_derivatives=True),
+    "material": Frame(material_frame, carries_axes=True),
+    "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor),
 }
 
 

@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 Term = Callable[..., Any]  # of F or J, lambda and mu; those of a matrix with parameters of its own take them too
 TURNED_OVER = ("content", "natural_length")  # what turnover changes at every point
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")  # of every tissue
-LOCAL_PROBLEM = "remodel_fenicsx.model.local_problem"  # which most runs do not import
 
 
 class Matrix:
@@ -45,13 +44,8 @@ class Matrix:
         What resists a change of volume, a function of J, lambda and mu: zero and without slope at J = 1.
     others
         All other terms, functions of F, lambda and mu; together zero and stress-free at F = I.
-    derivatives
-        S and dS/dC of the whole energy at points, from (eigenvalues of C (n, 3), lambda, mu, whether dS/dC is asked
-        for), in the eigenbasis of C: tensors (n, 3, 3) and Mandel matrices (n, 6, 6). The coupling "implicit" needs it.
     parameters
         Numbers of its own, keys of `[material]`. All of its functions take them by their names.
-    compiled
-        Under which name tensor.c has it; "": numpy computes what others do in C.
 
     Where a tube closes from a sector or is cut, the terms take arrays of complex numbers: np.maximum(x, 0), not |x|.
     Directions along x, y and z are the radius, the circumference and the length of a tube on its radius.
@@ -72,12 +66,10 @@ class Matrix:
         self,
         volumetric: Term,
         *others: Term,
-        derivatives: Callable[..., tuple[Any, Any]] | None = None,
         parameters: Mapping[str, Parameter] = NO_PARAMETERS,
-        compiled: str = "",
     ):
-        self.volumetric, self.others, self.derivatives = volumetric, others, derivatives
-        self.parameters, self.compiled, self.values = parameters, compiled, NO_VALUES
+        self.volumetric, self.others = volumetric, others
+        self.parameters, self.values = parameters, NO_VALUES
 
     def of(self, values: Mapping[str, Any]) -> Matrix:
         """The matrix with these values of its parameters.
@@ -90,7 +82,6 @@ class Matrix:
         found = copy.copy(self)
         found.values, found.volumetric = values, partial(self.volumetric, **values)
         found.others = tuple(partial(term, **values) for term in self.others)
-        found.derivatives = self.derivatives and partial(self.derivatives, **values)
         return found
 
     def __call__(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
@@ -117,28 +108,11 @@ def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any, **own:
     return lame_lambda / 2 * ln(jacobian) ** 2
 
 
-def neo_hookean_derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second: bool) -> tuple[Any, Any]:
-    """S = (lambda ln J - mu) C^-1 + mu I and dS/dC in the eigenbasis of C; arrays of n points."""
-    inverse = 1 / squared
-    volumetric = lame_lambda * np.log(squared).sum(axis=1) / 2 - lame_mu
-    value = np.zeros((len(squared), 3, 3))
-    value[:, range(3), range(3)] = volumetric[:, None] * inverse + np.reshape(lame_mu, (-1, 1))
-    if not second:
-        return value, None
-    entries = np.concatenate([inverse, np.zeros_like(inverse)], axis=1)
-    dyad = np.reshape(lame_lambda, (-1, 1, 1)) / 2 * entries[:, :, None] * entries[:, None, :]
-    rows, columns = tensors.ROWS, tensors.COLUMNS
-    dyad[:, range(6), range(6)] -= volumetric[:, None] * inverse[:, rows] * inverse[:, columns]
-    return value, dyad
-
-
 # its terms pass over parameters of a matrix that adds others to them
 neo_hookean = Matrix(
     logarithmic_dilatation,
     lambda F, lame_lambda, lame_mu, **own: lame_mu / 2 * (squared_norm(F) - 3),
     lambda F, lame_lambda, lame_mu, **own: -(lame_mu * ln(det(F))),
-    derivatives=neo_hookean_derivatives,
-    compiled="NEO_HOOKEAN",
 )
 """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
 
@@ -153,19 +127,9 @@ def mixed(matrices: Sequence[Matrix]) -> Matrix:
         for share, matrix in zip(shares, matrices, strict=True):
             yield values[share], matrix.of({name: values[name] for name in matrix.parameters})
 
-    def derivatives(squared: Any, lame_lambda: Any, lame_mu: Any, second: bool, **values: Any) -> tuple[Any, Any]:
-        stress: Any = 0.0
-        tangent: Any = 0.0
-        for share, matrix in parts(values):
-            its_stress, its_tangent = matrix.derivatives(squared, lame_lambda, lame_mu, second)
-            stress = stress + np.reshape(share, (-1, 1, 1)) * its_stress
-            tangent = tangent + np.reshape(share, (-1, 1, 1)) * its_tangent if second else None
-        return stress, tangent
-
     return Matrix(
         lambda J, lam, mu, **values: sum(share * matrix.volumetric(J, lam, mu) for share, matrix in parts(values)),
         lambda F, lam, mu, **values: sum(share * matrix.distortional(F, lam, mu) for share, matrix in parts(values)),
-        derivatives=derivatives,
         parameters=numbers,
     )
 
@@ -289,17 +253,8 @@ class Repulsion(WithParameters):
     derivatives
         Where M is no closed expression for UFL: dM/dC (n, 3, 3) and, on request, d^2M/dC^2 as Mandel matrices (n, 6, 6)
         from (C, A, second), arrays.
-    terms
-        For the coupling "implicit": G = dM/dC (n, 3, 3) and its derivatives by the cells and by C, (n, 6, 6), from
-        (eigenvalues of C (n, 3), cells, r0 (n,), whether derivatives are asked for; else None stands for them), in
-        the eigenbasis of C. The cells have `structure`, A (n, 3, 3), and `structure_by_cells()`, dA/dy (n, 6, 6). A
-        function, or its dotted name.
-    sees_axes
-        Whether `terms` are of cells with axes alone, not of a structure tensor.
     parameters
         Numbers of its own, keys of `[material]`. All of its functions take them by their names.
-    compiled
-        Under which name tensor.c has it; "": numpy computes what others do in C.
     values
         Of its parameters (`of`).
 
@@ -317,18 +272,15 @@ class Repulsion(WithParameters):
 
     sum: Callable[[Any, Sequence[UnitCell], Any], Any]
     derivatives: Callable[..., tuple[Array, Array | None]] | None = None
-    terms: Callable[..., Any] | str | None = None
-    sees_axes: bool = False
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
-    compiled: str = ""
     values: Mapping[str, Any] = field(default=NO_VALUES, compare=False)
-    functions = ("sum", "derivatives", "terms")
+    functions = ("sum", "derivatives")
 
 
 REPULSIONS: dict[str, Repulsion] = {
-    "axes": Repulsion(axes_sum, terms=f"{LOCAL_PROBLEM}.axes_terms", sees_axes=True, compiled="AXES"),
-    "log": Repulsion(log_sum, log_derivatives, terms=f"{LOCAL_PROBLEM}.log_terms", compiled="LOG"),
-    "length": Repulsion(length_sum, terms=f"{LOCAL_PROBLEM}.length_terms", compiled="LENGTH"),
+    "axes": Repulsion(axes_sum),
+    "log": Repulsion(log_sum, log_derivatives),
+    "length": Repulsion(length_sum),
 }
 
 

@@ -19,17 +19,14 @@ from remodel_fenicsx.model import spectral, tensor_law
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.chains import NO_PARAMETERS, NO_VALUES, Parameter
 from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
-from remodel_fenicsx.model.energy import LOCAL_PROBLEM, Tissue
+from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
 RankedFunction = Callable[[Array, Array, Array, Any, float, float], Array]
 Weights = Sequence[float]
 
-STRETCH_ITERATIONS = 60  # of Newton's method for one number; halved brackets alone reach a last digit from any start
 COMPLEX_STEP = 1e-30  # its square vanishes beside 1: derivatives are exact to rounding
-LOCKING_MARGIN = 1e-9  # of ln lambda_e: nearer to the locking stretch nothing is looked for
-STEEPNESS_DIFFERENCE = 1e-6  # of ln lambda_e, for the derivative of a, which only a tangent needs
 
 
 class Drive(NamedTuple):
@@ -138,18 +135,14 @@ class Law:
     target, follow
         Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
         `update` is made; r0 and kappa dt are (n,) or numbers. A scheme of second order needs them apart.
-    dimensions
-        Of laws towards a target by rank (`ranked`): the function of which `update` is made. The coupling "implicit"
-        asks for its slope.
+    is_ranked
+        Whether dimensions follow the rank of principal values (`ranked`).
     keeps_symmetry
         Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
     asks_kappa
         Whether kappa = 0 means that cells never change, so that there is no pass at all.
     share
         Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
-    response
-        For the coupling "implicit": cells at a strain and a driving tensor with their derivatives, as
-        `model.local_problem.tensor_response`; a function, or its dotted name.
     over_corrects
         Whether the coupling "staggered" may leave a symmetric solution with it.
     takes_set_points
@@ -158,9 +151,6 @@ class Law:
         Numbers of its own, keys of `[remodeling]`: `speed` takes them by their names, and the drive has them.
     speed
         The kappa that acts, from (kappa of the scene, temperature in K), where it is another.
-    compiled
-        Under which name tensor.c has it; "": numpy computes what others do in C.
-
     Examples
     --------
     Collagen that is lost, whatever acts on it (`ranked` makes laws of the paper's kind):
@@ -186,21 +176,17 @@ class Law:
     of_absolute_time: bool = False
     target: Callable[[Drive], tensor_law.Target] | None = None
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, Array | float], UnitCell] | None = None
-    dimensions: RankedFunction | None = None
     share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
+    is_ranked: bool = False
     keeps_symmetry: bool = False
     asks_kappa: bool = False
-    response: Callable[..., Any] | str | None = None
     over_corrects: bool = False
     takes_set_points: bool = False
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
     speed: Callable[..., float] | None = None
-    compiled: str = ""
 
 
-def ranked(
-    function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False, affine: bool = False
-) -> Law:
+def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
     """A law of the paper's kind (eqs. 8 to 11): axes at the drive's principal directions, dimensions by rank.
 
     Parameters
@@ -211,10 +197,6 @@ def ranked(
         kappa a number, or (n, 1) where regions differ. Points without a positive value, or kappa, keep their cells.
     has_limit, of_absolute_time
         As in `Law`.
-    affine
-        Whether l_new is an affine function of the target whose slope is the same for all ranks: the coupling
-        "implicit" is computed in C then.
-
     Returns
     -------
     Law
@@ -236,31 +218,19 @@ def ranked(
     """
 
     def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-        return by_rank(function, cells, drive, time_old, time_new).cells
+        return by_rank(function, cells, drive, time_old, time_new)
 
     return Law(
         update,
         has_limit,
         of_absolute_time=of_absolute_time,
-        dimensions=function,
         keeps_symmetry=True,
         asks_kappa=True,
-        response=f"{LOCAL_PROBLEM}.ranked_response",
-        compiled="AFFINE" if affine else "",
+        is_ranked=True,
     )
 
 
-class Ranked(NamedTuple):
-    """What a law by rank makes of cells, and of what; arrays of n points."""
-
-    values: Array
-    axes: Array
-    target: Array
-    active: NDArray[np.bool_]
-    cells: UnitCell
-
-
-def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> Ranked:
+def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
     """Axes at the principal directions (eqs. 8 and 9), dimensions towards r0 e (eqs. 10 and 11)."""
     values, axes = principal_directions(drive, cells.axes, drive.pairing)
     direction, active = drive.kernels.positive_direction(values, threshold=drive.noise)
@@ -274,7 +244,7 @@ def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: f
             np.where(active[:, None], new.dimensions, cells.dimensions),
             np.where(active[:, None, None], new.axes, cells.axes),
         )
-    return Ranked(values, axes, target, active, new)
+    return new
 
 
 def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
@@ -405,9 +375,9 @@ def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> U
 
 
 LAWS: dict[str, Law] = {
-    "explicit": ranked(explicit, has_limit=True, of_absolute_time=True, affine=True),
-    "rate": replace(ranked(rate, affine=True), over_corrects=True),
-    "relaxation": ranked(relaxation, has_limit=True, affine=True),
+    "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
+    "rate": replace(ranked(rate), over_corrects=True),
+    "relaxation": ranked(relaxation, has_limit=True),
     "tensor": Law(
         tensor,
         has_limit=True,
@@ -415,9 +385,7 @@ LAWS: dict[str, Law] = {
         follow=follow_tensor,
         keeps_symmetry=True,
         asks_kappa=True,
-        response=f"{LOCAL_PROBLEM}.tensor_response",
         takes_set_points=True,
-        compiled="TENSOR",
     ),
     "rotation": Law(rotation, share=turned_in_part),
     "none": Law(keep, remodels=False, keeps_symmetry=True),
@@ -529,7 +497,7 @@ class TurnoverRule(NamedTuple):
     followed: Followed
 
     def rates(self, tissue: Tissue, stretch: Any) -> TurnoverRates:
-        """Where chains have a stretch lambda_e (n,); complex for a derivative by a complex step."""
+        """Where chains have a stretch lambda_e (n,)."""
         chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
         return self.followed.rates(self, lambda some: chain.stiffness(some * r0, contour) * some, stretch)
@@ -558,73 +526,20 @@ def by_stress(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) -
     def steepness(some: Any) -> Any:
         return 1.0 + np.log(tension(some * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
 
-    present: Any = np.real(stretch)
-    steep, h = steepness(present), STEEPNESS_DIFFERENCE
-    if np.iscomplexobj(stretch):
-        slope = (steepness(present * (1 + h)) - steepness(present * (1 - h))) / (2 * h * present)
-        steep = steep + 1j * np.imag(stretch) * slope
+    steep = steepness(stretch)
     relative = tension(stretch) * stretch / (tension(rule.deposition_stretch) * rule.deposition_stretch)
     produced = 1.0 + rule.gain * (relative - 1.0)
-    produced = np.where(np.real(produced) > 0.0, produced, 0.0)
+    produced = np.maximum(produced, 0.0)
     return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (steep * rule.time))
 
 
 def by_tension(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) -> TurnoverRates:
     """Rates `tension`."""
     relative = tension(stretch) / tension(rule.deposition_stretch) - 1.0
-    limited = np.where(np.abs(np.real(relative)) < 1.0, relative, np.sign(np.real(relative)))
-    content = rule.gain / rule.time * limited
-    turned_over = 1.0 / rule.time + np.where(np.real(content) > 0.0, content, 0.0)
+    content = rule.gain / rule.time * np.clip(relative, -1.0, 1.0)
+    turned_over = 1.0 / rule.time + np.maximum(content, 0.0)
     return TurnoverRates(content, turned_over * (stretch / rule.deposition_stretch - 1.0))
 
 
 TURNOVER_RATES = {"cauchy": Followed(by_stress, 2), "tension": Followed(by_tension, 1)}
 """By the name that `remodeling.turnover.rates` has."""
-
-
-class TurnedOver(NamedTuple):
-    """Content and natural length at the end of a step as functions of r at its end, and their slopes by ln r."""
-
-    content: Array | float
-    natural_length: Array | float
-    content_slope: Array | float
-    natural_length_slope: Array | float
-
-
-def turned_over_at_the_end(rule: TurnoverRule, tissue: Tissue, length: Array, duration: float) -> TurnedOver:
-    """m and rho after a step with the rates at its end (backward Euler), where r there is `length`."""
-    # One number at each point: y = ln lambda_e with
-    # ln(r/r0) - y - ln rho_0 = duration (d ln rho / dt)(y), ln rho = ln(r/r0) - y.
-    # The left side falls and the right side rises with y. The solution lies between the stretch with rho_0, and
-    # lambda_h, where the right side is zero. Where it were beyond the locking stretch there is none: then rho is such
-    # that r/(rho L) >= 1.
-    assert tissue.chain is not None
-    start = np.log(length / (tissue.end_to_end_length * tissue.natural_length))
-    deposited = np.full_like(start, np.log(rule.deposition_stretch))
-    locked = np.log(tissue.contour_length / tissue.end_to_end_length) if tissue.chain.locks else np.inf + 0 * start
-    below = locked - LOCKING_MARGIN  # where the tension is still a number
-
-    def missing(y: Array) -> tuple[Array, Array]:
-        found = rule.rates(tissue, np.exp(y + 1j * COMPLEX_STEP))
-        change = duration * found.natural_length
-        return start - y - change.real, -1.0 - change.imag / COMPLEX_STEP
-
-    low, high = np.minimum(start, deposited), np.minimum(np.maximum(start, deposited), below)
-    lost = (high >= below) & (missing(high)[0] > 0.0)
-    y = np.clip(start, low, high)
-    for _ in range(STRETCH_ITERATIONS):
-        value, slope = missing(y)
-        low, high = np.where(value > 0.0, y, low), np.where(value > 0.0, high, y)
-        better = y - value / slope
-        better = np.where((better >= low) & (better <= high), better, (low + high) / 2)
-        if np.all(np.abs(better - y) <= np.finfo(float).eps * (1.0 + np.abs(y))):
-            break
-        y = better
-    # beyond the locking stretch: as much as r is beyond the largest one that the step can follow
-    found = rule.rates(tissue, np.exp(y + 1j * COMPLEX_STEP))
-    y = np.where(lost, locked + missing(y)[0], y)
-    by_stretch = [np.imag(rate) * duration / COMPLEX_STEP for rate in found]  # of the changes of ln m and ln rho, by y
-    answer = 1.0 / (1.0 + by_stretch[1])  # dy / d ln r
-    content = tissue.content * np.exp(duration * np.real(found.content))
-    natural_length = length / (tissue.end_to_end_length * np.exp(y))
-    return TurnedOver(content, natural_length, by_stretch[0] * answer, 1.0 - answer)

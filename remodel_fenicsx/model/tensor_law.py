@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model import tensors
-
 Array = NDArray[np.float64]
 
 COMPRESSION = 0.01
@@ -91,36 +89,6 @@ def weight_of_the_end(kappa_dt: Array | float) -> Array:
     short = z < 1e-3
     long = np.where(short, 1.0, z)
     return np.where(short, 0.5 + z / 12, -1.0 / np.expm1(-long) - 1.0 / long)
-
-
-def target_derivatives(tensor: Array, floor: Array | float) -> tuple[Array, Array]:
-    """dE/dD as Mandel matrices (n, 6, 6) and ds/dD as Mandel vectors (n, 6); arguments as for `target`."""
-    # With v the principal values of D, N = (D+)^2 changes across two of its axes by v_i + v_j, where both are positive,
-    # by v+^2 / |v_i - v_j| where one is: no difference of nearly equal numbers, and continuous where they agree.
-    values, vectors = np.linalg.eigh(tensor)
-    largest = np.abs(values).max(axis=1)
-    unit = np.where(largest > 0, largest, 1.0)
-    v = values / unit[:, None]
-    tension, compression = np.maximum(v, 0.0), np.minimum(v, 0.0)
-    positive, negative = (tension**2).sum(axis=1), (compression**2).sum(axis=1)
-    some = np.where(positive > 0, positive, 1.0)
-    by_values = np.zeros((len(v), 6, 6))
-    weights = tension**2 / some[:, None]
-    by_values[:, range(3), range(3)] = 2 * tension / some[:, None]
-    by_values[:, :3, :3] -= weights[:, :, None] * 2 * tension[:, None, :] / some[:, None, None]
-    for row, (i, j) in enumerate(tensors.PAIRS, start=3):
-        apart = np.maximum(np.abs(v[:, i] - v[:, j]), np.finfo(float).tiny)
-        both = (v[:, i] > 0) & (v[:, j] > 0)
-        one = np.maximum(tension[:, i], tension[:, j]) ** 2 / apart
-        by_values[:, row, row] = np.where(both, v[:, i] + v[:, j], one) / some
-    to_axes = tensors.congruence(vectors)
-    direction = to_axes @ (by_values / unit[:, None, None]) @ np.swapaxes(to_axes, 1, 2)
-    against = COMPRESSION * negative + (np.asarray(floor) / unit) ** 2
-    total = positive + against
-    slope = 2 * (tension * against[:, None] - COMPRESSION * positive[:, None] * compression)
-    slope /= (np.where(total > 0, total, 1.0) ** 2 * unit)[:, None]
-    by_tensor: Array = np.einsum("nab,nb->na", to_axes, tensors.on_diagonal(slope))
-    return direction, by_tensor
 
 
 def follow(structure: Array, towards: Target, end_to_end_length: Array | float, kappa_dt: Array | float) -> Array:

@@ -17,7 +17,6 @@ is written here goes over into them without a difference of nearly equal numbers
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -126,62 +125,12 @@ def from_mandel(components: Array) -> Array:
     return found
 
 
-UNITS = from_mandel(np.eye(6))
-"""The six symmetric tensors with one Mandel component each, (6, 3, 3)."""
-TURNS = np.sign(UNITS[3:]) * np.sign(np.arange(3) - np.arange(3)[:, None])
-"""The turns in the planes of `PAIRS`: one at ij, minus one at ji, (3, 3, 3)."""
-
-
-def diagonal(entries: Array) -> Array:
-    """Matrix (n, 6, 6) of the map that multiplies component ij of a tensor by entry ij (n, 3, 3)."""
-    found = np.zeros((len(entries), 6, 6))
-    found[:, range(6), range(6)] = entries[:, ROWS, COLUMNS]
-    return found
-
-
-def linear_map(function: Callable[[Array], Array]) -> Array:
-    """Matrix of a linear map of symmetric tensors, in Mandel components.
-
-    Parameters
-    ----------
-    function
-        The map, of a tensor H (3, 3), for n points: (n, 3, 3). Only the symmetric part of what it returns is seen.
-
-    Returns
-    -------
-    array
-        (n, 6, 6). Components are in the order 11, 22, 33, 23, 13, 12; those off the diagonal are times sqrt(2).
-
-    Examples
-    --------
-    H -> S H, for one point:
-
-    >>> import numpy as np
-    >>> from remodel_fenicsx.extend import linear_map
-    >>> S = np.diag([1.0, 2.0, 3.0])[None]
-    >>> linear_map(lambda H: S @ H)[0].diagonal()
-    array([1. , 2. , 3. , 2.5, 2. , 1.5])
-    """
-    values = (function(unit) for unit in UNITS)
-    return np.stack([to_mandel((value + np.swapaxes(value, -1, -2)) / 2) for value in values], axis=-1)
-
-
 def congruence(X: Array) -> Array:
     """Matrix (n, 6, 6) of H -> X H X^T; of a rotation: from its columns to the global axes."""
-    # X_ia X_jb + X_ib X_ja by index: `linear_map` takes four times as long, the most of an implicit step
+    # X_ia X_jb + X_ib X_ja by index
     first, second = ROWS[:, None], COLUMNS[:, None]
     products = X[:, first, ROWS] * X[:, second, COLUMNS] + X[:, first, COLUMNS] * X[:, second, ROWS]
     return np.asarray(FACTORS[:, None] * FACTORS / 2 * products)
-
-
-def dyads(left: Array, right: Array) -> Array:
-    """Matrix (n, 6, 6) of H -> a (b : H), from Mandel components (n, 6)."""
-    return left[:, :, None] * right[:, None, :]
-
-
-def on_diagonal(values: Array) -> Array:
-    """Mandel components (n, 6) of diagonal tensors, from (n, 3)."""
-    return np.concatenate([values, np.zeros_like(values)], axis=1)
 
 
 # ---------------------------------------------------------------- eigenvalues and logarithm

@@ -141,8 +141,6 @@ PRESET_NOTES = {
 
 # ---------------------------------------------------------------- profiles
 
-EXACT = "implicit"  # coupling
-
 
 @dataclass(frozen=True)
 class Profile:
@@ -153,7 +151,6 @@ class Profile:
     percent: float
     seconds: float
     cells: str = "isotropic"
-    takes_exact_coupling: bool = False
     is_for_means: bool = False
 
     def in_words(self, name: str) -> str:
@@ -167,8 +164,6 @@ class Profile:
     def settings_in_words(self) -> str:
         """The keys that it sets."""
         settings = ", ".join(f"{key} = {value}" for key, value in self.values.items())
-        if self.takes_exact_coupling:
-            settings += f", remodeling.coupling = {EXACT} where that leaves no error in time"
         if self.is_for_means:
             settings += (
                 " or, of a tube, sector with cells.antithetic: their means over seeds are nearly those of the whole"
@@ -180,8 +175,6 @@ class Profile:
         found = dict(self.values)
         if self.is_for_means and (part := for_means(scene)) != AUTO:
             found |= {"model.kinematics": part, "cells.antithetic": True}  # of fewer cells each draw scatters more
-        if self.takes_exact_coupling and scene.has_exact_coupling:
-            found["remodeling.coupling"] = EXACT
         return found
 
 
@@ -201,7 +194,7 @@ def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
 PROFILES: dict[str, Profile] = {
     "fast": Profile(_values(1, 1, 1.0), 1.4, 0.7, 0.2),
     "balanced": Profile(_values(1, 2, 0.5), 0.5, 0.5, 0.4),
-    "reference": Profile(_values(2, 2, 0.1), 0.0036, 0.0008, 1.4, takes_exact_coupling=True),
+    "reference": Profile(_values(2, 2, 0.1), 0.0036, 0.0008, 1.4),
 }
 """Points of the front of docs/speed_and_accuracy.md; `remodel-fenicsx trade SCENE` measures any scene."""
 

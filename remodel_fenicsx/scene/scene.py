@@ -382,20 +382,6 @@ class Scene(Table):
         ratio = f"lambda/mu = {self._stiffness_ratio:.4g}"
         return f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
 
-    def missing_for_implicit(self) -> str | None:
-        """What the scene lacks for the coupling "implicit"; None where it lacks nothing."""
-        return COUPLINGS[presets.EXACT].missing(self)
-
-    @property
-    def has_exact_coupling(self) -> bool:
-        """Whether the coupling "implicit" leaves no error in time: steps of any length lead to the same cells.
-
-        So it is where the cells depend on the time and the tension that they have then alone. From random cells some
-        points have no such state (docs/laws_and_couplings.md).
-        """
-        depends_on_now = LAWS[self.remodeling.law].of_absolute_time and not self.jumps_by_rank
-        return depends_on_now and self.missing_for_implicit() is None
-
     @property
     def end_of_ramps(self) -> float:
         """The time from which on no load changes; 0 without loads."""
@@ -453,7 +439,7 @@ class Scene(Table):
     @property
     def jumps_by_rank(self) -> bool:
         """Whether cells whose lengths differ from point to point go from rank to rank, under a law of lengths."""
-        return LAWS[self.remodeling.law].dimensions is not None and (self.has_random_cells or bool(self.measured_cells))
+        return LAWS[self.remodeling.law].is_ranked and (self.has_random_cells or bool(self.measured_cells))
 
     @property
     def is_as_run(self) -> bool:
@@ -587,8 +573,7 @@ class Scene(Table):
         return [
             *found,
             f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
-            "length overshoot in each step; set a shorter time.step, time.tolerance, or remodeling.coupling = "
-            "'implicit'",
+            "length overshoot in each step; set a shorter time.step or time.tolerance",
         ]
 
     def with_values(self, changes: Mapping[str, Any]) -> Scene:

@@ -40,6 +40,7 @@ from remodel_fenicsx.schema.tables import (
     IN_A_LIST,
     KeysOfParts,
     OneOf,
+    SceneError,
     Table,
     fault,
     named,
@@ -604,33 +605,13 @@ class CouplingKind:
         return resolved(self.coupling)
 
 
-def _missing_for_implicit(scene: Scene) -> str | None:
-    if scene.jumps_by_rank and not scene.is_as_run:  # a run that was begun goes on, up to a step without a solution
-        return (
-            "remodeling.law = 'tensor', or cells.initial 'isotropic', 'aligned' or three lengths: by rank other cells "
-            f"jump, and points have no solution; with remodeling.law = {scene.remodeling.law!r} they can have "
-            "remodeling.coupling 'staggered' or 'relaxed'"
-        )
-    return missing_for_steps_of_cells(scene)
+IMPLICIT = "implicit"
+IN_ITS_PLACE = "take 'extrapolated' with remodeling.law = 'tensor', or 'staggered' with smaller steps"
 
 
-def missing_for_steps_of_cells(scene: Scene) -> str | None:
-    """What a scene lacks for cells that a solve finds, of whatever cells it starts from; None: nothing."""
-    from remodel_fenicsx.model.local_problem import refused  # six modules that most runs need not load
-
-    material, remodeling = scene.material, scene.remodeling
-    if scene.formulation != "displacement":
-        return "mesh.formulation = 'displacement': in the others the stress at a point depends on its whole element"
-    properties = scene.properties().values()
-    if not any(one.material.chain_density for one in properties):
-        return "chains: material.chain_density above 0"
-    if scene.cases[1:]:
-        return "a scene without [[cases]]: it finds the cells for the stress of one load case"
-    if remodeling.has_set_point:
-        return "remodeling.exponent = 2 and remodeling.threshold = 0: derivatives of other targets are not known"
-    parts = LAWS[remodeling.law], DRIVERS[remodeling.driver], FRAMES[remodeling.frame]
-    matrices = [MATRICES[one.material.matrix] for one in properties]
-    return next(filter(None, (refused(*parts, matrix, REPULSIONS[material.repulsion]) for matrix in matrices)), None)
+def _refuse_implicit(*parts: Any) -> Any:
+    text = f"this run can only be continued by version 0.4.0; {IN_ITS_PLACE}"
+    raise SceneError(f"remodeling.coupling = {IMPLICIT!r}: {text}")
 
 
 COUPLINGS = {
@@ -656,13 +637,11 @@ COUPLINGS = {
         takes_cases=True,
         takes_turnover=True,
     ),
-    "implicit": CouplingKind(
-        "find cells and equilibrium of the same step together; for the law 'tensor', and for the laws of the paper "
-        "with cells that are not random",
-        "remodel_fenicsx.evolution.implicit:Implicit",
+    IMPLICIT: CouplingKind(
+        f"of runs made with version 0.4.0 and before, which are read; {IN_ITS_PLACE}",
+        _refuse_implicit,
         takes_turnover=True,
-        solves_cells=True,
-        missing=_missing_for_implicit,
+        missing=lambda scene: None if scene.is_as_run else f"version 0.4.0; {IN_ITS_PLACE}",
     ),
 }
 """Couplings by the name that a scene gives them."""
@@ -769,7 +748,7 @@ class Remodeling(Table):
     """Which cell dimension follows which principal value. 'sorted': by rank, as printed; where two values cross, the
     cell turns by 90 degrees at once. 'continuous': each principal direction continues the axis that it overlaps
     most."""
-    coupling: Annotated[str, OneOf(COUPLINGS)] = Field(
+    coupling: Annotated[str, OneOf(COUPLINGS, removed={IMPLICIT: IN_ITS_PLACE})] = Field(
         default="staggered",
         description=f"In which order a step solves and remodels. {meanings(COUPLINGS)}. The default with the law "
         "'tensor' is 'extrapolated' (docs/laws_and_couplings.md).",
@@ -1212,12 +1191,9 @@ class Time(Table):
         parts = scene.properties().items()
         bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
         still = [f"{in_region(name)}remodeling.kappa" for name, one in parts if one.kappa == 0]
-        later = "set time.end to a late time"
         reasons = {
             f"remodeling.law = {remodeling.law!r} has no limit that is the same on every path; allowed are the laws "
             + laws: not LAWS[remodeling.law].has_limit,
-            f"remodeling.threshold is above 0: where cells rest depends on the path; {later}": remodeling.threshold,
-            f"remodeling.exponent is not 2: derivatives of its target are not known; {later}": remodeling.has_set_point,
             f"needs chains: {', '.join(bare)} above 0": bare,
             f"{', '.join(still)} = 0: the cells never change": still,
         }

@@ -139,7 +139,7 @@ class OneOf:
     @property
     def choices(self) -> list[Any]:
         """All that is allowed."""
-        return [*self.also, *self.registry]
+        return [*self.also, *(name for name in self.registry if name not in (self.removed or ()))]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(self._check, handler(source))
@@ -148,9 +148,9 @@ class OneOf:
         return {"enum": self.choices}
 
     def _check(self, value: Any) -> Any:
-        if self.removed and value in self.removed:
+        if self.removed and value in self.removed and value not in self.registry:
             raise fault(self.removed[value])
-        if value is not None and value not in self.choices:
+        if value is not None and value not in (*self.also, *self.registry):
             raise ValueError("not registered")
         return value
 

@@ -135,7 +135,6 @@ class Change:
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
     roughly: bool = False
-    most_iterations: float = np.inf
     refusal: Refusal | None = field(default=None, init=False)  # what there was no way past but by a jump
     _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
 
@@ -301,7 +300,7 @@ class Change:
             )  # fmt: skip
 
     def _halved(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
-        if part / 2 < self._smallest or work.newton_iterations > self.most_iterations:
+        if part / 2 < self._smallest:
             text = failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last state that was solved
             found = diagnosed(self.newton, failure, self._direction)

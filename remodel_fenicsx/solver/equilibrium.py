@@ -173,7 +173,12 @@ class Equilibrium:
         self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.stress_free_weight(mesh))
         external = loading.external_residual(test)
         self.pointwise = pointwise_repulsion(state, self.tissue, shares, point_shares)
-        internal, tangents = self.internal_and_tangents(F, test, trial)
+        internal = [ufl.derivative(energy, u, test) for energy in self.energies]
+        tangents = [second_derivative(energy, u, test, trial) for energy in self.energies]
+        if self.pointwise is not None:
+            weight, dx = state.kinematics.stress_free_weight(mesh), self.quadrature.dx
+            internal[0] += self.pointwise.residual(u, F, test) * weight * dx
+            tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
         self.internal_forms = [jit.form(form) for form in internal]
         self.external_form = None if external is None else jit.form(external)
         # apart, so that bodies with other loads share the costly one
@@ -186,17 +191,6 @@ class Equilibrium:
         length = ufl.as_ufl(0.0 if self.tissue.locking_length is None else self.tissue.locking_length)
         self._known: Remembered[Look] = Remembered(self.comm, limits, length)
         self._energy_forms: list[Any] = []
-
-    def internal_and_tangents(self, F: Any, test: Any, trial: Any) -> tuple[list[Any], list[Any]]:
-        """Virtual work of the stresses and its derivative by the unknowns, UFL forms to be added up."""
-        u = self.state.unknown
-        internal = [ufl.derivative(energy, u, test) for energy in self.energies]
-        tangents = [second_derivative(energy, u, test, trial) for energy in self.energies]
-        if self.pointwise is not None:
-            weight, dx = self.state.kinematics.stress_free_weight(self.quadrature.mesh), self.quadrature.dx
-            internal[0] += self.pointwise.residual(u, F, test) * weight * dx
-            tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
-        return internal, tangents
 
     # ------------------------------------------------------------ what users ask
     def extension(self) -> Extension:

@@ -105,7 +105,6 @@ SINGLE_ERROR = 0.5  # relative, of the answer to the softest motion: 0.36 (40,80
 # L-BFGS learns such motions; above 1 a factor may even have another sign there
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; Newton's method goes on, as often again
 
-WORTH_A_FACTOR = 10  # iterations of GMRES with a factor: 4 of 40 ms (a tube in 3D, 5,600 unknowns)
 LAST, SURELY = 1e-5, 0.3  # relative, of a linear solve that ends it all: tried down to LAST; share of what is needed
 
 
@@ -402,27 +401,6 @@ class EveryTangent:
 
     def close(self) -> None:
         """Free PETSc's objects."""
-
-
-class Preconditioned(EveryTangent):
-    """GMRES with the factor of an earlier tangent; in each solve the second tangent makes a new one."""
-
-    # The first stands where loads and time have jumped, which may be an indefinite place beside the way of the body.
-    # One is also made after a system that took as many iterations as a factor costs.
-
-    _before = 0  # tangents before the solve
-
-    def begin(self) -> None:
-        self._before = self.tangents
-
-    def renew(self) -> None:
-        super().renew()
-        slow = self.snes.getKSP().getIterationNumber() > WORTH_A_FACTOR
-        if self._always or slow or self.tangents in (1, self._before + 2):
-            self._set_up()
-
-    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return "with a factor of every tangent", self._anew()
 
 
 class Multigrid(EveryTangent):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -244,8 +244,6 @@ def failure_text(reason: int, iterations: int, extension: Extension) -> str:
 class GuardedNewton:
     """Solves an equilibrium from the present unknowns; use `close` when it is needed no more."""
 
-    methods: Mapping[str, str] = {}  # in place of those that `auto` chooses
-
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
         self.equilibrium, self.settings, self._robust = equilibrium, settings, robust
         self.unknown = equilibrium.state.unknown
@@ -262,8 +260,7 @@ class GuardedNewton:
         """PETSc's objects of the method, which a body has for all of its steps."""
         equilibrium, settings, kinematics = self.equilibrium, self.settings, self.equilibrium.state.kinematics
         unknowns, ranks, narrow = self._x.getSize(), equilibrium.comm.size, not kinematics.three_dimensional
-        method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
-        self.method = method = self.methods.get(method, method) if settings.method == AUTO else method
+        self.method = method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
@@ -311,10 +308,6 @@ class GuardedNewton:
                     raise
                 solution.count(failure)
                 return solution
-
-    def gives_up(self, trial: Look) -> bool:
-        """Whether no step shorter than the one to this trial state is worth its cost; the solve then fails."""
-        return False
 
     def may_start(self, last_extension: float) -> bool:
         """Whether the present unknowns, from which `solve` is to start, are admissible and not too near to locking."""
@@ -479,7 +472,7 @@ class GuardedNewton:
             trial.waxpy(-1.0, step, x)
             self._push(trial)
             after = self.limits.look()
-            if after.extension.stop_signal or self.limits.allow(before, after) or self.gives_up(after):
+            if after.extension.stop_signal or self.limits.allow(before, after):
                 break
             step.scale(0.5)
         else:

@@ -20,7 +20,7 @@ from remodel_fenicsx.body.shape import FromFile, PROFILE
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
-from remodel_fenicsx.scene.presets import EXACT, PROFILES, profile_for
+from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import COLOURS, Answer
@@ -34,7 +34,6 @@ Array = NDArray[np.float64]
 
 # ---------------------------------------------------------------- settings of a scene from coarse to fine
 SECONDS_PER_POINT = 3e-5  # of a step: a first guess, corrected by the runs
-COST_OF_EXACT = 20.0  # of a step with the coupling that has no error in time, in others, as measured on the artery
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
 STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
@@ -42,7 +41,7 @@ MESHES = ((1, 1), (2, 1), (4, 1), (8, 1), (1, 2), (2, 2), (4, 2))  # refinement,
 TOGETHER = ((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25))  # both finer: refinement, degree, step in the scene's
 SEEDS = 3  # where another mesh draws other cells
 COMPARED = 8  # times at which rows are compared, beside corners of ramps and the end
-STRETCH, COUPLING, KINEMATIC = "mean_stretch", "remodeling.coupling", "model.kinematics"
+STRETCH, KINEMATIC = "mean_stretch", "model.kinematics"
 
 
 @dataclass(frozen=True)
@@ -56,10 +55,9 @@ class Setting:
 
     @property
     def key(self) -> str:
-        """What it is: kinematics, mesh, steps, and a coupling of its own."""
+        """What it is: kinematics, mesh and steps."""
         kinematics, refinement, degree = self.mesh
-        coupling = f"-{self.way[1]}" if COUPLING in self.changes else ""
-        return f"{kinematics}-{refinement}-degree-{degree}-{self.steps_in_words.replace(' ', '-')}{coupling}"
+        return f"{kinematics}-{refinement}-degree-{degree}-{self.steps_in_words.replace(' ', '-')}"
 
     @property
     def name(self) -> str:
@@ -77,19 +75,16 @@ class Setting:
         return self.scene.model.kinematics, self.scene.mesh.refinement, self.scene.mesh.degree
 
     @property
-    def way(self) -> tuple[str, str]:
-        """Kinematics and coupling: what a step costs goes by them."""
-        return self.scene.model.kinematics, self.scene.remodeling.coupling
+    def kinematics(self) -> str:
+        """What a step costs goes by them."""
+        return self.scene.model.kinematics
 
     @property
     def expected_seconds(self) -> float:
         """Of one of its runs, roughly."""
-        time, is_exact = self.scene.time, self.scene.remodeling.coupling == EXACT
-        steps: float = time.number_of_steps
-        if time.tolerance is not None:  # where steps have no error they are as long as they may be
-            steps = COMPARED if is_exact else DEGREES_PER_RUN / time.tolerance
-        cost = step_cost(self.scene, self.scene.model.kinematics) * (COST_OF_EXACT if is_exact else 1.0)
-        return SECONDS_PER_POINT * cost * steps
+        time = self.scene.time
+        steps = time.number_of_steps if time.tolerance is None else DEGREES_PER_RUN / time.tolerance
+        return SECONDS_PER_POINT * step_cost(self.scene, self.scene.model.kinematics) * steps
 
     @property
     def steps_in_words(self) -> str:
@@ -112,13 +107,6 @@ def ladder(scene: Scene) -> list[Setting]:
     wanted += [finer(refinement, degree) | {"time.step": factor * step} for refinement, degree, factor in TOGETHER]
     for tolerance in TOLERANCES if remodels else ():
         wanted += [finer(2, 2) | {"time.tolerance": tolerance}, {"time.tolerance": tolerance}]
-    if base.has_exact_coupling and base.remodeling.coupling != EXACT:  # long steps are as good as short ones, and pay
-        longer = [{COUPLING: EXACT, "time.step": factor * step} for factor in STEPS if factor > 1]
-        allowed = [values["time.step"] for values in longer if _setting(base, values)]
-        wanted += longer + [
-            {COUPLING: EXACT, "time.step": max(allowed, default=step)} | finer(*mesh) for mesh in MESHES
-        ]
-        wanted += [{COUPLING: EXACT, "time.tolerance": tolerance} | finer(2, 2) for tolerance in TOLERANCES[:1]]
     for name in dict.fromkeys((choice(scene).name, "sector", "full")):
         if name == choice(scene).name or not (objections(scene, name) or is_for_means(scene, name)):
             wanted.append({KINEMATIC: name})
@@ -274,33 +262,28 @@ class Row:
 
 
 class _Guess(NamedTuple):
-    """Of the exact result: what settings of one coupling tend to."""
+    """Of the exact result: what settings with fixed steps tend to."""
 
     angles: Array
     lengths: Array
     unknown: float
-    beyond: float
     notes: list[str]
 
 
 def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
     """Rows with errors against the best guess of the exact result, and what it rests on."""
     results = _on_the_mean(results)
-    by_coupling: dict[str, list[Result]] = {}
-    for result in results:
-        if result.setting.step is not None:
-            by_coupling.setdefault(result.setting.way[1], []).append(result)
-    if not by_coupling:
+    fixed = [result for result in results if result.setting.step is not None]
+    if not fixed:
         return [Row(result, np.nan, np.nan, doubt="nothing to compare with") for result in results], []
-    guesses = [_guess(same) for same in by_coupling.values()]
-    best = min(guesses, key=lambda guess: float(np.hypot(guess.unknown, guess.beyond)))
-    rows = sorted((_row(result, best) for result in results), key=lambda row: row.result.seconds)
+    guess = _guess(fixed)
+    rows = sorted((_row(result, guess) for result in results), key=lambda row: row.result.seconds)
     on_front = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
-    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], best.notes
+    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], guess.notes
 
 
 def _guess(fixed: Sequence[Result]) -> _Guess:
-    """What settings with fixed steps, and one coupling, tend to."""
+    """What settings with fixed steps tend to."""
     finest = min(fixed, key=_fineness)
     angles, lengths, unknown, notes = finest.angles, finest.lengths, 0.0, []
     sweeps = [_time_sweep(fixed)]
@@ -320,7 +303,7 @@ def _guess(fixed: Sequence[Result]) -> _Guess:
         notes.append(_in_words(sweep, found))
         if not found.trusted:
             unknown = max(unknown, typical(found.last)) if np.isfinite(found.last).any() else np.inf
-    return _Guess(angles, lengths, unknown, typical(angles - finest.angles), notes)
+    return _Guess(angles, lengths, unknown, notes)
 
 
 def _row(result: Result, guess: _Guess) -> Row:
@@ -451,7 +434,7 @@ class _TradeStudy(Study):
         self._results: dict[str, Result] = {}
         self._begun: dict[str, float] = {}
         self._start = 0.0  # seconds before the first step: mesh, kernels, the search for an unloaded body
-        self._pace: dict[tuple[str, str], float] = {}  # seconds over those expected, by kinematics and coupling
+        self._pace: dict[str, float] = {}  # seconds over those expected, by kinematics
 
     @property
     def results(self) -> list[Result]:
@@ -484,7 +467,7 @@ class _TradeStudy(Study):
 
     def _seconds(self, setting: Setting) -> float:
         """Of a run, by what others of its kind have taken, or else by the slowest."""
-        pace = self._pace.get(setting.way, max(self._pace.values(), default=1.0))
+        pace = self._pace.get(setting.kinematics, max(self._pace.values(), default=1.0))
         return self._start + pace * setting.expected_seconds
 
     def _needed(self) -> str:
@@ -504,7 +487,7 @@ class _TradeStudy(Study):
             with suppress(RecordingError):  # one that is damaged will be among those that have failed
                 if all(run.is_complete() for run in runs):
                     result = self._results[setting.name] = read(setting, runs, self.times)
-                    self._pace[setting.way] = max(result.wall_seconds / setting.expected_seconds, 0.1)
+                    self._pace[setting.kinematics] = max(result.wall_seconds / setting.expected_seconds, 0.1)
                     took = [clock.monotonic() - self._begun[run.name] for run in runs if run.name in self._begun]
                     self._start = max(min(took, default=0.0) - result.wall_seconds, 0.0)
 
@@ -601,7 +584,7 @@ class Trade(Answer):
         """Cost against error; points of the front have numbers, and beside the axes stands what they are."""
         shown = [row for row in self.rows if row.angle_error > 0]
         front = [row for row in shown if row.on_front]
-        kinds = dict(zip(dict.fromkeys(row.result.setting.way for row in shown), COLOURS, strict=False))
+        kinds = dict(zip(dict.fromkeys(row.result.setting.kinematics for row in shown), COLOURS, strict=False))
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         axes = figure.subplots()
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
@@ -609,9 +592,9 @@ class Trade(Answer):
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
         axes.plot(*_places(front), color="0.6", zorder=0, lw=0.8)
-        for way, colour in kinds.items():
-            same = [row for row in shown if row.result.setting.way == way]
-            axes.plot(*_places(same), "o", color=colour, markerfacecolor="white", markersize=4, label=", ".join(way))
+        for kinematics, colour in kinds.items():
+            same = [row for row in shown if row.result.setting.kinematics == kinematics]
+            axes.plot(*_places(same), "o", color=colour, markerfacecolor="white", markersize=4, label=kinematics)
             axes.plot(*_places([row for row in same if row.on_front]), "o", color=colour, markersize=5)
         if kinds:
             figure.legend(loc="outside lower left", ncols=3)

@@ -338,7 +338,7 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with pytest.raises(
         SceneError,
-        match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated', 'implicit'$",
+        match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated'$",
     ):
         scene(remodeling={"coupling": "late"})
     late = extend.CouplingKind("as staggered, but the cells stay as they are up to t = 2", Late)

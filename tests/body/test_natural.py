@@ -124,18 +124,13 @@ def rows(**changes: Any) -> list[dict[str, float]]:
 
 
 def test_couplings_see_the_residual_stress() -> None:
-    """Staggered, extrapolated and implicit steps tend to one way; the tangent of implicit steps sees G."""
-    ends, iterations = {}, {}
-    for coupling, step in (("staggered", 0.25), ("extrapolated", 1.0), ("implicit", 1.0)):
-        run = rows(**{"remodeling.coupling": coupling, "time.step": step, "time.end": 40.0})
-        ends[coupling], iterations[coupling] = run[-1], sum(row["newton_iterations"] for row in run)
-    for column, close in (("inner_radius", 3e-3), ("fibre_angle_inner", 0.25), ("fibre_angle_outer", 0.15)):
-        for coupling in ("staggered", "implicit"):
-            assert ends[coupling][column] == pytest.approx(ends["extrapolated"][column], abs=close), (coupling, column)
-    without = rows(
-        **{"remodeling.coupling": "implicit", "time.step": 1.0, "time.end": 40.0, "natural.opening_angle": 0.0}
+    """Staggered and extrapolated steps tend to one way."""
+    staggered, extrapolated = (
+        rows(**{"remodeling.coupling": coupling, "time.step": step, "time.end": 40.0})[-1]
+        for coupling, step in (("staggered", 0.25), ("extrapolated", 1.0))
     )
-    assert iterations["implicit"] <= 1.2 * sum(row["newton_iterations"] for row in without)
+    for column, close in (("inner_radius", 3e-3), ("fibre_angle_inner", 0.25), ("fibre_angle_outer", 0.15)):
+        assert staggered[column] == pytest.approx(extrapolated[column], abs=close), column
 
 
 def test_the_equilibrium_is_the_end_of_time() -> None:

@@ -69,13 +69,6 @@ def test_the_whole_tube_has_it() -> None:
         assert rows[1][name] == pytest.approx(rows[0][name], rel=1e-5)
 
 
-def test_the_implicit_coupling_finds_what_small_steps_find() -> None:
-    steps = {"implicit": 1.0, "extrapolated": 0.25}
-    rows = [last_row(scene(remodeling={"coupling": name}, time={"step": step})) for name, step in steps.items()]
-    for name in ("inner_radius", "fibre_angle_media"):
-        assert rows[0][name] == pytest.approx(rows[1][name], rel=2e-3)
-
-
 def test_fields_of_it_are_empty(tmp_path: Path) -> None:
     """No angle, no chain lines of any length."""
     folder = run(scene(output={"fields": True}, time={"end": 2.0}), tmp_path / "run", SELF)
@@ -109,12 +102,9 @@ def scaled() -> Iterator[None]:
     def others(F: Any, lam: Any, mu: Any, factor: Any) -> Any:
         return factor * neo_hookean.distortional(F, lam, mu)
 
-    def derivatives(squared: Any, lam: Any, mu: Any, second: bool, factor: Any) -> Any:
-        return neo_hookean.derivatives(squared, factor * lam, factor * mu, second)  # type: ignore[misc]
-
     with patch.dict(MATRICES):
         numbers = {"factor": Parameter(1.0, "Of the energy.", above=0.0)}
-        MATRICES["scaled"] = Matrix(volumetric, others, derivatives=derivatives, parameters=numbers)
+        MATRICES["scaled"] = Matrix(volumetric, others, parameters=numbers)
         MATRICES["whole"] = lambda F, lam, mu: neo_hookean(F, lam, mu)
         yield
 
@@ -124,8 +114,7 @@ TWICE = {"matrix": "scaled", "factor": 2.0}
 
 
 @pytest.mark.parametrize("tables", [
-    {}, {"remodeling": {"coupling": "implicit"}},
-    {"mesh": {"formulation": "selective-integration"}, "remodeling": {"law": "none"}},
+    {}, {"mesh": {"formulation": "selective-integration"}, "remodeling": {"law": "none"}},
 ], ids=str)  # fmt: skip
 def test_a_region_has_a_matrix_of_its_own(scaled: None, tables: dict[str, Any]) -> None:
     """One that is twice the built-in one is that of twice the moduli, in the inner layer or in the outer one."""

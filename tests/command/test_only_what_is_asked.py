@@ -58,7 +58,7 @@ def test_what_is_remembered_follows_every_change() -> None:
 
 @pytest.mark.parametrize(("remodeling", "passes"), [
     ({}, 3), ({"kappa": 0.0}, 0), ({"law": "none"}, 0), ({"law": "tensor", "kappa": 0.0}, 0),
-    ({"coupling": "implicit", "kappa": 0.0}, 0), ({"law": "rotation", "kappa": 0.0}, 3),
+    ({"law": "rotation", "kappa": 0.0}, 3),
 ])  # fmt: skip
 def test_cells_that_never_move_have_no_pass(
     remodeling: dict[str, Any], passes: int, monkeypatch: pytest.MonkeyPatch

@@ -18,7 +18,7 @@ from tests.runs import made
 from tests.values import isotropic
 
 Attempt = Solution | SolveFailure
-PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent", "implicit": "consistent"}
+PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent"}
 
 
 def artery(coupling: str, **changes: Any) -> Scene:

@@ -303,7 +303,6 @@ def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
 
 @pytest.mark.parametrize(("changes", "remedy"), [
     ({"natural.opening_angle": 60.0}, "mesh.degree = 2 or a larger mesh.refinement, for [natural] needs"),
-    ({"remodeling.coupling": "implicit"}, "for remodeling.coupling = 'implicit' needs"),
     ({"time.tolerance": 0.5, "mesh.formulation": "displacement"}, "mesh.formulation = 'selective-integration'"),
 ])  # fmt: skip
 def test_what_is_told_can_be_done_and_is_told_once(changes: dict[str, Any], remedy: str, caplog: Any) -> None:
@@ -321,7 +320,7 @@ def test_what_auto_takes() -> None:
     linear = {"mesh.element": "tetrahedron", "mesh.degree": 1}
     for values, taken in (
         ({}, SELECTIVE), ({"material.lame_lambda": 27.293}, "displacement"), ({"mesh.degree": 1}, SELECTIVE),
-        ({"remodeling.coupling": "implicit"}, "displacement"), ({"natural.opening_angle": 60.0}, "displacement"),
+        ({"natural.opening_angle": 60.0}, "displacement"),
         (linear, "displacement"), ({"mesh.element": "tetrahedron"}, SELECTIVE),
     ):  # fmt: skip
         scene = remodeling_tube(1e3, **values, **{"time.end": 40.0})

@@ -96,7 +96,7 @@ TENSOR = {"remodeling.law": "tensor", "material.repulsion": "log", "remodeling.f
         {"remodeling.law": "relaxation"},
         RANDOM,
         RANDOM | {"remodeling.frame": "material"},
-        *(TENSOR | {"remodeling.coupling": coupling} for coupling in ("extrapolated", "implicit")),
+        TENSOR | {"remodeling.coupling": "extrapolated"},
     ],
 )
 def test_numpy_does_the_same_and_no_c_runs(
@@ -125,7 +125,6 @@ def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, refused: Refus
     """One line, before anything is read."""
     monkeypatch.setenv(KERNELS, "numpy")
     assert type(kernels.point_kernels(MPI.COMM_SELF)) is kernels.PointKernels
-    assert tensor.tensor_kernels(MPI.COMM_SELF) is None
     monkeypatch.setenv(KERNELS, "c")
     assert refused("run", "no-such-scene.toml") == f"{KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
     with pytest.raises(RemodelError, match=KERNELS):

@@ -30,7 +30,6 @@ Scene = dict[str, Any]
 BOLTZMANN = 1.381e-23
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 COUNTS = 0.01  # a target with a smaller share is none to go on from
-SETTLED, PASSES = 1e-10, 300  # of an implicit step by repeated passes: change of the squares over r0^2; how many
 
 
 class NoEquilibrium(RuntimeError):
@@ -293,8 +292,6 @@ def march(scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, 
                 squares = cells.followed(start, expected, step)
         try:
             unknown = body.solve(unknown, (solved, loads), (squares, new))
-            if coupling == "implicit":
-                unknown, squares = _settled(body, cells, unknown, squares, start, new, time, step)
             if coupling == "extrapolated":
                 found = cells.target(body.stretches(unknown, new), squares)
                 had = cells.targets[0][1] if cells.targets else np.zeros_like(found)
@@ -315,17 +312,3 @@ def march(scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, 
             stretches = body.stretches(unknown, new)
             squares, (cells.ranked, cells.ranks) = cells.after(stretches, squares, squares, time, step)
     return path
-
-
-def _settled(
-    body: Bar | Wall, cells: Pass, unknown: Array, squares: Array, start: Array, loads: Any, time: float, step: float
-) -> tuple[Array, Array]:
-    """An implicit step by repeated passes."""
-    for _ in range(PASSES):
-        other, kept = cells.after(body.stretches(unknown, loads), squares, start, time, step)
-        change = np.abs(other - squares).max() / cells.r0**2
-        unknown, squares = body.solve(unknown, (squares, loads), (other, loads)), other
-        if change < SETTLED:
-            cells.ranked, cells.ranks = kept
-            return unknown, squares
-    raise NoEquilibrium("unknown: repeated passes do not settle")

@@ -72,31 +72,6 @@ def test_random_cells_keep_mesh_and_steps(name: str, changes: dict[str, Any], ki
     assert over.solver.relative_tolerance == 1e-8 and over.time == plain.time
 
 
-@pytest.mark.parametrize(("changes", "coupling"), [
-    ({}, "implicit"),
-    ({"cells": {"initial": "aligned", "aligned_axis": 1}}, "implicit"),
-    ({"cells": {"initial": "random"}}, "staggered"),  # points without such a state
-    ({"remodeling": {"law": "rate"}}, "staggered"),  # has an error of its steps with any coupling
-    ({"remodeling": {"coupling": "relaxed"}}, "relaxed"),  # the scene's own
-    ({"mesh": {"formulation": "selective-integration"}}, "staggered"),  # not for this coupling
-    ({"material": {"chain_density": 0.0}}, "staggered"),
-    ({"preset": "consistent"}, "extrapolated"),
-    ({"profile": "balanced"}, "staggered"),
-])  # fmt: skip
-def test_the_finest_takes_the_coupling_without_error_in_time(
-    changes: dict[str, Any], coupling: str, tmp_path: Path
-) -> None:
-    """Where it has none, and the scene names no other; on the command line, over what the scene names."""
-    scene = scene_from_dict({**ISOTROPIC, "profile": "reference", **changes})
-    assert scene.remodeling.coupling == coupling
-    path = tmp_path / "whole.toml"
-    path.write_text(scene_from_dict({**ISOTROPIC, **changes, "profile": "fast"}).to_toml())
-    over = read_scene(path, [], "balanced" if coupling == "staggered" and "profile" in changes else "reference")
-    assert over.remodeling.coupling == ("implicit" if coupling == "relaxed" or "mesh" in changes else coupling)
-    asked = ["remodeling.coupling=staggered", "remodeling.law=explicit"]
-    assert read_scene(path, asked, "reference").remodeling.coupling == "staggered"
-
-
 def test_validate_says_what_was_measured_for_random_cells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "artery.toml"
     path.write_text(scene_from_dict(TUBE).to_toml())

@@ -256,11 +256,10 @@ def test_derivatives_are_those_of_the_model(folder: Path, changes: dict[str, Any
             {"regions": {"inside": {"outer_radius": 1.1, "material": {"lame_mu": 2.0}}, "outside": {}}},
             '"regions.inside.material.lame_mu" = { start = 2.0 }',
         ),
-        ({"remodeling.coupling": "implicit"}, ""),
         ({"time.tolerance": 4.0, "solver.maximum_halvings": 2}, ""),
         ({}, '"geometry.outer_radius" = { start = 1.3 }'),
     ],
-    ids=["closing", "regions", "implicit", "chosen steps", "geometry"],
+    ids=["closing", "regions", "chosen steps", "geometry"],
 )
 def test_a_simulation_that_stays_says_what_a_new_one_does(folder: Path, changes: dict[str, Any], more: str) -> None:
     """With other numbers in between, and after a run that has failed."""

@@ -15,7 +15,7 @@ ALL = range(1, 301)
 QUICK = (  # half a second with what they are held against, most of them with kernels that other tests compile too
     1, 24, 60, 73, 85, 109, 117, 127, 137, 138, 140, 147, 149, 173, 194, 212, 217, 220, 227, 238, 242, 259,
 )  # fmt: skip
-# Implicit steps and equilibria that have no end within the limit (they may have one with more time)
+# Equilibria that have no end within the limit (they may have one with more time)
 ENDLESS = (29, 40, 46, 130, 166, 193, 223, 231, 268)
 HELD = ("right", "refused", "unstable", "warned")
 

@@ -36,13 +36,11 @@ def made_up(setting: trade.Setting, noise: float = 0.0, jagged: float = 0.0) -> 
     """A result with an error of first order in the step and of second in the size of elements over their degree."""
     kinematics, refinement, degree = setting.mesh
     step = setting.step or setting.scene.time.tolerance or 0.0
-    in_time = 0.0 if setting.scene.remodeling.coupling == "implicit" else 0.4 * step
-    error = in_time * SMOOTH + 1.6 / (refinement * degree**2) ** 2 * SMOOTH[:, ::-1]
+    error = 0.4 * step * SMOOTH + 1.6 / (refinement * degree**2) ** 2 * SMOOTH[:, ::-1]
     if jagged:
         error = jagged * np.sin(1e3 * step + refinement) * SMOOTH
     angles, lengths = 45.0 + error, 2.0 * (1 + 0.01 * error[:, :2])
-    dear = {"full": 100.0}.get(kinematics, 1.0) * (20.0 if setting.scene.remodeling.coupling == "implicit" else 1.0)
-    cost = refinement * degree / step * dear
+    cost = refinement * degree / step * {"full": 100.0}.get(kinematics, 1.0)
     return trade.Result(setting, angles, lengths, cost, cost, noise, (angles, lengths))
 
 
@@ -79,17 +77,6 @@ def test_estimates_are_the_errors_of_a_smooth_problem() -> None:
     rows, notes = estimated()
     assert_right(rows)
     assert not any(row.doubt for row in rows)
-    said = "\n".join(notes)
-    assert "time: no error (steps 5, 2.5 on refinement 1, degree 1)" in said  # of 'implicit', whose guess is taken
-    assert "mesh: order 2 (refinements 1, 2, 4 of degree 2)" in said
-    exact_ones = {row.result.setting.scene.remodeling.coupling for row in rows if row.angle_error < 0.02}
-    assert exact_ones == {"implicit"}
-
-
-def test_without_an_exact_coupling_orders_in_time_and_mesh_are_seen() -> None:
-    results = [made_up(setting) for setting in trade.ladder(artery()) if setting.way[1] == "staggered"]
-    rows, notes = trade.estimated(results)
-    assert_right(rows)
     assert any(note.startswith("time: order 1 (steps 1, 0.5, 0.25 on refinement 2, degree 2)") for note in notes)
     assert any(note.startswith("mesh: order 2 (refinements 1, 2, 4 of degree 2)") for note in notes)
 
@@ -138,14 +125,12 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
     assert len({setting.name for setting in settings}) == len(settings) > 20
     assert {setting.mesh[0] for setting in settings} == {"radial", "sector", "full"}
     coarse = [s for s in settings if s.mesh == ("radial", 1, 1) and s.step]
-    assert sorted(s.step or 0 for s in coarse if s.way[1] == "staggered") == [0.125, 0.25, 0.5, 1, 2.5, 5]
-    assert sorted(s.step or 0 for s in coarse if s.way[1] == "implicit") == [2.5, 5]
+    assert sorted(s.step or 0 for s in coarse) == [0.125, 0.25, 0.5, 1, 2.5, 5]
     profiles = {s.profile: s for s in settings if s.profile}
     assert list(profiles) == [s.profile for s in settings if s.profile] and set(profiles) == set(PROFILES)
     fast = {"model.kinematics": "radial", "time.tolerance": 1.0, "mesh.formulation": "auto"}
     assert profiles["fast"].scene == scene.with_values(fast)
     assert profiles["reference"].expected_seconds < 5.0  # measured: 1.4
-    assert profiles["reference"].scene.remodeling.coupling == "implicit"
     times = trade.compared_times(scene, settings)
     assert times[0] == 5.0 and 25.0 in times and times[-1] == 150.0
     for setting in settings:
@@ -160,25 +145,14 @@ def test_a_tendon_of_random_cells_stays_whole_and_has_seeds() -> None:
     assert {setting.seeds for setting in settings} == {(1,), (1, 2, 3)}
 
 
-@pytest.mark.parametrize("changes", [
-    {"cells.initial": "random"}, {"remodeling.law": "rate"}, {"material.chain_density": 0.0},
-    {"mesh.formulation": "selective-integration"},
-])  # fmt: skip
-def test_implicit_is_there_where_it_has_no_error_in_time(changes: dict[str, Any]) -> None:
-    """Profiles have a formulation of their own."""
-    settings = [setting for setting in trade.ladder(artery(**changes)) if not setting.profile]
-    assert {setting.scene.remodeling.coupling for setting in settings} == {"staggered"} and len(settings) > 15
-
-
 def test_a_point_has_no_mesh() -> None:
     """No row for one, no doubt for want of one, no word of one."""
     scene = preset_scene(PAPER, "cube").with_values({"cells.initial": "isotropic"})
     settings = trade.ladder(scene)
-    assert {setting.mesh[1:] for setting in settings} == {(1, 1)} and len(settings) > 15
+    assert {setting.mesh[1:] for setting in settings} == {(1, 1)} and len(settings) > 10
     points = [setting for setting in settings if setting.mesh[0] == "point"]
-    for coupling in ("staggered", "implicit"):
-        rows, notes = trade.estimated([made_up(setting) for setting in points if setting.way[1] == coupling])
-        assert not any(row.doubt for row in rows) and not any("mesh" in note for note in notes)
+    rows, notes = trade.estimated([made_up(setting) for setting in points])
+    assert not any(row.doubt for row in rows) and not any("mesh" in note for note in notes)
 
 
 def test_hats_add_up_to_one_and_are_one_at_their_places() -> None:
@@ -218,7 +192,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     with forked_children():
         assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "-q"]) == 3
         assert "point-1-degree-1-step-0.5-1 has failed: " in capsys.readouterr().err
-        assert status(out) == [f"{out}: 3 runs: 3 finished"]
+        assert status(out) == [f"{out}: 2 runs: 2 finished"]
         (out / "point-1-degree-1-step-0.5-1").unlink()
         assert cli.main(["trade", str(path), "-o", str(out), "--jobs", "12", "--budget", "10min"]) == 0
     words = capsys.readouterr().out
@@ -241,9 +215,9 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     s = 1 - np.exp(-0.1 * 18.0)
     assert last == pytest.approx(np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s))), abs=1e-6)
 
-    assert status(out) == [f"{out}: 4 runs: 4 finished"]
+    assert status(out) == [f"{out}: 3 runs: 3 finished"]
     before = {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")}
-    assert len(before) == 4  # the three, and 'implicit'
+    assert len(before) == 3
     assert cli.main(["trade", str(path), "-o", str(out), "-q"]) == 0
     assert {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")} == before
     with monkeypatch.context() as patch:
@@ -252,7 +226,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert "left out, over the budget: point-1-degree-1-tolerance-0.5" in capsys.readouterr().out
     assert cli.main(["trade", str(path), "-o", str(tmp_path / "none"), "--budget", "0.001s", "-q"]) == 4
     said = capsys.readouterr().err
-    assert said.startswith("remodel-fenicsx: 0 of 4 settings reached the end within the budget of 0.001 s, at least 2")
+    assert said.startswith("remodel-fenicsx: 0 of 3 settings reached the end within the budget of 0.001 s, at least 2")
     assert said.endswith("is kept, a larger budget goes on\n")
     assert said.count("\n") == 1
     for kept in (names[0] + "-1", names[0] + "-1.toml"):  # one run says what all take

@@ -137,7 +137,7 @@ def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: flo
     assert scripted.watcher.said == (factor == -3.0)
 
 
-@pytest.mark.parametrize(("coupling", "said"), [("staggered", True), ("extrapolated", True), ("implicit", False)])
+@pytest.mark.parametrize(("coupling", "said"), [("staggered", True), ("extrapolated", True)])
 def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(coupling: str, said: bool) -> None:
     """Long steps may look like a swing; an explicit rule does swing."""
     law = {"remodeling__law": "tensor", "material__repulsion": "log", "remodeling__coupling": coupling}
