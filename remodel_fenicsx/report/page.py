@@ -10,7 +10,7 @@ import os
 import re
 import shlex
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
@@ -49,7 +49,7 @@ from remodel_fenicsx.results.whole_body import (
     WholeBody,
     has_a_body,
 )
-from remodel_fenicsx.scene.scene import Scene, preset_scene
+from remodel_fenicsx.scene.scene import Scene, leaves, preset_scene
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.schema.tables import Table
 from remodel_fenicsx.system.files import read_regular, typed, write_new, write_whole
@@ -274,7 +274,7 @@ class Warned:
 
 ASSETS = Path(__file__).with_name("assets")
 MOST_TILES = 8
-NO_PHYSICS = {"format", "name", "preset", "profile", "output", "solver"}
+NO_PHYSICS = ("format", "name", "preset", "profile", "output", "solver")
 MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
 LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
 
@@ -574,17 +574,9 @@ def _changed(scene: Scene) -> str:
     if scene.preset is None:
         return ""
     preset = preset_scene(scene.preset, scene.geometry.name)
-    before, now = (dict(_leaves(one.model_dump(exclude_none=True, exclude=NO_PHYSICS))) for one in (preset, scene))
+    before, now = (dict(leaves(one.model_dump(exclude_none=True), NO_PHYSICS)) for one in (preset, scene))
     new = {key: value for key, value in now.items() if before.get(key) != value}
     return ", ".join(f"{key} = {_as_text(value)} for {_as_text(before.get(key, '-'))}" for key, value in new.items())
-
-
-def _leaves(table: Mapping[str, Any], key: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{key}{name}.")
-        else:
-            yield f"{key}{name}", value
 
 
 def _keys(keys: Table, *but: str) -> str:

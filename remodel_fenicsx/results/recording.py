@@ -373,7 +373,7 @@ def with_unit(value: float, unit: str) -> str:
     return number(value) + (unit if unit == "°" else f" {unit}" if unit else "")
 
 
-NEWTONS = {0: "N", -3: "mN", -6: "µN", -9: "nN"}  # by powers of ten; cm make hundreds
+NEWTONS: dict[float, str] = {0: "N", -3: "mN", -6: "µN", -9: "nN"}  # by powers of ten; cm make hundreds
 
 
 def unit_of(scene: Any, dimension: str) -> str:
