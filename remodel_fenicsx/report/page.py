@@ -26,6 +26,7 @@ from remodel_fenicsx.body.shape import Column, columns_of_region
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import GROWTH, moved_axes
+from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -48,6 +49,8 @@ from remodel_fenicsx.results.whole_body import (
     WholeBody,
     has_a_body,
 )
+from remodel_fenicsx.scene.scene import Scene, leaves, preset_scene
+from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.schema.tables import Table
 from remodel_fenicsx.system.files import read_regular, typed, write_new, write_whole
 from remodel_fenicsx.system.terminal import duration
@@ -271,6 +274,7 @@ class Warned:
 
 ASSETS = Path(__file__).with_name("assets")
 MOST_TILES = 8
+NO_PHYSICS = ("format", "name", "preset", "profile", "output", "solver")
 MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
 LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
 
@@ -366,10 +370,12 @@ def tiles(run: ReportedRun) -> Card | None:
         values, unit = history[column.name][np.isfinite(history[column.name])], run.unit(column)
         if not values.any():
             continue
+        is_reference = column.name.startswith("fibre_angle") and "deformed" not in column.name
+        reference = " (reference)" if is_reference else ""  # body and profile are deformed
         last, first = (escape(with_unit(float(values[index]), unit)) for index in (-1, 0))
         found.append(
             f'<div class="tile" title="{escape(column.meaning)}"><b>{last}</b>'
-            f'<span>{escape(words(column.name))}</span><span class="note">from {first}</span></div>'
+            f'<span>{escape(words(column.name))}{reference}</span><span class="note">from {first}</span></div>'
         )
     return Card("tiles", f'<div class="tiles whole">{"".join(found)}</div>') if found else None
 
@@ -438,7 +444,8 @@ def stress(run: ReportedRun) -> Card | None:
     if {"pressure", "inner_radius", "outer_radius"} <= set(history):
         inner, outer = history["inner_radius"], history["outer_radius"]
         laplace = np.interp(body.times, history["time"], history["pressure"] * inner / (outer - inner))
-    data = _by_layer(run, body, body.series["wall_stress"], ("around", "along", "across"))
+    label = ", ".join(filter(None, ("Cauchy stress", unit)))
+    data = _by_layer(run, body, body.series["wall_stress"], ("around", "along", "across"), label)
     data |= {"level": [_finite(value) for value in laplace]}
     legend = "Means of layers, in axes that move with the wall."
     legend += " Dashed: p r_i / h, by the law of Laplace the mean around." if np.isfinite(laplace).any() else ""
@@ -459,15 +466,18 @@ def content(run: ReportedRun) -> Card | None:
     title = f"{' and '.join(names).capitalize()} {run.recording.scene.geometry.depth_in_words[0]}"
     legend = '<p class="note">Means of layers, over those at the start: amount of the collagen, volume of the wall.</p>'
     html = section(title, f'<div id="content" class="stack"></div>{legend}', "half")
-    return Card("content", html, _by_layer(run, body, made[..., known], names))
+    return Card("content", html, _by_layer(run, body, made[..., known], names, "over the start"))
 
 
-def _by_layer(run: ReportedRun, body: ShownBody, values: NDArray[np.float32], names: Sequence[str]) -> dict[str, Any]:
+def _by_layer(
+    run: ReportedRun, body: ShownBody, values: NDArray[np.float32], names: Sequence[str], label: str
+) -> dict[str, Any]:
     """What a drawing over the depth needs of values (times, layers, names)."""
     through, start, end = run.recording.scene.geometry.depth_in_words
     return {
         "layers": [[[_finite(value) for value in layer] for layer in layers] for layers in values], "names": names,
         "depth": body.whole.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "level": [],
+        "label": label,
     }  # fmt: skip
 
 
@@ -531,22 +541,50 @@ def facts(run: ReportedRun) -> Card:
     ranks = [found[1] for text in said if (found := _RANKS.match(text))][-1:]
     on_ranks = "".join(f", {number} ranks" for number in ranks if number != "1")
     unloaded = [text for text in said if text.startswith(SAID_UNLOADED)][-1:]
+    element = kinematics.element(scene.mesh.element)
+    elements = f"{element[:-2]}a" if element.endswith("dron") else f"{element}s"
+    ends = () if len(scene.geometry.ends) > 1 else ("ends",)  # what they have no choice of is said by none
     rows = [
+        ("Changed", _changed(scene)),
         ("Body", "; ".join([_keys(scene.geometry, "file", "sha256"), *unloaded])),
         ("Free of stress", "" if scene.natural.is_of_the_mesh else _keys(scene.natural)),
-        ("Mesh", f"{count}{kinematics.element(scene.mesh.element)}: {_keys(scene.mesh)}"),
+        ("Mesh", f"{count}{elements}: {_keys(scene.mesh, 'element')}"),
         ("Kinematics", f"{scene.model.kinematics}: {kinematics.meaning}"),
-        ("Supports", _keys(scene.supports)),
-        ("Cells", _keys(scene.cells)),
+        ("Supports", _keys(scene.supports, *ends)),
+        ("Cells", _keys(scene.cells, *_idle(scene))),
         *((f"Region {words(name)}", _keys(region)) for name, region in scene.regions.items()),
         *((words(name).capitalize(), _keys(load)) for name, load in scene.loads.items()),
         *((f"Load case {number}", _keys(case)) for number, case in enumerate(scene.cases, start=1)),
         ("Material", scene.summary()),
-        ("Remodeling", _keys(scene.remodeling, "turnover")),
+        ("Remodeling", _keys(scene.remodeling, "turnover", *_idle(scene))),
         ("Turnover", _keys(scene.remodeling.turnover) if scene.remodeling.turnover.is_on else ""),
         ("Time", f"{steps} {scene.time.in_words()}{solving}{on_ranks}"),
     ]
     return Card("facts", section("What was run", table(row for row in rows if row[1])))
+
+
+def _idle(scene: Scene) -> list[str]:
+    """Keys of cells and remodeling that change nothing beside the others."""
+    how, is_random = scene.remodeling, scene.cells.initial == "random"
+    law = LAWS[how.law]
+    used = {
+        "aligned_axis": scene.cells.initial == "aligned", "seed": is_random, "antithetic": is_random,
+        "pairing": not law.takes_set_points, "threshold": law.takes_set_points, "exponent": law.takes_set_points,
+        "relaxation_factor": COUPLINGS[how.coupling].makes_a_share, "mean": bool(scene.cases),
+        "rotation_time": how.law == "rotation",
+    }  # fmt: skip
+    without_a_pass = () if law.remodels else set(Remodeling.model_fields) - {"law"}
+    return [*(key for key, is_used in used.items() if not is_used), *without_a_pass]
+
+
+def _changed(scene: Scene) -> str:
+    """Keys whose values are others than those of the preset, which stand beside them."""
+    if scene.preset is None:
+        return ""
+    preset = preset_scene(scene.preset, scene.geometry.name)
+    before, now = (dict(leaves(one.model_dump(exclude_none=True), NO_PHYSICS)) for one in (preset, scene))
+    new = {key: value for key, value in now.items() if before.get(key) != value}
+    return ", ".join(f"{key} = {_as_text(value)} for {_as_text(before.get(key, '-'))}" for key, value in new.items())
 
 
 def _keys(keys: Table, *but: str) -> str:
@@ -574,7 +612,8 @@ def warnings(run: ReportedRun) -> Card:
     )
     said = f"<ul>{items}</ul>" if found else '<p class="note">None: the run raised no warnings.</p>'
     name = run.recording.scene.name
-    again = f"{typed()} run scene.toml -o {shlex.quote(f'results/{name}-again')}"
+    command = re.sub(r"^\S*/with-fenicsx", "./with-fenicsx", typed())  # the page goes elsewhere
+    again = f"{command} run scene.toml -o {shlex.quote(f'results/{name}-again')}"
     buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a>' for file in _files(run))
     html = section(f"Warnings ({sum(one.count for one in found)})", said + f'<h2>Run it again</h2><pre id="again">'
                    f'{escape(again)}</pre><p><button id="copy">copy</button> {buttons}</p>')  # fmt: skip

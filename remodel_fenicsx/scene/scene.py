@@ -12,7 +12,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -870,7 +870,7 @@ SAME_LOAD = 1e-12  # relative difference of two loads that are the same
 def check_continuation(old: Scene, new: Scene, time: float) -> None:
     """Check that the physics of a scene is that of the run so far, until `time`."""
     rule = f"a resumed run may change time.end, output, solver, and loads after its checkpoint at {time:g}"
-    before, now = (dict(_physics(scene.model_dump(mode="json"))) for scene in (old, new))
+    before, now = (dict(leaves(scene.model_dump(mode="json"), FREE)) for scene in (old, new))
     for key in [*before, *(key for key in now if key not in before)]:
         if before.get(key) != now.get(key):
             was = shown(before[key]) if key in before else "not there"
@@ -891,13 +891,13 @@ def _ramp_times(load: Load | None) -> list[float]:
     return [] if load is None else [time for time, _ in load.ramp]
 
 
-def _physics(table: Mapping[str, Any], key: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of all values that must stay."""
+def leaves(table: Mapping[str, Any], free: Sequence[str], key: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of all values but those that are free."""
     for name, value in table.items():
         path = f"{key}.{name}" if key else name
-        if path in FREE or path.endswith("cells.fibres"):  # the SHA-256 beside it must stay
+        if path in free or path.endswith("cells.fibres"):  # the SHA-256 beside it must stay
             continue
         if isinstance(value, Mapping):
-            yield from _physics(value, path)
+            yield from leaves(value, free, path)
         else:
             yield path, value

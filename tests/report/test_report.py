@@ -159,7 +159,16 @@ def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
         "time 40, deposition stretch 1.1, gain 1", "value 1.2, ramp ((0, 0), (24, 1))",
     ]  # fmt: skip
     assert not [words for words in expected if words not in text]
+    radial = html.unescape(Decoded.of(recorded("radial")).text)
+    said = re.sub("<.*?>", " ", radial[radial.index("What was run"):radial.index("Warnings (")])  # fmt: skip
+    expected = ["cells.initial = isotropic for random", "time.end = 3 for 150", "model.kinematics = radial for full"]
+    expected += ["8 intervals: refinement 1,", "ends free", "law explicit", "./with-fenicsx"]
+    assert not [words for words in expected if words not in said + radial[radial.index("Run it again") :][:99]]
+    idle = ["aligned axis", "seed", "antithetic", "relaxation factor", "threshold", "rotation time", "mean", "Output"]
+    assert not [words for words in idle if words in said] and said.index("time.end") < said.index("Body")
+    assert "fibre angle inner (reference)" in radial and "outer radius (reference)" not in radial
     text = Decoded.of(recorded("cube")).text
+    assert "ends free" not in text and re.search("[0-9]+ hexahedra: refinement", text)
     assert not [words for words in ("Free of stress", "<th>Turnover", "so that under the loads") if words in text]
 
 

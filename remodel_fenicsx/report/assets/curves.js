@@ -7,6 +7,13 @@ PARTS.curves = (data, arrays, clock) => {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => all.forEach((curve) => curve.draw()));
 };
 
+// With room around what stays but for rounding, which is no jump from 0 to 100.
+function rangeOf(plot, low, high) {
+  const size = Math.max(Math.abs(low), Math.abs(high)), isConstant = high - low <= 1e-9 * size;
+  if (isConstant) return [low - 0.1 * (size || 1), high + 0.1 * (size || 1)];
+  return LIBRARIES.uPlot.rangeNum(low, high, 0.1, true);
+}
+
 class Curve {
   constructor(place, times, curve, clock) {
     Object.assign(this, { place, times, curve, clock });
@@ -28,8 +35,8 @@ class Curve {
       stroke: colourOf(CURVE_COLOURS[k % CURVE_COLOURS.length]), width: 1.6, spanGaps: false, points: { show: false },
     }));
     const options = {
-      ...this.size(), legend: { show: false }, scales: { x: { time: false } },
-      axes: [{ ...axis("time"), size: 34 }, { ...axis(this.curve.unit || this.curve.title), size: 56 }], series: [{}, ...lines],
+      ...this.size(), legend: { show: false }, scales: { x: { time: false }, y: { range: rangeOf } },
+      axes: [{ ...axis("time"), size: 34 }, { ...axis([this.curve.title, this.curve.unit].filter(Boolean).join(", ")), size: 56 }], series: [{}, ...lines],
       cursor: { drag: { x: false, y: false }, points: { show: false }, y: false },
       hooks: { draw: [(plot) => this.drawMark(plot)] },
     };

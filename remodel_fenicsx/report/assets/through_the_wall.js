@@ -8,16 +8,26 @@ for (const name of ["stress", "content"]) {
   };
 }
 
+// Multiples of 1, 2 or 5 times a power of ten, some four of them, around two numbers.
+function roundTicks(low, high) {
+  const raw = (high - low || Math.abs(high) || 1) / 3, power = 10 ** Math.floor(Math.log10(raw));
+  const step = power * [1, 2, 5, 10].find((factor) => factor * power >= raw * (1 - 1e-9));
+  const first = Math.floor(low / step + 1e-9), last = Math.max(first + 1, Math.ceil(high / step - 1e-9));
+  return Array.from({ length: last - first + 1 }, (_, k) => Number(((first + k) * step).toPrecision(6)));
+}
+
 function wallDrawing(data, clock, what) {
   const all = [...data.layers.flat(2), ...data.level.filter(Number.isFinite), 0];
-  const low = Math.min(...all), size = Math.max(...all) - low || 1;
+  const ticks = roundTicks(Math.min(...all), Math.max(...all)), low = ticks[0], size = ticks.at(-1) - low;
   const x = (depth) => 48 + 220 * depth, y = (value) => 168 - (152 * (value - low)) / size;
   const drawing = element("svg", { viewBox: "0 0 345 196", role: "img" });
   drawing.append(element("title", {}, `Mean ${what} ${data.through} at t = ${inDigits(clock.time)}`));
-  for (const value of [0, low, low + size / 2, low + size]) {
+  for (const value of ticks) {
     drawing.append(element("line", { x1: 48, x2: 268, y1: y(value), y2: y(value), stroke: "var(--line)" }));
     drawing.append(element("text", { x: 43, y: y(value) + 4, "text-anchor": "end" }, inDigits(value)));
   }
+  const label = { transform: "translate(11 92) rotate(-90)", "text-anchor": "middle", class: "label" };
+  drawing.append(element("text", label, data.label));
   const rows = data.layers[clock.index], level = data.level[clock.index];
   if (Number.isFinite(level)) {
     const at = { x1: 48, x2: 268, y1: y(level), y2: y(level), stroke: "var(--text)", "stroke-dasharray": "5 4" };
