@@ -72,7 +72,8 @@ def _module(module: ModuleType, seen: dict[int, str]) -> Iterator[str]:
         elif callable(value):
             yield name + _parameters(value if inspect.isfunction(value) else type(value).__call__)
         elif isinstance(value, Mapping):
-            yield f"{name} = {{{', '.join(map(repr, value))}}}"
+            known = (repr(key) for key, part in value.items() if getattr(part, "meaning", True))
+            yield f"{name} = {{{', '.join(known)}}}"
         else:
             yield f"{name}: {type(value).__name__}"
 

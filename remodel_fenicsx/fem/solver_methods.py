@@ -104,10 +104,7 @@ SOLVER_METHODS = {
     ),
 }
 
-REMOVED = {
-    name: "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"
-    for name in ("exact", "preconditioned")
-}
+REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent in every iteration"}
 """Methods of earlier versions, and what to take in their place."""
 
 # Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused

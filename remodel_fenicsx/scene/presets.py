@@ -194,7 +194,7 @@ def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
 PROFILES: dict[str, Profile] = {
     "fast": Profile(_values(1, 1, 1.0), 1.4, 0.7, 0.2),
     "balanced": Profile(_values(1, 2, 0.5), 0.5, 0.5, 0.4),
-    "reference": Profile(_values(2, 2, 0.1), 0.0036, 0.0008, 1.4),
+    "reference": Profile(_values(2, 2, 0.1), 0.06, 0.06, 2.0),
 }
 """Points of the front of docs/speed_and_accuracy.md; `remodel-fenicsx trade SCENE` measures any scene."""
 

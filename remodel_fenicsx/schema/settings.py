@@ -64,7 +64,7 @@ LARGEST_MESH = 10_000_000  # hexahedra; Gmsh, which is serial, needs about 10 GB
 
 def meanings(registry: Mapping[str, Any]) -> str:
     """Of all that it has, for a description."""
-    return ". ".join(f"{name!r}: {part.meaning}" for name, part in registry.items())
+    return ". ".join(f"{name!r}: {part.meaning}" for name, part in registry.items() if part.meaning)
 
 
 # ---------------------------------------------------------------- body and mesh
@@ -638,7 +638,7 @@ COUPLINGS = {
         takes_turnover=True,
     ),
     IMPLICIT: CouplingKind(
-        f"of runs made with version 0.4.0 and before, which are read; {IN_ITS_PLACE}",
+        "",  # it means nothing to new scenes; those of runs made with version 0.4.0 and before are read
         _refuse_implicit,
         takes_turnover=True,
         missing=lambda scene: None if scene.is_as_run else f"version 0.4.0; {IN_ITS_PLACE}",

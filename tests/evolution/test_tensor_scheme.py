@@ -214,6 +214,12 @@ def test_the_target_of_a_first_step_is_not_extrapolated() -> None:
     np.testing.assert_allclose(coupling._extrapolated(3.0).switch[some], share[some], atol=1e-13)
 
 
+def test_a_step_that_is_solved_twice_is_one_step() -> None:
+    """The little that its second solve moves is no measure for the next step, which would be looked into."""
+    first, second = (step.work.newton_iterations for step in pulled_cube([[0.0, 0.0], [10.0, 1.0]], 2.0).steps())
+    assert second < first
+
+
 def test_late_tension_is_the_same_in_a_run_that_goes_on(tmp_path: Path) -> None:
     """What a point has had as targets, or that it has had none, is kept."""
     goes_on(pulled_cube([[1.0, 0.0], [2.0, 1.0]], 3.0).scene, tmp_path, 1.0, 2.0)
