@@ -26,7 +26,7 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue
+from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue, neo_hookean
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene import presets
 from remodel_fenicsx.schema.settings import (
@@ -128,7 +128,7 @@ def borne(tissue: Tissue, is_loaded: bool) -> float:
     Without chains the most that the wall bears.
     """
     chain, modulus, stretch = tissue.chain, tissue.lame_mu, math.inf  # the square of that around
-    if getattr(tissue.matrix, "compiled", "") != "NEO_HOOKEAN":
+    if tissue.matrix is not neo_hookean:
         return math.inf
     if chain is not None:
         length, start = NEAR_LOCKING * tissue.contour_length, tissue.end_to_end_length
