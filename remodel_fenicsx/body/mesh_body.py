@@ -477,7 +477,8 @@ class WalledMesh(Walled):
 
     def log_of_radii(self, wall: Any) -> float | None:
         """Faces are as their radii; None if the wall does not go around."""
-        ratio = wall.area("outer") / wall.area("inner") if wall is not None else 0.0
+        area = getattr(wall, "area", None)  # of a mesh from a file; a drawn one knows no areas
+        ratio = area("outer") / area("inner") if area is not None else 0.0
         return math.log(ratio) if ratio > 1.0 else None
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:

@@ -218,10 +218,10 @@ def test_a_folder_below_a_file_is_exit_code_2(tmp_path: Path, ranks: int) -> Non
 # ---------------------------------------------------------------- failures and signals
 
 
-def test_a_load_beyond_floating_point_is_exit_code_3_and_said_in_words(tmp_path: Path) -> None:
-    done = run("run", demo("cube"), "--set", "loads.force.value=1e300", "-o", tmp_path / "out", "-q")
+def test_a_load_beyond_all_sense_is_exit_code_3_and_said_in_words(tmp_path: Path) -> None:
+    done = run("run", demo("cube"), "--set", "loads.force.value=1e60", "-o", tmp_path / "out", "-q")
     assert done.returncode == 3, done.stderr
-    assert "no equilibrium at time 1: " in done.stderr and "too large or too small for floating-point" in done.stderr
+    assert "59.1 decades" in done.stderr and "no equilibrium" in done.stderr
 
 
 @pytest.mark.parametrize("ranks", [2, *slowly(1)])

@@ -16,7 +16,7 @@ from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear
 from remodel_fenicsx.solver.newton import Limits
-from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Preconditioned, Secants
+from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants
 from remodel_fenicsx.watch.warnings import VolumeResponse
 from tests import parts
 from tests.parts import tube
@@ -60,7 +60,7 @@ def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
 
 # ---------------------------------------------------------------- same states, other work
 @pytest.mark.parametrize("predictor", ["none", "autoregressive"])
-@pytest.mark.parametrize("method", ["lagged", "iterative", "preconditioned"])
+@pytest.mark.parametrize("method", ["lagged", "iterative"])
 def test_all_methods_come_to_the_same_states(
     method: str, predictor: str, direct: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -298,23 +298,6 @@ def test_levels_that_have_become_useless_are_made_anew(caplog: pytest.LogCapture
     simulation.close()
     assert "solved once more, with new levels in every iteration: the linear solver failed" in caplog.text
     assert "in parts" not in caplog.text
-    assert_same(rows, expected)
-
-
-def test_a_factor_serves_the_tangents_of_two_solves(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One is made in each solve, by its second tangent; where too many iterations are needed, in every iteration."""
-    caplog.set_level(logging.INFO)
-    renewed, set_up = [], Preconditioned._set_up
-    monkeypatch.setattr(Preconditioned, "_set_up", lambda self: (renewed.append(self.tangents), set_up(self)))
-    simulation, expected = simulated("preconditioned")
-    simulation.close()
-    before = np.cumsum([0, *(row["newton_iterations"] for row in expected[:-1])])
-    assert renewed == [1, *(before + 2)] and "once more" not in caplog.text
-    simulation, rows = simulated("preconditioned", solver__petsc_options={"ksp_max_it": 2})
-    simulation.close()
-    assert "solved once more, with a factor of every tangent: the linear solver failed" in caplog.text
     assert_same(rows, expected)
 
 

@@ -233,7 +233,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         (shutil.copytree if (out / kept).is_dir() else shutil.copy)(out / kept, tmp_path / "one" / kept)
     assert cli.main(["trade", str(path), "-o", str(tmp_path / "one"), "--budget", "0.001s", "-q"]) == 4
     said = capsys.readouterr().err
-    assert "1 of 4 settings" in said and re.search(r"all settings take about [\d.e-]+ min more \(--budget\)\n$", said)
+    assert "1 of 3 settings" in said and re.search(r"all settings take about [\d.e-]+ min more \(--budget\)\n$", said)
 
 
 def test_what_is_doubted_is_not_trusted(tmp_path: Path) -> None:
