@@ -128,7 +128,7 @@ def borne(tissue: Tissue, is_loaded: bool) -> float:
     Without chains the most that the wall bears.
     """
     chain, modulus, stretch = tissue.chain, tissue.lame_mu, math.inf  # the square of that around
-    if getattr(tissue.matrix, "compiled", "") != "NEO_HOOKEAN":
+    if tissue.matrix is not MATRICES["neo-hookean"]:
         return math.inf
     if chain is not None:
         length, start = NEAR_LOCKING * tissue.contour_length, tissue.end_to_end_length
