@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import json
 import os
 import re
@@ -168,6 +169,8 @@ def _done(arguments: list[str]) -> int:
         return _fail(_as_typed(error, options), error.exit_code, error.on_all_ranks)
     except OSError as error:
         text, code = f"cannot write the results: {refusal_in_words(error)}", BAD_ENVIRONMENT
+        if error.errno == errno.ENAMETOOLONG:
+            text, code = refusal_in_words(error), BAD_INPUT
         if getattr(options, "output", None) and isinstance(error, (FileExistsError, NotADirectoryError)):
             # lies in a file, or just taken
             text = f"-o {options.output}: {refusal_in_words(error)}; allowed is a new or an empty folder"
@@ -182,7 +185,7 @@ def _done(arguments: list[str]) -> int:
 
 def _parsed(arguments: list[str]) -> argparse.Namespace:
     """The options, after the extensions; of several ranks only the first says what is wrong with them."""
-    for word in arguments:
+    for word in (*arguments, os.environ.get(EXTENSIONS, "")):
         if re.search("[\ud800-\udfff]", word):  # records and other programs could not name it
             raise RemodelError(f"{ascii(word)}: must be UTF-8")
     first = _Parser(prog="remodel-fenicsx", add_help=False, allow_abbrev=False)

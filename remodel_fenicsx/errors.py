@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-LONGEST_MESSAGE = 900  # characters: of longer ones, such as all columns of a shape, the ends are said
+LONGEST_MESSAGE = 900  # characters: of longer ones the ends are said
 BAD_INPUT, SOLVE_FAILED, PAUSED, BAD_ENVIRONMENT = 2, 3, 4, 5
 
 

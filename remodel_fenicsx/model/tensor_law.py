@@ -77,8 +77,7 @@ def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target
 def awake(tensor: Array, least_tension: float) -> Array:
     """Share of kappa that acts: max(0, 1 - s0/s) with the largest principal value s; (n,)."""
     # A lazy zone, as in models of the adaptation of bone; Hypothesis I of the paper says "within a range".
-    largest = np.linalg.eigvalsh(tensor)[:, -1]
-    return np.where(largest > least_tension, 1 - least_tension / np.where(largest > 0, largest, 1.0), 0.0)
+    return 1 - least_tension / np.maximum(np.linalg.eigvalsh(tensor)[:, -1], least_tension)
 
 
 def weight_of_the_end(kappa_dt: Array | float) -> Array:

@@ -838,18 +838,36 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     read = read_toml(Path(path))
     name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)  # what follows another dot is part of it
     read.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
-    changes = [parse_override(override) for override in overrides]
+    changes = dict(parse_override(override) for override in overrides)
+    chosen = set(CHOSEN_BY_RUNS) - set(changes) if changes and "format" in read else set()
 
     def made(settings: Mapping[str, Any]) -> Scene:
         values = merged(read, presets.nested(settings))
-        for key, value in changes:
+        for key, value in changes.items():
             put(values, key, value)
-        _follow(values, dict(changes), is_whole="format" in values)
-        return scene_from_dict(_beside(values, Path(path).parent))
+        _follow(values, changes, is_whole="format" in values)
+        return _chosen_anew(_beside(values, Path(path).parent), chosen)
 
     if profile is None:
         return made({})
     return _with_profile(profile, lambda settings: made({"profile": profile, **settings}))
+
+
+CHOSEN_BY_RUNS = ("model.kinematics", "mesh.formulation")
+
+
+def _chosen_anew(values: dict[str, Any], chosen: set[str]) -> Scene:
+    """The scene, with "auto" in place of what a run had chosen and what does not go with the rest any more."""
+    try:
+        return scene_from_dict(values)
+    except SceneError as error:
+        key = str(error).partition(" ")[0]
+        if key not in chosen:
+            raise
+        scene = _chosen_anew(merged(values, presets.nested({key: AUTO})), chosen - {key})
+        if is_first_rank():
+            log.warning("%s; %s takes its place", error, shown(AUTO))
+        return scene
 
 
 def _with_profile(name: str, made: Callable[[Mapping[str, Any]], Scene]) -> Scene:

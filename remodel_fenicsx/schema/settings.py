@@ -43,6 +43,7 @@ from remodel_fenicsx.schema.tables import (
     SceneError,
     Table,
     fault,
+    listed,
     named,
     quoted,
     refuse,
@@ -1383,5 +1384,5 @@ class Output(Table):
         if name in GROWTH_COLUMNS and not scene.remodeling.turnover.grows:
             raise fault(f"{name!r} needs remodeling.turnover with a volume above 0", key, name)
         if name not in known:
-            names = ", ".join(map(repr, known))
+            names = listed(map(repr, known), repr(name))
             raise fault(f"no such column on request; allowed for shape {shape.name!r} are {names}", key, name)

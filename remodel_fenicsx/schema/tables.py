@@ -248,6 +248,14 @@ def named(registry: Mapping[str, Any], fits: Callable[[Any], Any]) -> str:
     return ", ".join(repr(name) for name, part in registry.items() if fits(part))
 
 
+def listed(names: Iterable[str], wrong: str, most: int = 24) -> str:
+    """Names for an error; of many those that are most like a wrong one."""
+    names = list(names)
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(difflib.get_close_matches(wrong, names, most, 0.0))} and {len(names) - most} more"
+
+
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number that a float can hold; true and false are not."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from remodel_fenicsx.errors import UnreadableFile, printable
-from remodel_fenicsx.schema.tables import SceneError, description, shown
+from remodel_fenicsx.schema.tables import SceneError, description, listed, shown
 from remodel_fenicsx.schema.units import is_quantity
 from remodel_fenicsx.system.files import read_regular
 
@@ -181,7 +181,7 @@ def read_columns(
     if unknown := [name for name, found in zip(names, head, strict=True) if not found]:
         if all(_number(name, ".") is not None for name in names):
             raise UnreadableFile("begins with a row of numbers; the first row must have the names of the columns")
-        raise UnreadableFile(f"the column {shown(unknown[0])} is not known; allowed are {', '.join(allowed)}")
+        raise UnreadableFile(f"the column {shown(unknown[0])} is not known; allowed are {listed(allowed, unknown[0])}")
     if twice := [name for number, name in enumerate(head) if name in head[:number]]:
         raise UnreadableFile(f"the column {twice[0]} is there twice")
     mark = "," if any("," in cell for row in rows for cell in row) else "."

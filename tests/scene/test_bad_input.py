@@ -30,6 +30,7 @@ from remodel_fenicsx.results.checkpoint_file import read_checkpoint
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.scene import preset_scene, read_scene
 from remodel_fenicsx.simulation import checked_domain
+from remodel_fenicsx.system.environment import EXTENSIONS
 from tests.conftest import Refused
 from tests.parts import tube
 from tests.results.test_resume import SELF, first_half, rows
@@ -259,9 +260,13 @@ def test_a_command_line(command: tuple[str, list[str]], place: Path) -> None:
         assert sorted(path.name for path in place.iterdir()) == before
 
 
-def test_words_that_are_no_utf_8_are_refused_by_name(refused: Refused, tmp_path: Path) -> None:
+def test_words_that_are_no_utf_8_are_refused_by_name(
+    refused: Refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The log of a run could not name them."""
     assert refused("validate", f"{tmp_path}/\udcff.toml").endswith("\\udcff.toml': must be UTF-8\n")
+    monkeypatch.setenv(EXTENSIONS, "\udcff.py")
+    assert refused("schema").endswith("\\udcff.py': must be UTF-8\n")
 
 
 @pytest.mark.parametrize("table", ["regions", "loads", "supports"])

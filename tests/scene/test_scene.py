@@ -484,3 +484,17 @@ def test_times_after_an_earlier_end_are_dropped_with_a_line(tmp_path: Path, capl
     assert caplog.messages == ["output.times: 2 after time.end = 3 dropped"]
     with pytest.raises(SceneError, match="must be at most time.end"):
         read_scene(path, ["time.end=3", "output.times=[5]"])
+
+
+def test_what_a_run_has_chosen_is_chosen_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """With a line, where it does not go with what is set; not what is set itself, nor without any change."""
+    path = tmp_path / "scene.toml"
+    path.write_text(scene_from_dict(BASES["layers"]).with_values({"model.kinematics": "radial"}).to_toml())
+    assert read_scene(path, ["remodeling.kappa=0.1"]).model.kinematics == "radial" and not caplog.messages
+    assert read_scene(path, ["cells.initial=random"]).model.kinematics == "auto"
+    assert re.fullmatch("model.kinematics = 'radial': cells.initial .*; 'auto' takes its place", *caplog.messages)
+    with pytest.raises(SceneError, match="model.kinematics = 'radial'"):
+        read_scene(path, ["cells.initial=random", "model.kinematics=radial"])
+    path.write_text(path.read_text().replace("format = ", "# "))
+    with pytest.raises(SceneError, match="model.kinematics = 'radial'"):
+        read_scene(path, ["cells.initial=random"])
