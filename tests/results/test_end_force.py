@@ -121,7 +121,7 @@ def test_a_column_that_a_scene_cannot_have_is_refused_before_anything_runs(
     """In `validate` and in `run`, in one line that names what is allowed; fields too."""
     place = tmp_path / "scene.toml"
     place.write_text('preset = "kuhl-holzapfel-2007"\n[geometry]\nshape = "cube"\n')
-    for key, name, allowed in (("columns", "axial_force", "'mean_stretch'"), ("fields", "stress", "'cauchy_stress'")):
+    for key, name, allowed in (("columns", "axial_force", "'force'"), ("fields", "stress", "'cauchy_stress'")):
         for command in (["validate"], ["run", "-o", str(tmp_path / "out")]):
             code = cli.main([command[0], str(place), f"--set=output.{key}=['{name}']", *command[1:]])
             error = capfd.readouterr().err
