@@ -19,7 +19,7 @@ from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_me
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.evolution.coupling import Maker
-from remodel_fenicsx.evolution.stepper import OtherCase, OtherCaseWatcher, Step, Stepper, Watcher, times
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher, times
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -192,11 +192,13 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
     first, *more = (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, settings, solver, first, coupling, kappa)
     if settings.turnover.grows:
-        stepper.remodeling.turnover.begin_with(in_files(fibres, GROWTH, state.cells.quadrature, domain))
+        stepper.part("turnover").begin_with(in_files(fibres, GROWTH, state.cells.quadrature, domain))
     if others:
+        from remodel_fenicsx.evolution.load_cases import LoadCase, join
+
         given = enumerate(zip(others, more, strict=True), start=2)
-        cases = [OtherCase(number, *part, stepper, solver, kappa) for number, part in given]
-        stepper.remodeling.join(cases, [case.weight for case in scene.cases])
+        cases = [LoadCase(number, *part, stepper, solver, kappa) for number, part in given]
+        join(stepper, cases, [case.weight for case in scene.cases])
     control, rest = None, None
     if at_once:
         rest = _way_to_rest(scene, stepper)
@@ -219,10 +221,12 @@ def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
     counted = "negative_eigenvalues" in scene.output.columns
     found = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
     found += [kind.make(scene, stepper) for kind in WATCHERS.values()]
-    for case in stepper.remodeling.cases:
+    for case in stepper.each_case[1:]:
+        from remodel_fenicsx.evolution.load_cases import LoadCaseWatcher
+
         own = [EquilibriumStability(case, unstable)]
         own += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
-        found += [OtherCaseWatcher(case, watcher) for watcher in own if watcher is not None]
+        found += [LoadCaseWatcher(case, watcher) for watcher in own if watcher is not None]
     return [watcher for watcher in found if watcher is not None]
 
 

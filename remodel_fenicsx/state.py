@@ -20,7 +20,7 @@ from remodel_fenicsx.fem.assembly import Remembered
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
 from remodel_fenicsx.fem.kinematics import Kinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.kernels import PointKernels, point_kernels
+from remodel_fenicsx.kernels import PointKernels, point_kernels, with_kernels
 from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_of, structure_tensors
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
@@ -128,6 +128,7 @@ class UnitCells(CellField):
     ):
         super().__init__(quadrature, "cell")
         self.settings, self.local_axes = settings, local_axes
+        self.prepared: list[Parameters] = []  # tissues on this mesh (`State.parameters`)
         self.axis_values[:] = axes = self.initial_axes()
         everywhere = np.ones(len(domain.element_number), dtype=np.bool_)
         for name, cells in {"": settings, **regions}.items():
@@ -196,8 +197,9 @@ class State:
         What else is remembered from step to step, by name: a coupling puts its own here, its functions by `remember`.
     counts
         Functions that a checkpoint may lack, each with the name of the number that is 0 then: how many are known.
-    others
-        States of further load cases, with the same cells: snapshots and checkpoints hold them too.
+    others, weights
+        States of further load cases, with the same cells: snapshots and checkpoints hold them too. Weights of all, this
+        one first.
 
     Examples
     --------
@@ -228,8 +230,11 @@ class State:
         self._natural = getattr(kinematics, "gradient", None)  # G, of a body that is free of stress elsewhere
         self._initial = getattr(kinematics, "initial", None)  # that of the start, where it grows
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
+        self._known: Remembered[Array] = Remembered(None, F)
+        self._known_elastic: Remembered[Array] = Remembered(None, kinematics.elastic_gradient(unknown))
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.others: Sequence[State] = ()
+        self.weights: Sequence[float] = (1.0,)
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.tell: Callable[[str], object] = lambda words: None  # of a step that is solved in parts
@@ -265,8 +270,9 @@ class State:
         return self.loading.domain.gather_nodes(self.kinematics.nodal_displacement(self.unknown)[self._dof_of_node])
 
     def deformation_gradient(self) -> NDArray[np.float64]:
-        """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3)."""
-        return self.cells.quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3)
+        """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3); only to read."""
+        quadrature = self.cells.quadrature
+        return self._known(lambda: quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3))
 
     @property
     def natural_gradient(self) -> NDArray[np.float64] | None:
@@ -286,9 +292,19 @@ class State:
         return axes if gradient is None else axes @ np.swapaxes(gradient, -1, -2)
 
     def elastic_gradient(self) -> NDArray[np.float64]:
-        """F_e of the present unknowns at all points in one row, (elements * points, 3, 3)."""
-        F = self.deformation_gradient()
-        return self.elastic(F.reshape(*self.cells.quadrature.shape, 3, 3)).reshape(-1, 3, 3)
+        """F_e of the present unknowns at all points in one row, (elements * points, 3, 3); only to read."""
+        if self._natural is None:
+            return self.deformation_gradient()
+        shape = (*self.cells.quadrature.shape, 3, 3)
+        return self._known_elastic(lambda: self.elastic(self.deformation_gradient().reshape(shape)).reshape(-1, 3, 3))
+
+    def parameters(self, tissue: Tissue) -> Parameters:
+        """The parameters of a tissue on this mesh, made once for all who ask. Collective, the first time."""
+        known = next((one for one in self.cells.prepared if tissue is one.given or tissue is one.tissue), None)
+        if known is None:
+            known = Parameters(tissue, self.cells.quadrature)
+            self.cells.prepared.append(known)
+        return known
 
     def per_mesh_volume(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values per volume of the start's stress-free tissue as values per volume of the mesh, (elements, points)."""
@@ -300,11 +316,15 @@ class State:
         """Every dolfinx function of the state by its name, those of further load cases with their mark ("@2")."""
         shared = {self.cells.dimensions.name, self.cells.axes.name}
         found = dict(self._functions)
-        for mark, case in list(self.cases().items())[1:]:
+        for mark, case in list(self.each_case().items())[1:]:
             found |= {f"{name}{mark}": function for name, function in case._functions.items() if name not in shared}
         return found
 
-    def cases(self) -> dict[str, State]:
+    def join(self, others: Sequence[State], weights: Sequence[float]) -> None:
+        """Hold other states with the same cells too; weights of all, this one first."""
+        self.others, self.weights = list(others), tuple(weights)
+
+    def each_case(self) -> dict[str, State]:
         """The states of all load cases by the mark that their names have: this one has none, then "@2", "@3"."""
         return {"": self} | {f"@{number}": case for number, case in enumerate(self.others, start=2)}
 
@@ -318,7 +338,7 @@ class State:
         number
             How many steps there have been.
         """
-        for case in self.cases().values():
+        for case in self.each_case().values():
             case.time, case.number = time, number
 
     def _add(self, function: Any) -> None:
@@ -457,11 +477,6 @@ class Earlier:
 # Numbers and arrays are made again only where a parameter has changed.
 
 
-def on_mesh(tissue: Tissue, mesh: Any) -> Tissue:
-    """The tissue with Constants in place of numbers, so that other numbers compile nothing."""
-    return tissue.map(lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value))
-
-
 def at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
     """A tissue on a mesh with its parameters as arrays over the points in one row, (elements * points,)."""
     return tissue.map(lambda name, value: assembly.point_values(value, quadrature).reshape(-1))
@@ -485,11 +500,23 @@ def by_region(domain: Domain, values: Mapping[str, float]) -> Any:
 
 
 class Parameters:
-    """What the live parameters of a tissue are at present."""
+    """A tissue on a mesh, and what its live parameters are at present.
+
+    Attributes
+    ----------
+    given, tissue
+        The tissue, and the same with Constants in place of numbers, so that other numbers compile nothing.
+    compiled
+        The same with its repulsion in C.
+    """
 
     def __init__(self, tissue: Tissue, quadrature: Quadrature):
-        self.tissue, self.quadrature = tissue, quadrature
-        values = list(tissue.parameters.values())
+        self.given, self.quadrature, mesh = tissue, quadrature, quadrature.mesh
+        self.tissue = tissue.map(
+            lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value)
+        )
+        self.compiled = with_kernels(self.tissue, mesh.comm)
+        values = list(self.tissue.parameters.values())
         self._largest: Remembered[Tissue] = Remembered(quadrature.mesh.comm, *values)
         self._at_points: Remembered[Tissue] = Remembered(None, *values)
 
@@ -497,7 +524,7 @@ class Parameters:
         """The largest value of each in the body, numbers. Collective."""
 
         def found() -> Tissue:
-            whole = self.tissue.map(lambda name, value: assembly.largest(value, self.quadrature.mesh))
+            whole = self.compiled.map(lambda name, value: assembly.largest(value, self.quadrature.mesh))
             if not isinstance(self.tissue.contour_length, dolfinx.fem.Function):
                 return whole
             lengths = self.at_points().contour_length.reshape(self.quadrature.shape)
@@ -508,7 +535,7 @@ class Parameters:
 
     def at_points(self) -> Tissue:
         """`at_points`; not to be written into."""
-        return self._at_points(lambda: at_points(self.tissue, self.quadrature))
+        return self._at_points(lambda: at_points(self.compiled, self.quadrature))
 
     def locking_length(self) -> Array:
         """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""

@@ -208,7 +208,7 @@ COLUMNS: dict[str, Column] = {
 
 
 def _turned_over(name: str, m: Any) -> float:
-    return float(m.observer.stepper.turnover.mean(name))
+    return float(m.observer.stepper.part("turnover").mean(name))
 
 
 COLUMNS_ON_REQUEST: dict[str, Column] = {
@@ -256,21 +256,21 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "growth",
             "",
             "volume of the tissue free of stress over that at the start; mean over the volume at the start",
-            lambda m: float(m.quadrature.mean(m.observer.stepper.turnover.growth.ratio)),
+            lambda m: float(m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio)),
             by_case=False,
         ),
         Column(
             "collagen_share",
             "",
             "share of the tissue's volume that is collagen, mean over the volume at the start",
-            lambda m: m.observer.stepper.turnover.collagen_share(),
+            lambda m: m.observer.stepper.part("turnover").collagen_share(),
             by_case=False,
         ),
         Column(
             TURNOVER_POWER,
             "stress length^3 / time",
             "power that turnover releases at the F of the row, without growth",
-            lambda m: m.observer.stepper.turnover.power(),
+            lambda m: m.observer.stepper.part("turnover").power(),
             by_case=False,
         ),
         Column(

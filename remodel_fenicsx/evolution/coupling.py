@@ -134,9 +134,8 @@ class Coupling(Protocol):
     """One step in two halves, inside the stepper's transaction. What is between them is the step's row.
 
     Cells are changed by `RemodelingPass.apply` or `replace`, which know the power. What goes on from step to step is
-    remembered in the state (`State.remember`, `state.Numbers`). Whoever takes turnover tells it where a step is:
-    `lag`, `extrapolate` or `begin`, then `settle` or `take`, at last `complete`. Further load cases are solved by the
-    coupling too (`RemodelingPass.cases`).
+    remembered in the state (`State.remember`, `state.Numbers`). The coupling tells what remodels beside the cells
+    (`RemodelingPass.beside`) where a step is: `before`, `settle` in equilibrium, `after`.
 
     Attributes
     ----------
@@ -226,10 +225,9 @@ class Staggered:
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = None if settings.predictor == "none" else Predictor(state)
         self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
-        self.turnover = remodeling.turnover
         self.residual = 0.0
         self.tangents = 0  # that were assembled in the last solve of the state itself
-        changes = remodeling.law.remodels or self.turnover is not None
+        changes = any(part.changes for part in (remodeling, *remodeling.beside))
         self.blend = Blend(state, tissue, settings) if changes else None
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -240,9 +238,12 @@ class Staggered:
         StepFailure
             If no admissible equilibrium is found.
         """
-        if self.turnover is not None:
-            self.turnover.lag(time)  # the rates of the row, like its cells, are those of the step before
+        self._before(time)
         return self.balanced(time, loads)
+
+    def _before(self, time: float) -> None:
+        for part in self.remodeling.beside:
+            part.before(time, self.traits.order)
 
     def balanced(self, time: float, loads: LoadValues, again: bool = False) -> Work:
         """Equilibrium with what has remodeled.
@@ -262,14 +263,12 @@ class Staggered:
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
         self.state.settle_cells()
-        if self.turnover is not None:
-            self.turnover.settle()
         self.residual = work.residual
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
         self.tangents = work.tangents
-        for case in self.remodeling.cases:
-            work.count(case.solve(time, again))
+        for part in self.remodeling.beside:
+            work.count(part.settle(time, again))
         return work
 
     def remodel(self, time: float) -> float:
@@ -277,9 +276,10 @@ class Staggered:
         power = 0.0
         if self.remodeling.law.remodels:
             power = self.remodeling.apply(self.state.time, time, self.residual)
-        if self.turnover is not None:
-            self.turnover.complete(time)
-        return power
+        return power + self._after(time)
+
+    def _after(self, time: float) -> float:
+        return sum(part.after(time) for part in self.remodeling.beside)
 
     @property
     def better(self) -> UnitCell | None:
@@ -289,8 +289,8 @@ class Staggered:
     def close(self) -> None:
         """Free PETSc's objects."""
         self.newton.close()
-        for case in self.remodeling.cases:
-            case.coupling.close()
+        for part in self.remodeling.beside:
+            part.close()
         if self.blend is not None:
             self.blend.close()
 
@@ -336,11 +336,11 @@ class Staggered:
     def _solve_in_parts(
         self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work, failure: SolveFailure | None
     ) -> None:
-        """First the change of the cells and of turnover, then that of the loads."""
+        """First the change of what remodels, then that of the loads."""
         # `failure`: that of the whole step, if it was tried.
         loading, halvings = self.state.loading, self.settings.maximum_halvings
         loading.set(old_loads)
-        if self.blend is not None and self._cells_changed():
+        if self.blend is not None and self._has_remodeled():
             blend = self.blend
             parts = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
             Change(*parts, halvings, blend.largest_part, roughly=True).advance(work)
@@ -356,7 +356,7 @@ class Staggered:
 
     def _whole(self, time: float, old_loads: LoadValues, new_loads: LoadValues) -> Change:
         """The change of the cells and of the loads together."""
-        blend = self.blend if self.blend is not None and self._cells_changed() else None
+        blend = self.blend if self.blend is not None and self._has_remodeled() else None
 
         def set_fraction(fraction: float) -> None:
             self.state.loading.set(between(old_loads, new_loads, fraction))
@@ -369,15 +369,14 @@ class Staggered:
         return Change(time, "the step", set_fraction, self.state, lambda: blend.newton, halvings, blend.largest_part)
 
     def _set_part(self, fraction: float) -> None:
-        """Of what the cells have changed since the last solved state, and content and natural length."""
+        """Take a part of what has remodeled since the last solved state."""
         assert self.blend is not None
         self.blend.set(fraction)
-        if self.turnover is not None:
-            self.turnover.set_part(fraction)
+        for part in self.remodeling.beside:
+            part.set_part(fraction)
 
-    def _cells_changed(self) -> bool:
-        """Or content and natural length."""
-        if self.turnover is not None:
+    def _has_remodeled(self) -> bool:
+        if any(part.changes for part in self.remodeling.beside):
             return True
         same = self.state.equilibrium_cells.equals(self.state.cells)
         return bool(self.state.comm.allreduce(int(not same)) > 0)
@@ -422,8 +421,7 @@ class Extrapolated(Staggered):
         cells = self.state.cells
         self._start, expected = cells.point_cells.copy(), self._extrapolated(time)
         self._follow(expected, time)
-        if self.turnover is not None:
-            self.turnover.extrapolate(time)
+        self._before(time)
         work = self.balanced(time, loads)
         self._found = self.remodeling.target(self.residual)
         self._begins = (self._newest["switch"] < COUNTS) & (self._found.switch >= COUNTS)
@@ -443,9 +441,7 @@ class Extrapolated(Staggered):
         self._older[:] = self._newest
         self._older["time"][self._begins] = NEVER  # its step had the target of its end
         self._newest["direction"], self._newest["switch"], self._newest["time"] = *self._found, time
-        if self.turnover is not None:
-            self.turnover.complete(time)
-        return self._power
+        return self._power + self._after(time)
 
     def _extrapolated(self, time: float) -> Target:
         """The target at the middle of the step."""

@@ -18,10 +18,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
-from remodel_fenicsx.evolution.turnover import MUCH, Slowing
 from remodel_fenicsx.fem import assembly
-from remodel_fenicsx.model.cells import structure_tensor
-from remodel_fenicsx.model.laws import relaxed
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.system import NOTICE
@@ -34,7 +31,7 @@ PATH_TOLERANCE, UNLOADING = 3.0, 0.5
 There points lose their tension, and their cells stay as exact as the way. The paper's artery takes 25 solves."""
 UNCHECKED = 90.0  # degrees: more than any step's error, where it leaves nothing
 LONGEST = 1.0  # step on the way, times kappa: longer ones leave too few looks at cells that come to rest slowly
-GROWTH_OF_STEPS, LONGEST_AT_END = 1.5, 8.0
+LENGTHENING_OF_STEPS, LONGEST_AT_END = 1.5, 8.0
 """Under constant loads each step may be longer by this factor while changes fall, up to so many times 1/kappa: then a
 step is a pass to the limit but for 0.03 %."""
 FRONT = 1.2
@@ -56,7 +53,8 @@ class Homeostasis:
         self.control, self.held_from = control, held_from
         self.first = first  # hold of the loads in which the way rests once before, from and to
         self.stepper, self.state, self.tolerance = control.stepper, control.state, control.tolerance
-        self.remodeling, self.turnover = self.stepper.remodeling, self.stepper.turnover
+        self.remodeling = self.stepper.remodeling
+        self.remodels = [part for part in self.stepper.remodels if part.components]
         self.quadrature = self.state.cells.quadrature
         control.level = logging.INFO  # no row of the way is a result; of points that turn over at once fronts tell
         self.longest = control.longest
@@ -73,8 +71,7 @@ class Homeostasis:
         """Equilibrium of forces and of cells."""
         state, work = self.state, Work()
         start, number, self.steps, self._held = state.time, state.number, 0, None
-        # turnover and a threshold remember the way
-        remembers = self.turnover is not None or self.remodeling.settings.threshold > 0.0
+        remembers = any(part.depends_on_path for part in self.remodels)
         coarsens = not (self.stepper.coupling.traits.accumulates or self.tolerance >= UNCHECKED or remembers)
         if self.first is not None:
             self._rest_before(*self.first, work)
@@ -86,14 +83,14 @@ class Homeostasis:
             state.restore(self._held)
             self._go(time, loads, max(start, self.held_from), False, work)
         state.reach(start, number)
-        for case in state.cases().values():
+        for case in state.each_case().values():
             case.settle_cells()
         self._residual = work.residual
         return work
 
     def _rest_before(self, held: float, change: float, work: Work) -> None:
-        """Wait under loads that are held until all rests; what is made from there on takes room."""
-        control, stepper, growth = self.control, self.stepper, self.turnover.growth
+        """Wait under loads that are held until all rests; then begins what waits for that."""
+        control, stepper = self.control, self.stepper
         stops, given = control.stops, stepper.load_values
         control.stops = [*(stop for stop in stops if stop <= held), stops[-1]]
         stepper.load_values = lambda time: given(min(time, held))
@@ -102,8 +99,9 @@ class Homeostasis:
         finally:
             control.stops, stepper.load_values = stops, given
         self.state.settle_cells()
-        log.info("growth begins, after %d steps", self.steps)
-        growth.start = change
+        log.info("all rests after %d steps, before time %g", self.steps, change)
+        for part in self.remodels:
+            part.rested(change)
         self.state.reach(change, self.state.number)
 
     def _go(self, time: float, loads: LoadValues, held: float, coarsens: bool, work: Work) -> None:
@@ -111,7 +109,8 @@ class Homeostasis:
         # The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
         # collagen comes to rest depends on the way.
         state, control, before, waiting, near = self.state, self.control, np.inf, 0.0, NEAR_REST
-        self._slowing = Slowing(dict(Slowing.INITIAL))
+        for part in self.remodels:
+            part.begin_path()
         control.tolerance, control.longest = self.tolerance, self.longest
         start = held
         for step in control.march():
@@ -130,42 +129,30 @@ class Homeostasis:
             left, residual = self._left(work.residual), work.residual
             waiting += min(1.0, self.stepper.slowest * (state.time - start))  # a long step forgets as much as one
             start = state.time
-            is_over = self._is_over(left, waiting, time, work.residual)
+            is_over = self._is_over(left, waiting)
             if (is_over or left <= near) and (self._add_tail(time, loads, work) or is_over):
                 return
             work.residual, near = residual, min(near, AGAIN * left)
             state.restore(ahead)
             if coarsens:
-                longer = min(GROWTH_OF_STEPS * control.longest, LONGEST_AT_END)
+                longer = min(LENGTHENING_OF_STEPS * control.longest, LONGEST_AT_END)
                 control.longest, before = longer if left < before else self.longest, left
 
     def _left(self, residual: float) -> float:
-        """By how much A changes, over r0^2, or content and natural length, in a time of 1/kappa from here."""
+        """By how much all changes, relatively, in a time of 1/kappa from here."""
         soon = self.state.time + 1 / self.stepper.slowest
-        return max(self._largest(self._change_by_a_pass(soon, residual)), self._growth())
+        return max(part.left(soon, residual) for part in self.remodels)
 
-    def _is_over(self, left: float, waiting: float, time: float, residual: float) -> bool:
+    def _is_over(self, left: float, waiting: float) -> bool:
         """Whether the path ends: the cells hardly change, or do not come to rest."""
         if left <= REST:
             return True
-        if self._grows_on(waiting):
-            text = (
-                "growth does not come to rest, its rates fall no faster than 1/t "
-                "(docs/tissue_that_lives.md, When it comes to rest): the state is that "
-                "of time %g, on the path"
-            )
-            self._say(logging.WARNING, text, self.state.time)
+        if without := [text for part in self.remodels if (text := part.without_rest(waiting))]:
+            self._say(logging.WARNING, without[0])
             return True
         if waiting > LONGEST_HOLD:
-            self._say(
-                logging.WARNING,
-                "the cells do not come to rest: a pass to its limit changes the structure tensor A by up to %.2g r0^2",
-                self._largest(self._towards(time, residual)),
-            )
-            if self.turnover is not None:
-                self._say(
-                    logging.WARNING, "content or natural length change by up to %.2g in a time of T", self._growth()
-                )
+            text = "the cells do not come to rest: in a time of 1/kappa the state still changes by %.2g of its size"
+            self._say(logging.WARNING, text, left)
         return waiting > LONGEST_HOLD
 
     # ------------------------------------------------------------ the tail of the decay
@@ -176,16 +163,14 @@ class Homeostasis:
         """
         state, factor = self.state, 1.0
         coupling: Any = self.stepper.coupling
-        change, rates = self._towards(time, work.residual), self._rates()
+        changes = self._to_the_limit(time, work.residual)
         for _ in range(TAIL_PASSES):
-            left = max(self._largest(change), self._growth())
+            left = self._size(changes)
             if left <= TAIL:
                 return True
             before, residual = state.snapshot(), work.residual
-            asked, _ = self.remodeling.updated_cells(state.time, time, residual)
-            state.cells.set(*relaxed(state.cells.point_cells.copy(), asked, factor)[:2])
-            if self.turnover is not None:
-                self.turnover.change(rates.reshape(-1, 2).T, factor)
+            for part, change in zip(self.remodels, changes, strict=True):
+                part.follow(change, factor, time, residual)
             try:
                 found = coupling.balanced(state.time + 1 / self.stepper.slowest, loads, again=True)
             except StepFailure as failure:
@@ -194,58 +179,30 @@ class Homeostasis:
                 return False
             work.add(found)
             work.substeps, self.steps = work.substeps + found.substeps, self.steps + 1
-            before_it, change, rates = (change, rates), self._towards(time, found.residual), self._rates()
-            if max(self._largest(change), self._growth()) >= left:
+            earlier, changes = changes, self._to_the_limit(time, found.residual)
+            if self._size(changes) >= left:
                 state.restore(before)
                 work.residual = residual
                 return False
             work.residual = found.residual
             # a change d that falls to s d when d/(1 - s_0) was added leaves s d/(1 - s): s of the last factor
-            pairs = zip(before_it, (change, rates), strict=True)
+            pairs = zip(earlier, changes, strict=True)
             ratios = [self._dot(one, other) / square for one, other in pairs if (square := self._dot(one, one))]
             ratio = 1 - (1 - max(ratios)) / factor
             factor = 1 / (1 - min(max(ratio, -1.0), LARGEST_RATIO))
         return False
 
-    def _towards(self, time: float, residual: float) -> Array:
-        """Change of A by a pass to the limit at all points that have tension."""
-        change = self._change_by_a_pass(time, residual)
-        change[self.remodeling.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
-        return change
+    def _to_the_limit(self, time: float, residual: float) -> list[Array]:
+        """Changes of what remodels to where it tends."""
+        return [part.to_the_limit(time, 1 / self.stepper.slowest, residual) for part in self.remodels]
 
-    def _rates(self) -> Array:
-        """Changes of ln m and ln rho in a time of 1/kappa, (elements, points, 2); none where nothing is turned over."""
-        if self.turnover is None:
-            return np.zeros((self.quadrature.shape[0], 0, 2))
-        return np.asarray(self.turnover.rates().T / self.stepper.slowest).reshape(*self.quadrature.shape, 2)
+    def _size(self, changes: Sequence[Array]) -> float:
+        """The largest relative change."""
+        return max(part.size(change) for part, change in zip(self.remodels, changes, strict=True))
 
     def _dot(self, one: Array, other: Array) -> float:
         """Sum of products over all ranks."""
         return float(self.state.comm.allreduce(float(self.quadrature.owned(one * other).sum())))
-
-    def _growth(self) -> float:
-        """Largest relative change of content or natural length in the time in which `REST` is asked for."""
-        if self.turnover is None:
-            return 0.0
-        return self.quadrature.maximum(self.turnover.fastest_changes()) / self.stepper.slowest
-
-    def _grows_on(self, waiting: float) -> bool:
-        """Whether the natural length has grown much, and its rates do not fall as those do that come to rest."""
-        if self.turnover is None:
-            return False
-        goes_on = self._slowing.goes_on(waiting, self._growth())
-        return goes_on and self.quadrature.maximum(self.turnover.factors("natural_length")) > MUCH
-
-    def _change_by_a_pass(self, time: float, residual: float) -> Array:
-        """Of A up to a time, at all points."""
-        asked, _ = self.remodeling.updated_cells(self.state.time, time, residual)
-        found = structure_tensor(*asked[:2]).reshape(*self.quadrature.shape, 3, 3)
-        return np.asarray(found - self.state.cells.structure_tensor())
-
-    def _largest(self, change: Array) -> float:
-        """Over r0^2, of all points."""
-        r0 = assembly.point_values(self.stepper.tissue.end_to_end_length, self.quadrature)
-        return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def _largest_jump(self) -> tuple[float, NDArray[np.float64]]:
         """Largest difference of A over r0^2 between a point and its nearest ones, and the middle of the two."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -12,18 +12,19 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import Remembered, coefficient, over_ranks, point_values
-from remodel_fenicsx.kernels import in_numpy, with_kernels
-from remodel_fenicsx.model import spectral
-from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from remodel_fenicsx.kernels import in_numpy
+from remodel_fenicsx.model import spectral, tensors
+from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, tensor_target
+from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, relaxed, tensor_target
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
-from remodel_fenicsx.state import Numbers, Parameters, State, on_mesh, stress_rounding
+from remodel_fenicsx.state import Numbers, State, stress_rounding
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -48,23 +49,26 @@ class Noise(NamedTuple):
     rounding: float
 
 
-class RemodelingPass:
+class RemodelingPass(Remodels):
     """Updates the unit cells of a solved state."""
 
-    def __init__(self, state: State, tissue: Tissue, settings: Remodeling, kappa: Any = None):
-        self.state, self.settings = state, settings
-        self.quadrature = state.cells.quadrature
-        self.cases: Sequence[Any] = ()  # further load cases (`stepper.OtherCase`), which drive the cells too
-        self.weights: Sequence[float] = (1.0,)  # of all cases, this one first
-        self.turnover: Any = None  # `TurnoverPass`, which changes content and natural length
-        if settings.turnover.is_on:
-            from remodel_fenicsx.evolution.turnover import TurnoverPass
+    name, components = "cells", len(tensors.MANDEL)
 
-            self.turnover = TurnoverPass(state, tissue, settings.turnover)
+    def __init__(
+        self,
+        state: State,
+        tissue: Tissue,
+        settings: Remodeling,
+        kappa: Any = None,
+        beside: Sequence[Remodels] = (),
+    ):
+        self.state, self.settings, self.beside = state, settings, list(beside)  # beside: what else remodels
+        self.quadrature = state.cells.quadrature
+        # drives of states beside this one, which have the same cells
+        self.further: list[Callable[[], Drive]] = []
         # of a pass's change of the cells that is made
         self.relaxation = settings.relaxation_factor if COUPLINGS[settings.coupling].makes_a_share else 1.0
-        self.tissue = with_kernels(on_mesh(tissue, self.quadrature.mesh), state.comm)
-        self.parameters = Parameters(self.tissue, self.quadrature)
+        self.parameters = state.parameters(tissue)
         self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
         self.set_kappa(settings.kappa if kappa is None else kappa)
         if self.fastest == 0.0 and self.law.asks_kappa:  # cells that never move need no pass
@@ -76,24 +80,25 @@ class RemodelingPass:
         self._numbers = Numbers(state, "noise", {"said": 0, "stress": 0.0, "floor": 0.0})
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.elastic_gradient(state.unknown)
-        self.stresses = PointStresses(state, self.tissue)
-        tensor = self.driver.tensor(F, self.stresses.ufl)
-        # one stacked expression: F_e comes at no cost with the driver
-        self.stacked = ufl.as_vector([t[i, j] for t in (F, tensor) for i in range(3) for j in range(3)])
-        self._expression = jit.expression(self.stacked, self.quadrature.points)
-        self._known: Remembered[Array] = Remembered(state.comm, self.stacked)
+        self.stresses = PointStresses(state, tissue)
+        tensor = ufl.as_ufl(self.driver.tensor(F, self.stresses.ufl))
+        self._expression = jit.expression(tensor, self.quadrature.points)
+        self._known: Remembered[Array] = Remembered(state.comm, tensor)
         self._target: Any = self.law.target
         if self._target is tensor_target and not settings.has_set_point and not in_numpy():
             from remodel_fenicsx.kernels.tensor import TensorKernels
 
             self._target = TensorKernels(state.comm).target  # with the exponent 2 and no threshold
 
-    def join(self, cases: Sequence[Any], weights: Sequence[float]) -> None:
-        """From now on further load cases drive the cells too, with these weights: of the first case, and of them."""
-        self.cases, self.weights = list(cases), tuple(weights)
-        self.state.others = [case.state for case in cases]
-        if self.turnover is not None:
-            self.turnover.weights = self.weights
+    @property
+    def changes(self) -> bool:  # type: ignore[override]
+        """Whether cells change at all."""
+        return self.law.remodels
+
+    @property
+    def depends_on_path(self) -> bool:  # type: ignore[override]
+        """Whether cells stay where tension is below a threshold."""
+        return self.settings.threshold > 0.0
 
     def set_kappa(self, kappa: Any) -> None:
         """A number, or a DG0 Function."""
@@ -107,27 +112,24 @@ class RemodelingPass:
         self.slowest, self.kappa = slowest if np.isfinite(slowest) else 0.0, at_points.reshape(-1)
 
     def driving_tensor(self) -> tuple[Array, Array]:
-        """F and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
-        return self.kernels.gradient_and_driver(self.stacked_values().reshape(-1, 2, 3, 3))
-
-    def stacked_values(self) -> Array:
-        """F_e and the driving tensor, row by row, (elements, points, 18); of one state they are computed once."""
+        """F_e and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
 
         def evaluated() -> Array:
             self.stresses.refresh()
-            return self.quadrature.evaluate(self._expression, (18,))
+            tensor = self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
+            return (tensor + np.swapaxes(tensor, 1, 2)) / 2
 
-        return self._known(evaluated)
+        return self.state.elastic_gradient(), self._known(evaluated)
 
     def drive(self, residual: float = 0.0) -> Drive:
         """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
-        # With several load cases: in all of their states.
-        if not self.cases:
+        # Of several states with the same cells: their mean.
+        if not self.further:
             return self._own_drive(residual)
-        return MEANS_OF_CASES[self.settings.mean].drive(self._drives(residual), self.weights)
+        return MEANS_OF_CASES[self.settings.mean].drive(self._drives(residual), self.state.weights)
 
     def _drives(self, residual: float) -> list[Drive]:
-        return [self._own_drive(residual), *(case.drive() for case in self.cases)]
+        return [self._own_drive(residual), *(drive() for drive in self.further)]
 
     def _own_drive(self, residual: float) -> Drive:
         F, tensor = self.driving_tensor()
@@ -207,12 +209,12 @@ class RemodelingPass:
     def target(self, residual: float = 0.0) -> Target:
         """What the structure tensor tends to in the present state; of laws that have one."""
         if self._averages_targets:
-            return mean_target([self._target(drive) for drive in self._drives(residual)], self.weights)
+            return mean_target([self._target(drive) for drive in self._drives(residual)], self.state.weights)
         return self._target(self.drive(residual))
 
     @property
     def _averages_targets(self) -> bool:
-        return bool(self.cases) and MEANS_OF_CASES[self.settings.mean].of_targets
+        return bool(self.further) and MEANS_OF_CASES[self.settings.mean].of_targets
 
     def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
         """Of all points in one row: those without tension, or with hardly any beside compression. Cells there stay."""
@@ -224,7 +226,7 @@ class RemodelingPass:
 
     def asleep_share(self) -> float:
         """Share of the body's volume in which no principal value is above `remodeling.threshold`."""
-        tensor = self.drive().tensor if self.cases else self.driving_tensor()[1]
+        tensor = self.drive().tensor if self.further else self.driving_tensor()[1]
         asleep = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
         return float(self.quadrature.mean(asleep.reshape(self.quadrature.shape).astype(float)))
 
@@ -271,3 +273,56 @@ class RemodelingPass:
         before, after = (structure_tensor(*cells[:2]) for cells in self._change)
         distance = np.linalg.norm(after - before, axis=(-1, -2))
         return self.quadrature.maximum(distance.reshape(self.quadrature.shape))
+
+    # ------------------------------------------------------------ as one of those that remodel
+    def row(self) -> UnitCell:
+        """Return the cells of the solved state."""
+        return UnitCell(*self.state.equilibrium_cells.point_cells[:2])
+
+    def set(self, values: UnitCell) -> None:
+        """Take other cells."""
+        self.state.cells.set(*values[:2])
+
+    def as_components(self, values: UnitCell) -> Array:
+        """Return Mandel components of A."""
+        return tensors.to_mandel(structure_tensor(*values[:2]))
+
+    def moved(self, values: UnitCell, change: Array) -> UnitCell:
+        """Return cells whose A has changed."""
+        squared, axes = spectral.continued(structure_tensor(*values[:2]) + tensors.from_mandel(change), values.axes)
+        return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
+
+    def passed(self, values: UnitCell, time: float, residual: float) -> UnitCell:
+        """Return the cells after a pass."""
+        return self.updated_cells(self.state.time, time, residual, values)[0] if self.law.remodels else values
+
+    def apart(self, values: UnitCell, other: UnitCell) -> float:
+        """Return the angle between the directions of the chains, root mean square over the body."""
+        angles = angle_between(values, other).reshape(self.quadrature.shape)
+        return float(np.sqrt(self.quadrature.mean(angles**2)))
+
+    def left(self, time: float, residual: float) -> float:
+        """Return the largest change of A by a pass, over r0^2."""
+        return self.size(self._change_by_a_pass(time, residual))
+
+    def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
+        """Return the change of A by a pass to a time, at points that have tension."""
+        change = self._change_by_a_pass(time, residual)
+        change[self.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
+        return change
+
+    def size(self, change: Array) -> float:
+        """Return the largest change of A over r0^2."""
+        r0 = self.parameters.at_points().end_to_end_length.reshape(self.quadrature.shape)
+        return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
+
+    def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
+        """Make a multiple of the change of a pass to a time."""
+        asked, _ = self.updated_cells(self.state.time, time, residual)
+        self.set(relaxed(self.state.cells.point_cells.copy(), asked, factor))
+
+    def _change_by_a_pass(self, time: float, residual: float) -> Array:
+        """Return that of A, (elements, points, 3, 3)."""
+        asked, _ = self.updated_cells(self.state.time, time, residual)
+        present = self.state.cells.structure_tensor()
+        return np.asarray(structure_tensor(*asked[:2]).reshape(present.shape) - present)

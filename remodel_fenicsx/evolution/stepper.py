@@ -7,27 +7,32 @@ import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from decimal import Decimal
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Coupling, Maker, Staggered
+from remodel_fenicsx._lazy import resolved
+from remodel_fenicsx.evolution.coupling import Coupling, Maker
+from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.laws import Drive
-from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver, Turnover
-from remodel_fenicsx.solver.continuation import Change, StepFailure, Work
+from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver
+from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.solver.newton import GuardedNewton
-from remodel_fenicsx.state import State, on_mesh
+from remodel_fenicsx.state import State
 from remodel_fenicsx.system.interrupts import Paused
 
 log = logging.getLogger(__name__)
+
+BESIDE: dict[str, Callable[[State, Tissue, Remodeling], Remodels] | str] = {
+    "turnover": "remodel_fenicsx.evolution.turnover:TurnoverPass",
+}
+"""What remodels beside the cells, by the table of `[remodeling]` that switches it on; made of state and tissue."""
 
 SLOWNESS = 5  # steps between two looks of warnings, each of which costs up to a third of a step
 
@@ -187,43 +192,53 @@ class Stepper:
         kappa: Any = None,
     ):
         self.state, self.load_values, self._solver = state, load_values, solver
-        self.tissue = on_mesh(tissue, state.cells.quadrature.mesh)
-        self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa)
+        self.tissue = state.parameters(tissue).tissue
+        beside = [
+            resolved(make)(state, self.tissue, remodeling)
+            for name, make in BESIDE.items()
+            if getattr(remodeling, name).is_on
+        ]
+        self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, beside)
+        self.each_case: list[Any] = [self]  # whose states have these cells: this one, and further load cases
         # cells that never change are coupled to nothing
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
-        if remodeling.turnover.is_on and name != remodeling.coupling and state.comm.rank == 0:
+        if beside and name != remodeling.coupling and state.comm.rank == 0:
             log.warning(
-                "kappa is 0: cells stay as they are, and content and natural length follow with the coupling "
-                "'staggered' in place of %r, whose errors fall with the step",
+                "kappa is 0: the cells do not change, and %s follows with the coupling 'staggered' in place of %r, "
+                "whose errors fall with the step",
+                ", ".join(part.name for part in beside),
                 remodeling.coupling,
             )
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
-        self.turnover = self.remodeling.turnover
         self._closed = False
         # asked when a step's pass is done; what it raises takes the step back (`time_steps`)
         self.judge: Callable[[Step], object] = lambda step: None
 
     @property
+    def remodels(self) -> list[Remodels]:
+        """What remodels: the cells, and what is beside them."""
+        return [self.remodeling, *self.remodeling.beside]
+
+    def part(self, name: str) -> Any:
+        """Return what remodels under this name; None where nothing has it."""
+        return next((part for part in self.remodels if part.name == name), None)
+
+    @property
     def slowest(self) -> float:
-        """The smallest rate above 0 of cells and turnover, in 1/time; 0 where nothing remodels."""
-        return min((rate for rate in self._rates("slowest") if rate), default=0.0)
+        """The smallest rate above 0, 1/time; 0 where nothing remodels."""
+        return min((part.slowest for part in self.remodels if part.changes and part.slowest), default=0.0)
 
     @property
     def fastest(self) -> float:
         """The largest one."""
-        return max(self._rates("fastest"), default=0.0)
-
-    def _rates(self, name: str) -> list[float]:
-        parts = [self.remodeling] if self.remodeling.law.remodels else []
-        parts += [] if self.turnover is None else [self.turnover]
-        return [getattr(part, name) for part in parts]
+        return max((part.fastest for part in self.remodels if part.changes), default=0.0)
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
         """The present state as the step that watchers see before all others; at first in equilibrium without loads."""
         state, work = self.state, Work()
         if not state.number:
-            for case in (self, *self.remodeling.cases):
+            for case in self.each_case:
                 release(case.state, case.coupling.equilibrium, self._solver, work)
         step = Step(state.time, state.number, dict(state.loading.values), self.coupling.equilibrium.extension(), work)
         for watcher in watchers:
@@ -418,52 +433,3 @@ class Pause(Watcher):
         asked = [one for one in self.comm.allgather(reason) if one]
         if asked:
             raise Paused(REASONS[asked[0]], step.time, self.folder)
-
-
-# ---------------------------------------------------------------- further load cases: states with the same cells
-class OtherCase:
-    """A load case beside the first: solved after it in each step, and asked for its drive before the pass."""
-
-    def __init__(
-        self,
-        number: int,
-        state: State,
-        load_values: Callable[[float], LoadValues],
-        stepper: Stepper,
-        solver: Solver,
-        kappa: Any = None,
-    ):
-        self.number, self.state, self.load_values = number, state, load_values
-        self.tissue = stepper.tissue
-        settings = stepper.remodeling.settings.model_copy(update={"turnover": Turnover()})  # the first case makes it
-        self.remodeling = RemodelingPass(state, stepper.tissue, settings, kappa)
-        self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
-        state.stop_signal = lambda: stepper.state.stop_signal()
-
-    def solve(self, time: float, again: bool) -> Work:
-        """Equilibrium at `time` with the present cells; `again` as of `Staggered.balanced`."""
-        try:
-            return self.coupling.balanced(time, self.load_values(time), again)
-        except StepFailure as failure:
-            raise StepFailure(failure.time, f"load case {self.number}: {failure}", failure.refusal) from failure
-
-    def drive(self) -> Drive:
-        """Of the solved state."""
-        return self.remodeling.drive(self.coupling.residual)
-
-    def seen(self, step: Step) -> Step:
-        """A step as it is in this case."""
-        extension = self.coupling.equilibrium.extension()
-        return replace(step, loads=dict(self.state.loading.values), extension=extension, case=self.number)
-
-
-class OtherCaseWatcher(Watcher):
-    """A watcher of the states of another load case: it sees each step as it is there."""
-
-    def __init__(self, case: OtherCase, watcher: Watcher):
-        def as_there(hook: Callable[[Step], None], step: Step) -> None:
-            hook(case.seen(step))
-
-        for name in ("started", "resumed", "solved", "completed", "undone", "committed"):
-            setattr(self, name, partial(as_there, getattr(watcher, name)))
-        self.close = watcher.close  # type: ignore[method-assign]

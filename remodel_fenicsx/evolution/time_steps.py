@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.model import spectral, tensors
-from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
 from remodel_fenicsx.model.tensors import largest_change_of_length
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.solver.continuation import StepFailure
@@ -28,7 +28,6 @@ Array = NDArray[np.float64]
 
 SLOWEST = 20.0  # times as slowly as the cells alone body and cells may forget
 LARGEST_LINEAR_CHANGE = 1.0  # change of a length: a linear answer says no more
-COMPONENTS = (len(tensors.MANDEL),)
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,7 @@ class Estimate:
     row: float
 
 
-class Remodeled(NamedTuple):
-    """What remodels, at all points in one row: cells, and with turnover ln m and ln rho (2, n)."""
-
-    cells: UnitCell
-    turnover: Array | None = None
+Values = Sequence[Any]  # of all that remodels, each in a form of its own (`life_cycle.Remodels`)
 
 
 class TimeError:
@@ -52,105 +47,90 @@ class TimeError:
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.slowest
-        self.turnover = stepper.turnover
-        initial = {"row": 0.0, "speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0, "turnover": 0.0}
+        self.remodels = [part for part in stepper.remodels if part.components]
+        # the error of rows so far, by name; "row": that of the cells
+        self._errors = ["row" if part is stepper.remodeling else part.name for part in self.remodels]
+        initial = {"speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0} | dict.fromkeys(self._errors, 0.0)
         self._numbers = Numbers(stepper.state, "time_error", initial)
-        # of structure tensors: with rows that lag the last error, with others the last row
-        self._last = Earlier(stepper.state, "time_error_cells", lambda: self.quadrature.function("", COMPONENTS), 1)
-        if self.turnover is not None:  # the same of ln m and ln rho
-            made = stepper.state, "time_error_turnover", lambda: self.quadrature.function("", (2,)), 1
-            self._last_turnover = Earlier(*made)
+        # with rows that lag the last error, with others the last row
+        self._last = [
+            Earlier(
+                stepper.state,
+                f"time_error_{part.name}",
+                partial(self.quadrature.function, "", (part.components,)),
+                1,
+            )
+            for part in self.remodels
+        ]
 
     def measure(self, step: Step) -> Estimate:
-        """The estimate of a step whose pass is done, within its transaction."""
+        """Estimate the error of a step whose pass is done, within its transaction."""
         duration = step.time - self.state.time
-        row, better = self._row_and_better()
+        rows = [part.row() for part in self.remodels]
+        betters = [self._better(part) for part in self.remodels]
         if self.stepper.coupling.traits.accumulates:
-            found = self._added_up(step, row, better, duration)
-        elif better is None:
+            found = self._added_up(step, rows, betters, duration)
+        elif all(better is None for better in betters):
             found = Estimate(0.0, 0.0)
         else:
-            lag = self._lag(step, row, better, duration)
+            lag = self._lag(step, rows, _known(betters, rows), duration)
             found = Estimate(lag, lag)
         self._numbers["duration"] = duration
         step.time_error = found.row
         return found
 
-    def _row_and_better(self) -> tuple[Remodeled, Remodeled | None]:
-        """Of the solved state, and what the coupling has that is better; None where nothing is."""
-        cells, better = UnitCell(*self.state.equilibrium_cells.point_cells[:2]), self.stepper.coupling.better
-        if self.turnover is None:
-            return Remodeled(cells), None if better is None else Remodeled(better)
-        return Remodeled(cells, self.turnover.row), Remodeled(better or cells, self.turnover.better)
+    def _better(self, part: Remodels) -> Any:
+        return self.stepper.coupling.better if part is self.stepper.remodeling else part.better()
 
     # ------------------------------------------------------------ rows that lag behind
-    def _lag(self, step: Step, row: Remodeled, better: Remodeled, duration: float) -> float:
-        """Distance to what a pass makes with the stress of a body that has remodeled so."""
-        known, angle = better, self._apart(row, better)
+    def _lag(self, step: Step, rows: Values, betters: Values, duration: float) -> float:
+        """Measure the distance to what a pass makes with the stress of a body that has remodeled so."""
+        known, angle = betters, self._apart(rows, betters)
         with self.state.tentative():
-            strain, admissible = self._strain(step, self._expected(row, better, duration))
+            strain, admissible = self._strain(step, self._expected(rows, betters, duration))
             if admissible:
-                better = self._passed(step, row, duration)
-        most, angle = SLOWEST * angle, self._apart(row, better)
+                pairs = zip(self.remodels, rows, strict=True)
+                betters = [part.passed(row, step.time, step.work.residual) for part, row in pairs]
+        most, angle = SLOWEST * angle, self._apart(rows, betters)
         if angle > most:  # another state, to which this one does not tend
-            better, angle = known, most
-        before, after = (structure_tensor(*some.cells[:2]) for some in (row, better))
-        self._last.push(tensors.to_mandel(after - before).ravel())
-        if row.turnover is not None and better.turnover is not None:
-            self._last_turnover.push(np.ravel((better.turnover - row.turnover).T))
+            betters, angle = known, most
+        for part, last, row, better in zip(self.remodels, self._last, rows, betters, strict=True):
+            last.push((part.as_components(better) - part.as_components(row)).ravel())
         return max(angle, strain)
 
-    def _expected(self, row: Remodeled, better: Remodeled, duration: float) -> Remodeled:
-        """By what the last error lets expect; at first the better ones."""
-        if not self._last.known:
-            return better
-        longer = duration / self._numbers["duration"]
-        last = tensors.from_mandel(self._last.values[0].reshape(-1, *COMPONENTS))
-        squared, axes = spectral.continued(structure_tensor(*row.cells[:2]) + longer * last, row.cells.axes)
-        cells = UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
-        if row.turnover is None:
-            return Remodeled(cells)
-        return Remodeled(cells, row.turnover + longer * self._last_turnover.values[0].reshape(-1, 2).T)
-
-    def _passed(self, step: Step, row: Remodeled, duration: float) -> Remodeled:
-        """What the present state makes of the row's cells and collagen."""
-        remodeling, turnover, cells = self.stepper.remodeling, row.turnover, row.cells
-        if remodeling.law.remodels:
-            cells, _ = remodeling.updated_cells(self.state.time, step.time, step.work.residual, cells)
-        if turnover is not None:
-            turnover = self.turnover.after(turnover, duration, present=True)
-        return Remodeled(cells, turnover)
+    def _expected(self, rows: Values, betters: Values, duration: float) -> Values:
+        """Return what the last error lets expect; at first the better ones."""
+        if not self._last[0].known:
+            return betters
+        longer, parts = duration / self._numbers["duration"], zip(self.remodels, self._last, rows, strict=True)
+        return [
+            part.moved(row, longer * last.values[0].reshape(-1, part.components)) for part, last, row in parts
+        ]
 
     # ------------------------------------------------------------ errors that add up
-    def _added_up(self, step: Step, row: Remodeled, better: Remodeled | None, duration: float) -> Estimate:
-        fading = self._fading(step, row, duration)
-        answer, numbers, difference, turned_over = self._answer(fading, duration), self._numbers, 0.0, 0.0
-        if better is not None:
+    def _added_up(self, step: Step, rows: Values, betters: Values, duration: float) -> Estimate:
+        fading, numbers, strain = self._fading(step, rows, duration), self._numbers, 0.0
+        answer, ends, left = self._answer(fading, duration), [], []
+        if any(better is not None for better in betters):
+            betters = _known(betters, rows)
             with self.state.tentative():
-                strain, _ = self._strain(step, better)
-            difference = max(self._angle(row.cells, better.cells), strain)
-            turned_over = self._largest(row, better)
-        ends = [_end_of(difference, self.kappa * duration)]
-        left = float(np.exp(-fading * duration)) * numbers["row"] + difference
-        numbers["row"] = left
-        if self.turnover is not None:
-            # the rates of turnover, which are bounded, change no longer than the cells do
-            ends.append(_end_of(turned_over, max(self.kappa, self.turnover.slowest) * duration))
-            fading = min(fading, self.turnover.slowest) if fading else self.turnover.slowest
-            numbers["turnover"] = float(np.exp(-fading * duration)) * numbers["turnover"] + turned_over
-            left = max(left, numbers["turnover"])
-        return Estimate(answer * max(ends), left)
+                strain, _ = self._strain(step, betters)
+        for part, name, row, better in zip(self.remodels, self._errors, rows, _known(betters, rows), strict=True):
+            error = max(part.apart(row, better), strain if part is self.stepper.remodeling else 0.0)
+            # bounded rates change no longer than the cells do
+            ends.append(_end_of(error, max(self.kappa, part.slowest) * duration))
+            rate = min(fading, part.slowest) if fading else part.slowest
+            numbers[name] = float(np.exp(-rate * duration)) * numbers[name] + error
+            left.append(numbers[name])
+        return Estimate(answer * max(ends), max(left))
 
-    def _fading(self, step: Step, row: Remodeled, duration: float) -> float:
-        """Rate at which errors fade: that at which cells and turnover slow down while loads are held."""
-        numbers, known = self._numbers, self._last.known
-        before, fading, speed = numbers["speed"], numbers["fading"], 0.0
-        kept = [(self._last, tensors.to_mandel(structure_tensor(*row.cells[:2])).ravel())]
-        if row.turnover is not None:
-            kept.append((self._last_turnover, np.ravel(row.turnover.T)))
-        if known:
-            changes = [present - last.values[0] for last, present in kept]
-            shape = self.quadrature.shape
+    def _fading(self, step: Step, rows: Values, duration: float) -> float:
+        """Return the rate at which errors fade: that at which all slows down while loads are held."""
+        numbers, speed, shape = self._numbers, 0.0, self.quadrature.shape
+        before, fading = numbers["speed"], numbers["fading"]
+        present = [part.as_components(row).ravel() for part, row in zip(self.remodels, rows, strict=True)]
+        if self._last[0].known:
+            changes = [one - last.values[0] for one, last in zip(present, self._last, strict=True)]
             points = max(shape[0] * shape[1], 1)  # a rank may have none
             squares = [(change**2).reshape(*shape, change.size // points).sum(axis=-1) for change in changes]
             speed = float(np.sqrt(self.quadrature.mean(sum(squares)))) / duration
@@ -159,8 +139,8 @@ class TimeError:
         elif before > 0 and speed > 0:
             rate = np.log(before / speed) / (0.5 * (duration + numbers["duration"]))
             fading = float(np.sqrt(fading * np.clip(rate, self.kappa / SLOWEST, self.kappa)))
-        for last, present in kept:
-            last.push(present)
+        for last, one in zip(self._last, present, strict=True):
+            last.push(one)
         numbers["speed"], numbers["fading"] = speed, fading
         return fading
 
@@ -174,42 +154,31 @@ class TimeError:
 
     def _held(self, step: Step) -> bool:
         """Whether no load has changed over the step."""
-        time = self.state.time
-        return _same(self.stepper.load_values(time), step.loads) and all(
-            _same(case.load_values(time), case.state.loading.values) for case in self.stepper.remodeling.cases
+        first, *others = self.stepper.each_case
+        time, loads = self.state.time, [step.loads, *(case.state.loading.values for case in others)]
+        return all(
+            values.get(name) == value
+            for case, values in zip((first, *others), loads, strict=True)
+            for name, value in case.load_values(time).items()
         )
 
     # ------------------------------------------------------------ distances
-    def _apart(self, row: Remodeled, better: Remodeled) -> float:
-        """Between the directions of the chains, or the largest relative one of content and natural length, degrees."""
-        return max(self._angle(row.cells, better.cells), self._largest(row, better))
+    def _apart(self, rows: Values, betters: Values) -> float:
+        """Return the largest distance of what remodels, degrees."""
+        return max(part.apart(*pair) for part, *pair in zip(self.remodels, rows, betters, strict=True))
 
-    def _largest(self, row: Remodeled, better: Remodeled) -> float:
-        """Relative difference of content or natural length in the body, as an angle in radians, in degrees."""
-        if row.turnover is None or better.turnover is None:
-            return 0.0
-        largest = np.abs(better.turnover - row.turnover).max(axis=0).reshape(self.quadrature.shape)
-        return float(np.degrees(self.quadrature.maximum(largest)))
-
-    def _angle(self, row: UnitCell, better: UnitCell) -> float:
-        """Between the directions of the chains, root mean square over the body."""
-        apart = angle_between(row, better).reshape(self.quadrature.shape)
-        return float(np.sqrt(self.quadrature.mean(apart**2)))
-
-    def _strain(self, step: Step, remodeled: Remodeled) -> tuple[float, bool]:
+    def _strain(self, step: Step, remodeled: Values) -> tuple[float, bool]:
         """Let the body answer what has remodeled: the largest change of a length, and whether that is a state."""
-        # In all load cases.
-        shape, cases, cells = self.quadrature.shape, self.stepper.remodeling.cases, remodeled.cells
-        before = [case.state.elastic_gradient() for case in (self.stepper, *cases)]
-        self.state.cells.set(cells.dimensions.reshape(*shape, 3), cells.axes.reshape(*shape, 3, 3))
-        if remodeled.turnover is not None:
-            self.turnover.set(remodeled.turnover)
-        tangents = [case.coupling.tangents for case in (self.stepper, *cases)] if cases else [step.work.tangents]
-        found = [self._answered(*parts) for parts in zip((self.stepper, *cases), before, tangents, strict=True)]
+        cases = self.stepper.each_case
+        before = [case.state.elastic_gradient() for case in cases]
+        for part, values in zip(self.remodels, remodeled, strict=True):
+            part.set(values)
+        tangents = [case.coupling.tangents for case in cases] if cases[1:] else [step.work.tangents]
+        found = [self._answered(*parts) for parts in zip(cases, before, tangents, strict=True)]
         return max(strain for strain, _ in found), all(admissible for _, admissible in found)
 
     def _answered(self, case: Any, before: Array, tangents: int) -> tuple[float, bool]:
-        """Of one load case, a stepper or what is one to those who look on; `before`: its F_e."""
+        """Of one load case; `before`: its F_e."""
         state, equilibrium = case.state, case.coupling.equilibrium
         state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
         after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
@@ -218,14 +187,15 @@ class TimeError:
         return float(np.degrees(self.quadrature.maximum(changes))), admissible
 
 
+def _known(betters: Values, rows: Values) -> Values:
+    """Better values where there are any, those of the row elsewhere."""
+    return [row if better is None else better for better, row in zip(betters, rows, strict=True)]
+
+
 def _end_of(difference: float, forgotten: float) -> float:
     """Where an error ends that each step adds to, if all steps are alike and exp(-forgotten) is left after each."""
     share = float(-np.expm1(-forgotten))
     return difference / share if share else difference
-
-
-def _same(before: Mapping[str, float], loads: Mapping[str, float]) -> bool:
-    return all(loads.get(name) == value for name, value in before.items())
 
 
 # ---------------------------------------------------------------- steps as long as a tolerance allows

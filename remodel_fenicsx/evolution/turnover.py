@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TurnoverRates
-from remodel_fenicsx.schema.settings import Turnover
-from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.schema.settings import Remodeling, Turnover
+from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.solver.diagnosis import Refusal
-from remodel_fenicsx.state import Earlier, Numbers, Parameters, State, on_mesh
+from remodel_fenicsx.state import Earlier, Numbers, State
 
 Array = NDArray[np.float64]
 
@@ -110,21 +110,24 @@ class Slowing:
         return bool(numbers["early_time"] and rate * elapsed >= numbers["early_rate"] * numbers["early_time"])
 
 
-class TurnoverPass:
-    """Changes content and natural length with the lengths of solved states, as the coupling asks."""
+class TurnoverPass(Remodels):
+    """Changes content and natural length with the lengths of solved states; values are ln m and ln rho, (2, n)."""
 
-    def __init__(self, state: State, tissue: Tissue, settings: Turnover):
+    name, components, changes, depends_on_path = "turnover", len(TURNED_OVER), True, True
+
+    def __init__(self, state: State, tissue: Tissue, remodeling: Remodeling):
+        settings = remodeling.turnover
         assert settings.time is not None
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
-        self.tissue = on_mesh(tissue, self.quadrature.mesh)
-        self._parameters = Parameters(self.tissue, self.quadrature)
+        self._parameters = state.parameters(tissue)
+        self.tissue = self._parameters.tissue
         self._numbers = Numbers(state, "turnover", {"duration": 0.0})
         self._earlier = Earlier(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
-        self.weights: Sequence[float] = (1.0,)  # of the load cases, that of `state` first
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
         self.growth = Growth(state, settings) if state.kinematics.grows else None
-        self._start = self._before = self.row = self.better = self.logarithms()  # before: of the last solved state
+        self._start = self._before = self._row = self._better = self.logarithms()  # before: of the last solved state
         self._start_rates: Array | None = None  # where those of both ends together are better
+        self.begin_path()
 
     def begin_with(self, ratio: Array) -> None:
         """J_g of an earlier run, where it had this content."""
@@ -132,46 +135,102 @@ class TurnoverPass:
         self.growth.begin_with(self._values("content"), ratio)
 
     # ------------------------------------------------------------ over a step
-    def lag(self, time: float) -> None:
-        """Before a step to `time` is solved: m and rho change with the rates of the last row, over its step."""
-        self.change(self.rates(), self._numbers["duration"])
-        self._numbers["duration"], self._start_rates = time - self.state.time, None
-
-    def extrapolate(self, time: float) -> None:
-        """Before a step to `time` is solved: m and rho of its end."""
-        duration, start = time - self.state.time, self.rates()
-        mean = start
+    def before(self, time: float, order: int) -> None:
+        """Change m and rho with the rates of the last row over its step; of order 2, with those of the step's middle."""
+        duration, last, rates = time - self.state.time, self._numbers["duration"], self.rates()
+        self._numbers["duration"], self._start_rates = duration, None
+        if order == 1:
+            self.change(rates, last)
+            return
+        mean = rates
         if self._earlier.known:
-            before = self._earlier.values[0].reshape(-1, 2).T
-            mean = start + duration / (2 * self._numbers["duration"]) * (start - before)
-        self._earlier.push(np.ravel(start.T))
-        self._numbers["duration"], self._start_rates = duration, start
+            mean = rates + duration / (2 * last) * (rates - self._earlier.values[0].reshape(-1, 2).T)
+        self._earlier.push(np.ravel(rates.T))
+        self._start_rates = rates
         self.change(mean, duration)
 
     def change(self, rates: Array, duration: float) -> None:
-        """Other m and rho, after a time with rates (2, n)."""
+        """Take m and rho after a time with rates (2, n)."""
         self._before = self._start = self.logarithms()
-        self.row = changed(self._start, rates, duration)
-        self.set(self.row)
+        self._row = changed(self._start, rates, duration)
+        self.set(self._row)
 
     def set_part(self, fraction: float) -> None:
-        """A part of what has changed since the last solved state."""
-        self.set(self._before + fraction * (self.row - self._before))
+        """Take a part of what has changed since the last solved state."""
+        self.set(self._before + fraction * (self._row - self._before))
 
-    def settle(self) -> None:
+    def settle(self, time: float, again: bool) -> Work:
         """The present state is solved."""
-        self._before = self.row
+        self._before = self._row
+        return Work()
 
-    def complete(self, time: float) -> None:
-        """After a step: what is better than the row."""
+    def after(self, time: float) -> float:
+        """Make what is better than the row; the power of turnover is a column of its own."""
         duration = time - self.state.time
-        self.better = self.after(self.row, duration)
+        self._better = changed(self._row, self.rates(), duration)
         if self._start_rates is not None:
-            self.better = changed(self._start, (self._start_rates + self.rates()) / 2, duration)
+            self._better = changed(self._start, (self._start_rates + self.rates()) / 2, duration)
+        return 0.0
 
-    def after(self, start: Array, duration: float, present: bool = False) -> Array:
-        """ln m and ln rho (2, n) after a time with the rates of the solved state; `present`: with its present cells."""
-        return changed(start, self.rates(present), duration)
+    # ------------------------------------------------------------ errors and rest
+    def row(self) -> Array:
+        """Return ln m and ln rho of the solved state."""
+        return self._row
+
+    def better(self) -> Array:
+        """Return what the rates of the solved state ask for."""
+        return self._better
+
+    def as_components(self, values: Array) -> Array:
+        """Return them by points."""
+        return values.T
+
+    def moved(self, values: Array, change: Array) -> Array:
+        """Return values after a change."""
+        return values + change.T
+
+    def passed(self, values: Array, time: float, residual: float) -> Array:
+        """Return values after a step with the rates of the present state and its cells."""
+        return changed(values, self.rates(present=True), time - self.state.time)
+
+    def apart(self, values: Array, other: Array) -> float:
+        """Return the largest relative difference of m or rho, as an angle in radians, in degrees."""
+        return float(np.degrees(self.size((other - values).T.reshape(*self.quadrature.shape, 2))))
+
+    def left(self, time: float, residual: float) -> float:
+        """Return the largest relative change up to a time."""
+        return self.quadrature.maximum(self.fastest_changes()) * (time - self.state.time)
+
+    def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
+        """Return the changes over a duration; there is no pass to a limit."""
+        return np.asarray(self.rates().T * duration).reshape(*self.quadrature.shape, 2)
+
+    def size(self, change: Array) -> float:
+        """Return the largest relative change."""
+        return self.quadrature.maximum(np.abs(change).max(axis=-1))
+
+    def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
+        """Take a multiple of such a change."""
+        self.change(change.reshape(-1, 2).T, factor)
+
+    def begin_path(self) -> None:
+        """Watch anew whether rates fall."""
+        self._slowing = Slowing(dict(Slowing.INITIAL))
+
+    def without_rest(self, waiting: float) -> str:
+        """Say that the natural length has grown much while its rates fall no faster than 1/t."""
+        goes_on = self._slowing.goes_on(waiting, self.quadrature.maximum(self.fastest_changes()))
+        if not goes_on or self.quadrature.maximum(self.factors("natural_length")) <= MUCH:
+            return ""
+        return (
+            "growth does not come to rest, its rates fall no faster than 1/t (docs/tissue_that_lives.md, When it comes "
+            f"to rest): the state is that of time {self.state.time:g}, on the path"
+        )
+
+    def rested(self, time: float) -> None:
+        """What is made from a time on takes room."""
+        if self.growth is not None:
+            self.growth.start = time
 
     # ------------------------------------------------------------ values
     def logarithms(self) -> Array:
@@ -189,7 +248,7 @@ class TurnoverPass:
         """d ln m / dt and d ln rho / dt of the solved state (2, n), of several load cases the weighted mean."""
         states = (self.state, *self.state.others)
         parts = [np.array(self._rates(state, present)) for state in states]
-        return np.asarray(sum(weight * part for weight, part in zip(self.weights, parts, strict=True)))
+        return np.asarray(sum(weight * part for weight, part in zip(self.state.weights, parts, strict=True)))
 
     def _rates(self, state: State, present: bool) -> TurnoverRates:
         """In one load case."""

@@ -12,7 +12,6 @@ principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
 squared_length      model.energy.squared_end_to_end_length
-parts               kernels.PointKernels.gradient_and_driver
 structure           model.cells.structure_tensor
 extension           kernels.PointKernels.extension
 may_turn            kernels.PointKernels.may_turn
@@ -156,10 +155,6 @@ class PointKernels:
         """`energy.squared_end_to_end_length` of one whole cell."""
         return np.asarray(energy.squared_end_to_end_length(F, [cell]))
 
-    def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
-        """F and the symmetric part of the driving tensor, (n, 3, 3) each, from both (n, 2, 3, 3)."""
-        return both[:, 0], (both[:, 1] + np.swapaxes(both[:, 1], 1, 2)) / 2
-
     def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
         """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J."""
         with np.errstate(invalid="ignore"):
@@ -224,11 +219,6 @@ class CompiledPointKernels(PointKernels):
         squared = np.empty(len(F))
         self._call("squared_length", len(F), F, cell.dimensions, cell.axes, squared)
         return squared
-
-    def gradient_and_driver(self, both: Array) -> tuple[Array, Array]:
-        F, driver = np.empty((2, len(both), 3, 3))
-        self._call("parts", len(both), both, F, driver)
-        return F, driver
 
     def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
         stretch, smallest = np.empty(len(length)), np.empty(1)

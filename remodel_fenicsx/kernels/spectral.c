@@ -122,17 +122,6 @@ void squared_length(int64_t n, const double *F, const double *dimensions, const 
     }
 }
 
-/* F and the symmetric part of the driving tensor, from where they stand one after the other. */
-void parts(int64_t n, const double *both, double *F, double *driver)
-{
-    for (int64_t at = 0; at < n; ++at)
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j) {
-                F[9 * at + 3 * i + j] = both[18 * at + 3 * i + j];
-                driver[9 * at + 3 * i + j] = 0.5 * (both[18 * at + 9 + 3 * i + j] + both[18 * at + 9 + 3 * j + i]);
-            }
-}
-
 /* cells.structure_tensor: A = sum l_I^2 n_I (x) n_I. */
 void structure(int64_t n, const double *dimensions, const double *axes, double *tensor)
 {

@@ -44,7 +44,7 @@ class TensorKernels:
         if np.iscomplexobj(F):
             return log_sum(F, cells, end_to_end_length)
         result = np.empty(F.shape[:-2])
-        self.call("log_sum", result.size, F, whole_structure_tensor(cells), result)
+        self.call("log_sum", result.size, F, np.broadcast_to(whole_structure_tensor(cells), F.shape), result)
         return result
 
     def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:

@@ -79,8 +79,8 @@ class Checkpoints(Watcher):
                 number=state.number,
                 scene=self.scene_text,
                 versions=self._versions,
-                loads=marked({mark: case.loading.values for mark, case in state.cases().items()}),
-                numbers=marked({mark: case.numbers for mark, case in state.cases().items()}),
+                loads=marked({mark: case.loading.values for mark, case in state.each_case().items()}),
+                numbers=marked({mark: case.numbers for mark, case in state.each_case().items()}),
                 functions=list(arrays),
                 arrays={f"function/{name}": values for name, values in arrays.items()} | self._mesh,
             )
@@ -117,7 +117,7 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
     numbers = header.numbers | {counts[name]: 0.0 for name in missing}
     if missing and first:
         log.info("not in the checkpoint, so they begin anew: %s", ", ".join(missing))
-    for mark, case in state.cases().items():
+    for mark, case in state.each_case().items():
         case.numbers |= with_mark(numbers, mark)
         kept = with_mark(header.loads, mark)
         case.loading.set({name: kept.get(name, 0.0) for name in case.loading.values})
@@ -129,7 +129,7 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
     if any(name not in there and name not in counts for name in here):
         raise CheckpointError(f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}")
     loads = sorted(name for name, value in checkpoint.loads.items() if value)  # earlier versions kept all, zero or not
-    own = sorted(marked({mark: case.loading.values for mark, case in state.cases().items()}))
+    own = sorted(marked({mark: case.loading.values for mark, case in state.each_case().items()}))
     if not set(loads) <= set(own):
         raise CheckpointError(f"the checkpoint has the loads {loads}, this run has {own}")
     for name in [name for name in here if name in there]:
@@ -158,7 +158,7 @@ def with_mark(values: Mapping[str, T], mark: str) -> dict[str, T]:
 
 def _counts(state: State) -> dict[str, str]:
     """`State.counts` of all load cases."""
-    cases = state.cases().items()
+    cases = state.each_case().items()
     return {f"{name}{mark}": f"{count}{mark}" for mark, case in cases for name, count in case.counts.items()}
 
 

@@ -64,7 +64,7 @@ class Observer(Watcher):
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
         self.tools: dict[Any, Any] = {}
-        self.others = [Observer(shape, case, ()) for case in stepper.remodeling.cases]
+        self.others = [Observer(shape, case, ()) for case in stepper.each_case[1:]]
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:
@@ -167,7 +167,7 @@ class Measurement:
         if (
             stepper.remodeling.law.remodels and stepper.remodeling.driver is DRIVERS["cauchy"]
         ):  # the pass asks for it too
-            return np.asarray(stepper.remodeling.stacked_values()[..., 9:].reshape(*self.quadrature.shape, 3, 3))
+            return stepper.remodeling.driving_tensor()[1].reshape(*self.quadrature.shape, 3, 3)
 
         def compiled() -> tuple[PointStresses, Any]:
             stresses = PointStresses(self.state, stepper.tissue)

@@ -52,7 +52,7 @@ class ElementFields:
     """Element means for pictures."""
 
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
-        self.observer, self.turnover, self.names = Observer(shape, stepper, ()), stepper.turnover, tuple(names)
+        self.observer, self.turnover, self.names = Observer(shape, stepper, ()), stepper.part("turnover"), tuple(names)
         self.tissue, self._parameters = stepper.tissue, stepper.coupling.equilibrium.parameters
 
     def __call__(self) -> dict[str, Array]:

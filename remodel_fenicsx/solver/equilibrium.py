@@ -23,11 +23,10 @@ from remodel_fenicsx.fem.assembly import (
     over_ranks,
     second_derivative,
 )
-from remodel_fenicsx.kernels import with_kernels
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, whole_structure_tensor
-from remodel_fenicsx.model.tensors import MANDEL, passes_through_zero
-from remodel_fenicsx.state import Parameters, State, on_mesh
+from remodel_fenicsx.model.tensors import MANDEL, det, passes_through_zero
+from remodel_fenicsx.state import State
 
 Array = NDArray[np.float64]
 Shares = Callable[[], Sequence[UnitCell]]
@@ -41,10 +40,9 @@ class PointwiseRepulsion:
     """Second Piola-Kirchhoff stress of the repulsion and its derivative, as quadrature functions that forms take."""
 
     def __init__(self, state: State, tissue: Tissue, cells: Sequence[UnitCell], shares: Shares):
-        self.state, self.shares = state, shares
-        self.tissue = with_kernels(tissue, state.comm)
-        self.quadrature = state.cells.quadrature
-        self._parameters = Parameters(self.tissue, self.quadrature)
+        self.state, self.shares, self.quadrature = state, shares, state.cells.quadrature
+        self._parameters = state.parameters(tissue)
+        self.tissue = self._parameters.compiled
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         of_cells = [ufl.as_ufl(part) for cell in cells for part in cell]
@@ -165,8 +163,8 @@ class Equilibrium:
         self.state, self.quadrature = state, state.cells.quadrature
         mesh = self.quadrature.mesh
         self.comm = mesh.comm
-        self.tissue = on_mesh(tissue, mesh)
-        self.parameters = Parameters(self.tissue, self.quadrature)
+        self.parameters = state.parameters(tissue)
+        self.tissue, self._point_shares = self.parameters.tissue, point_shares
         u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.elastic_gradient(u)
@@ -185,11 +183,9 @@ class Equilibrium:
         self.tangent_forms = [jit.form(form) for form in tangents]
         if external is not None and _depends_on(external, u):
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
-        squared = squared_end_to_end_length(F, shares) if self.tissue.chain is not None else ufl.as_ufl(0.0)
-        limits = ufl.as_vector([squared, ufl.det(F), *(F[i, j] for i in range(3) for j in range(3))])
-        self._limits = jit.expression(limits, self.quadrature.points)
-        length = ufl.as_ufl(0.0 if self.tissue.locking_length is None else self.tissue.locking_length)
-        self._known: Remembered[Look] = Remembered(self.comm, limits, length)
+        chains = [] if self.tissue.chain is None else [part for cell in shares for part in cell]
+        length = 0.0 if self.tissue.locking_length is None else self.tissue.locking_length
+        self._known: Remembered[Look] = Remembered(self.comm, F, *map(ufl.as_ufl, [*chains, length]))
         self._energy_forms: list[Any] = []
 
     # ------------------------------------------------------------ what users ask
@@ -235,7 +231,18 @@ class Equilibrium:
 
     def states(self) -> Array:
         """r^2 in squared link lengths (0 without chains), J and F, eleven numbers: (elements, points, 11)."""
-        return self.quadrature.evaluate(self._limits, (11,))
+        F = self.state.elastic_gradient()
+        states = np.empty((len(F), 11))
+        states[:, 0] = self._squared_length(F)
+        states[:, 1], states[:, 2:] = det(F), F.reshape(-1, 9)
+        return states.reshape(*self.quadrature.shape, 11)
+
+    def _squared_length(self, F: Array) -> Array | float:
+        if self.tissue.chain is None:
+            return 0.0
+        if self._point_shares is None:
+            return self.state.cells.kernels.squared_length(F, self.state.cells.point_cells)
+        return np.asarray(squared_end_to_end_length(F, self._point_shares()))
 
     def locking_length(self) -> NDArray[np.float64]:
         """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""

@@ -18,7 +18,7 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
 from remodel_fenicsx.solver.linear import negative_pivots, uneven
-from remodel_fenicsx.state import Earlier, Numbers, at_points
+from remodel_fenicsx.state import Earlier, Numbers
 from remodel_fenicsx.watch.warnings import WarnsOnce
 
 log = logging.getLogger(__name__)
@@ -330,4 +330,4 @@ class BucklingWarning(WarnsOnce):
     @cached_property
     def _tissue(self) -> Tissue:
         number = len(self._places)
-        return at_points(self.stepper.tissue, self.quadrature).map(lambda name, value: value[:number])
+        return self.state.parameters(self.stepper.tissue).at_points().map(lambda name, value: value[:number])

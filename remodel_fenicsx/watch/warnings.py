@@ -21,7 +21,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.model.tensors import cofactor
-from remodel_fenicsx.state import Numbers, at_points
+from remodel_fenicsx.state import Numbers
 from remodel_fenicsx.system import NOTICE
 
 Array = NDArray[np.float64]
@@ -178,7 +178,7 @@ class LockingWarning(WarnsOnce):
 
     def __init__(self, stepper: Stepper, locks: bool, remedy: str = REMEDY):
         super().__init__(stepper)
-        tissue = at_points(stepper.tissue, self.quadrature)
+        tissue = self.state.parameters(stepper.tissue).at_points()
         shape = self.quadrature.shape
         self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
         self.locks, self.remedy = locks, remedy
@@ -287,7 +287,7 @@ class PressureNoise(WarnsOnce):
     def __init__(self, stepper: Stepper, remedy: str = REMEDY):
         super().__init__(stepper)
         self.remedy = remedy
-        points = at_points(stepper.tissue, self.quadrature)
+        points = self.state.parameters(stepper.tissue).at_points()
         lame = points.lame_lambda.reshape(self.quadrature.shape)
         self.stiffness = self.quadrature.owned(lame)
         self.ratio = self.quadrature.maximum(lame / points.lame_mu.reshape(self.quadrature.shape))
@@ -496,14 +496,14 @@ class GrowthWithoutRest(WarnsOnce):
 
     @classmethod
     def of(cls, scene: Any, stepper: Any) -> GrowthWithoutRest | None:
-        return None if stepper.turnover is None else cls(stepper, scene.end_of_ramps)
+        return None if stepper.part("turnover") is None else cls(stepper, scene.end_of_ramps)
 
     def due(self, step: Step) -> bool:
         return step.time > self.held_from
 
     def look(self, step: Step) -> str:
         """At the rates, while loads are held."""
-        turnover, elapsed = self.stepper.turnover, step.time - self.held_from
+        turnover, elapsed = self.stepper.part("turnover"), step.time - self.held_from
         rates, period = turnover.fastest_changes(), turnover.settings.time
         rate = self.quadrature.maximum(rates)
         goes_on = self._slowing.goes_on(elapsed, rate)

@@ -114,7 +114,7 @@ def test_walls_rest_where_an_independent_program_says(case: Any, caplog: pytest.
     """Radius, thickness, means, angles, what a cut shows, curves continued to the faces; nothing is said."""
     with simulated(at_rest(case)) as (simulation, (row,)):
         stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
-        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.turnover._values("content")
+        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.part("turnover")._values("content")
     compare(row, RESTS[case])
     for values, expected, accuracy in zip((stress, content.ravel()), LOCAL.get(case, ()), (0.1, 0.02)):
         curve = np.polynomial.Polynomial.fit(depth, values, 8)
@@ -193,7 +193,7 @@ def test_the_wall_is_as_large_as_its_tissue() -> None:
     """Volume between the deformed faces: the integral of J_e J_g."""
     with simulated(wall(0.5, 400.0)) as (simulation, rows):
         F, quadrature = simulation.state.elastic_gradient(), simulation.quadrature
-        growth = simulation.stepper.turnover.growth.ratio
+        growth = simulation.stepper.part("turnover").growth.ratio
         volume = quadrature.integral(np.linalg.det(F).reshape(growth.shape) * growth)
     inner, outer = rows[-1]["inner_radius"], rows[-1]["outer_radius"]
     assert volume == pytest.approx(np.pi * (outer**2 - inner**2) * 2.0 * 1.1, rel=1e-6)
@@ -358,7 +358,7 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
     for gain in (1.0, 2.0):
         rates: list[float] = []
         with made(membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 20.0 / gain)) as simulation:
-            turnover = simulation.stepper.turnover
+            turnover = simulation.stepper.part("turnover")
             for step in simulation.steps():
                 rates += [np.abs(turnover.rates()).max()] if step.time in (600.0, 700.0) else []
             tissue = simulation.stepper.remodeling.parameters.largest()

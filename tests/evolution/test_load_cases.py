@@ -196,7 +196,7 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
     changes = []
     for cases in (pulse(0.33), *([case | {"weight": 1.0}] for case in pulse(0.33))):
         with simulated(artery(cases, end=4.0, **tables)) as (simulation, _):
-            changes.append([np.log(simulation.stepper.turnover._values(name)) for name in columns[:2]])
+            changes.append([np.log(simulation.stepper.part("turnover")._values(name)) for name in columns[:2]])
     both, diastole, systole = np.array(changes)
     np.testing.assert_allclose(both, 2 / 3 * diastole + 1 / 3 * systole, atol=1e-12)
     assert np.abs(systole - diastole).max() > 1e-4

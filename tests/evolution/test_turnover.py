@@ -40,7 +40,7 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(caplo
     for end, degrees in ((960.0, 3.0), ("equilibrium", 0.5)):
         with made(wall(end, 8.0, GROWS, COLUMNS)) as simulation:
             row = list(simulation.steps())[-1].row
-            turnover, order = simulation.stepper.turnover, np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
+            turnover, order = simulation.stepper.part("turnover"), np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
             assert [row[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
             assert opening_angle(simulation) == pytest.approx(115.4, abs=degrees)
             for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
@@ -148,7 +148,7 @@ def test_a_growth_that_rests_is_no_instability_however_large(
     values["loads"]["pressure"]["ramp"] += [[800.0, 1.0], [824.0, 1.6]]
     values["time"]["tolerance"] = 3.0
     with caplog.at_level(NOTICE), simulated(values) as (simulation, _):
-        assert simulation.stepper.turnover._values("content").max() > 10.0
+        assert simulation.stepper.part("turnover")._values("content").max() > 10.0
     assert not [record for record in caplog.records if record.levelname == "WARNING" and "rest" in record.message]
 
 
@@ -187,7 +187,7 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
     values = wall(40.0, 8.0, GROWS, COLUMNS, coupling=coupling) | {"solver": {"predictor": "none"}}
     whole = rows_of(values)
     simulation = Simulation(scene_from_dict(values))
-    coupled, turnover = simulation.stepper.coupling, simulation.stepper.turnover
+    coupled, turnover = simulation.stepper.coupling, simulation.stepper.part("turnover")
     set_part, parts, refused = turnover.set_part, [], set()
     newton = coupled.blend.newton
     solve = newton.solve

@@ -1,0 +1,94 @@
+"""Further load cases: states with the same cells, solved after the first one, whose stresses drive the cells too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from remodel_fenicsx.body.loading import LoadValues
+from remodel_fenicsx.evolution.coupling import Staggered
+from remodel_fenicsx.evolution.life_cycle import Remodels
+from remodel_fenicsx.evolution.remodeling import RemodelingPass
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.model.laws import Drive
+from remodel_fenicsx.schema.settings import Solver
+from remodel_fenicsx.solver.continuation import StepFailure, Work
+from remodel_fenicsx.state import State
+
+
+class LoadCase:
+    """A load case beside the first: solved after it in each step, and asked for its drive before the pass."""
+
+    def __init__(
+        self,
+        number: int,
+        state: State,
+        load_values: Callable[[float], LoadValues],
+        stepper: Stepper,
+        solver: Solver,
+        kappa: Any = None,
+    ):
+        self.number, self.state, self.load_values = number, state, load_values
+        self.tissue, self.each_case = stepper.tissue, [self]
+        self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
+        self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
+        state.stop_signal = lambda: stepper.state.stop_signal()
+
+    def solve(self, time: float, again: bool) -> Work:
+        """Solve for equilibrium at `time` with the present cells; `again` as of `Staggered.balanced`."""
+        try:
+            return self.coupling.balanced(time, self.load_values(time), again)
+        except StepFailure as failure:
+            raise StepFailure(failure.time, f"load case {self.number}: {failure}", failure.refusal) from failure
+
+    def drive(self) -> Drive:
+        """Return the drive of the solved state."""
+        return self.remodeling.drive(self.coupling.residual)
+
+    def seen(self, step: Step) -> Step:
+        """Return a step as it is in this case."""
+        extension = self.coupling.equilibrium.extension()
+        return replace(step, loads=dict(self.state.loading.values), extension=extension, case=self.number)
+
+
+class LoadCases(Remodels):
+    """All load cases beside the first; they have the cells of the first, and no values of their own."""
+
+    name = "cases"
+
+    def __init__(self, cases: Sequence[LoadCase]):
+        self.cases = cases
+
+    def settle(self, time: float, again: bool) -> Work:
+        """Solve each."""
+        work = Work()
+        for case in self.cases:
+            work.count(case.solve(time, again))
+        return work
+
+    def close(self) -> None:
+        """Free what PETSc has made for each."""
+        for case in self.cases:
+            case.coupling.close()
+
+
+def join(stepper: Stepper, cases: Sequence[LoadCase], weights: Sequence[float]) -> None:
+    """Let load cases drive the cells of a stepper too, with weights: of the first case, and of them."""
+    stepper.state.join([case.state for case in cases], weights)
+    stepper.each_case += cases
+    stepper.remodeling.further += [case.drive for case in cases]
+    stepper.remodeling.beside.append(LoadCases(cases))
+
+
+class LoadCaseWatcher(Watcher):
+    """A watcher of the states of another load case: it sees each step as it is there."""
+
+    def __init__(self, case: LoadCase, watcher: Watcher):
+        def as_there(hook: Callable[[Step], None], step: Step) -> None:
+            hook(case.seen(step))
+
+        for name in ("started", "resumed", "solved", "completed", "undone", "committed"):
+            setattr(self, name, partial(as_there, getattr(watcher, name)))
+        self.close = watcher.close  # type: ignore[method-assign]
