@@ -505,7 +505,7 @@ def _unseen_files(scene: Scene) -> str:
         return ""
     if (reason := reason_unusable()) is not None:
         return f"the files that it names; {reason}"
-    from remodel_fenicsx.simulation import check_files
+    from remodel_fenicsx.initial import check_files
 
     return check_files(scene)
 

@@ -117,13 +117,13 @@ if TYPE_CHECKING:
     from remodel_fenicsx.results.columns import Measurement as Measurement
     from remodel_fenicsx.scene.reference import markdown_reference as markdown_reference
     from remodel_fenicsx.solver.linear import EveryTangent as EveryTangent
-    from remodel_fenicsx.watch.warnings import WarnsOnce as WarnsOnce
+    from remodel_fenicsx.evolution.stepper import WarnsOnce as WarnsOnce
 
 _LATE = {
     **dict.fromkeys(("Coupling", "Staggered", "Traits"), "evolution.coupling"),
     "EveryTangent": "solver.linear",
     "Measurement": "results.columns",
-    "WarnsOnce": "watch.warnings",
+    "WarnsOnce": "evolution.stepper",
     "form": "fem.jit",
     "markdown_reference": "scene.reference",
 }

@@ -41,7 +41,8 @@ from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation, in_region
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.schema.text import read_toml
-from remodel_fenicsx.simulation import Simulation, checked_domain, mesh_of, with_choices
+from remodel_fenicsx.initial import checked_domain, mesh_of, with_choices
+from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
@@ -261,7 +262,7 @@ def _record(
             agreed(comm, lambda: RunFolder(place, text, comm.rank, after, {} if resumes else files))
         )
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
-        steps = scene.time.number_of_steps if simulation.control else state.number + len(simulation.remaining())
+        steps = scene.time.number_of_steps if scene.time.chooses else state.number + len(simulation.way.remaining())
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
         ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"

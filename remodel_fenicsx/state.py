@@ -23,8 +23,8 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels import PointKernels, point_kernels, with_kernels
 from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_of, structure_tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
-from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS
+from remodel_fenicsx.model.energy import MATRICES, TURNED_OVER, Tissue, mixed
+from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS, Properties
 
 Array = NDArray[np.float64]
 
@@ -235,6 +235,7 @@ class State:
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.others: Sequence[State] = ()
         self.weights: Sequence[float] = (1.0,)
+        self.label = ""  # before what is said of it, where there are others
         # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
         self.stop_signal: Callable[[], int] = lambda: 0
         self.tell: Callable[[str], object] = lambda words: None  # of a step that is solved in parts
@@ -551,3 +552,41 @@ class Parameters:
     def where_chains(self, values: Array) -> Array:
         """Values at all points (elements, points), NaN where there are no chains of which they would be."""
         return np.where(self.has_chains(), values, np.nan)
+
+
+# ---------------------------------------------------------------- the tissue of regions
+NEVER_LOCKED = 1e12  # link lengths: contour length of chains that are not there; infinity times zero is no number
+
+
+def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple[Tissue, Any]:
+    """Tissue and kappa of a scene's regions: numbers where these agree, DG0 Functions where they differ."""
+    tissues, kappas = _tissues(properties), {name: one.kappa for name, one in properties.items()}
+    tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
+    if any(other != tissue for other in tissues.values()):
+        tissue = tissue.map(lambda key, _: by_region(domain, {name: t.parameters[key] for name, t in tissues.items()}))
+    return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
+
+
+def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
+    """Of the regions, all of one chain law and one matrix: where there are no chains, none locks."""
+    found = {name: one.tissue for name, one in properties.items()}
+    chain = next((tissue.chain for tissue in found.values() if tissue.chain is not None), None)
+    matrices = list(dict.fromkeys(one.material.matrix for one in properties.values()))
+    for name, tissue in found.items():
+        if chain is not None and tissue.chain is None:
+            length = NEVER_LOCKED if chain.locks else tissue.contour_length
+            found[name] = replace(tissue, chain=chain, contour_length=length)
+    return found if len(matrices) == 1 else _with_one_matrix(found, properties, matrices)
+
+
+def _with_one_matrix(
+    tissues: Mapping[str, Tissue], properties: Mapping[str, Properties], matrices: Sequence[str]
+) -> dict[str, Tissue]:
+    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # `Properties.check_with` asks
+    defaults = {name: number.default for name, number in mixture.parameters.items()}
+    found = {}
+    for name, tissue in tissues.items():
+        share = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
+        own = getattr(tissue.matrix, "values", {})
+        found[name] = replace(tissue, matrix=mixture.of({**defaults, **own, **share}))
+    return found

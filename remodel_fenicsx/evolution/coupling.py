@@ -18,6 +18,7 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
 from remodel_fenicsx.schema.settings import Solver
+from remodel_fenicsx.solver.attempts import EXPECTED, LAST, Attempt, attempted, say
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
@@ -257,8 +258,7 @@ class Staggered:
         """
         work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
         step = LoadStep.between(time - self.state.time, old_loads, loads)
-        if again or not self._solved_as_expected(step, loads, work):
-            self._solve_from_the_last(time, old_loads, loads, work)
+        self._solve(step, time, old_loads, loads, work, again)
         self._whole(time, old_loads, loads).look_back(before, work, again)
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
@@ -295,42 +295,46 @@ class Staggered:
             self.blend.close()
 
     # ------------------------------------------------------------ in one piece: the paper's step
-    def _solved_as_expected(self, step: LoadStep, loads: LoadValues, work: Work) -> bool:
-        """Solve from where the predictor expects the solution; if that fails, all is as before."""
-        # Where chains would be almost straight the forces are huge, and Newton's method comes back slowly: from the
-        # last displacement it takes fewer iterations.
-        unknown, loading = self.state.unknown.x.array, self.state.loading
-        before, old_loads = unknown.copy(), dict(loading.values)
+    def _solve(
+        self, step: LoadStep, time: float, old_loads: LoadValues, loads: LoadValues, work: Work, again: bool
+    ) -> None:
+        """Try `attempts.EXPECTED`, `LAST` and `PARTS`."""
+        unknown, loading, failure = self.state.unknown.x.array, self.state.loading, None
+        before = unknown.copy()
         loading.set(loads)  # what they prescribe is part of what is expected
-        expected = None if self.predictor is None else self.predictor.expected(step)
-        try:
-            if expected is not None:
-                unknown[:] = expected
-            if expected is not None and self.newton.may_start(self._last["extension"]):
-                work.add(self.newton.solve(origin=before))
-                work.substeps = 1
-                return True
-        except SolveFailure as failure:
-            work.add(failure)
-            log.info("not solved from the predicted displacement: %s", failure.reason)
+        if not again and self._starts_as_expected(step):
+            if self._tried(EXPECTED, work, before) is None:
+                return
         unknown[:] = before
         loading.set(old_loads)
-        return False
+        if self.equilibrium.extension().admissible:
+            loading.set(loads)
+            failure = self._tried(LAST, work)
+            if failure is None:
+                return
+        else:
+            say(LAST, "the remodeled cells have r >= L at the old displacement")
+        self._solve_in_parts(time, old_loads, loads, work, failure)
 
-    def _solve_from_the_last(self, time: float, old_loads: LoadValues, loads: LoadValues, work: Work) -> None:
-        """From the unknowns of the last step, in one piece or in parts."""
-        if not self.equilibrium.extension().admissible:
-            log.info("solving in parts: the remodeled cells have r >= L at the old displacement")
-            self._solve_in_parts(time, old_loads, loads, work, failure=None)
-            return
-        self.state.loading.set(loads)
-        try:
-            work.add(self.newton.solve())
-            work.substeps = 1
-        except SolveFailure as failure:
-            work.add(failure)
-            log.info("solving in parts: %s", failure.reason)
-            self._solve_in_parts(time, old_loads, loads, work, failure)
+    def _starts_as_expected(self, step: LoadStep) -> bool:
+        """Take the unknowns that are expected, where there are any that are admissible."""
+        # Where chains would be almost straight the forces are huge, and Newton's method comes back slowly: from the
+        # last displacement it takes fewer iterations.
+        expected = None if self.predictor is None else self.predictor.expected(step)
+        if expected is None:
+            return False
+        self.state.unknown.x.array[:] = expected
+        return self.newton.may_start(self._last["extension"])
+
+    def _tried(self, attempt: Attempt, work: Work, origin: Array | None = None) -> SolveFailure | None:
+        """Solve from the present unknowns; return the failure, if it is one."""
+        found = attempted(lambda: self.newton.solve(origin), SolveFailure)
+        work.add(found)
+        if isinstance(found, SolveFailure):
+            say(attempt, found.reason)
+            return found
+        work.substeps = 1
+        return None
 
     # ------------------------------------------------------------ in parts
     def _solve_in_parts(

@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.stepper import Step, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.fem import assembly
+from remodel_fenicsx.solver.attempts import attempted
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.system import NOTICE
@@ -46,25 +48,42 @@ TAIL_PASSES, TAIL = 15, 1e-9  # passes to the limit after the path, at most, and
 LARGEST_RATIO = 0.95  # of two changes, for Aitken's extrapolation: it then goes 20 times as far as the last change
 
 
+class PathToRest(NamedTuple):
+    """What is known of the path before it: its end, stops and first step, and the tolerance of its steps in degrees.
+
+    `held_from`: time from which all loads are held. `before_change`: hold of the loads in which all rests once before,
+    from and to.
+    """
+
+    end: float
+    stops: Sequence[float]
+    first: float
+    tolerance: float
+    held_from: float
+    before_change: tuple[float, float] | None = None
+
+
 class Homeostasis:
     """The way through ramps and held loads until the cells rest, as one step of a stepper."""
 
-    def __init__(self, control: StepControl, held_from: float, first: tuple[float, float] | None = None):
-        self.control, self.held_from = control, held_from
-        self.first = first  # hold of the loads in which the way rests once before, from and to
-        self.stepper, self.state, self.tolerance = control.stepper, control.state, control.tolerance
-        self.remodeling = self.stepper.remodeling
-        self.remodels = [part for part in self.stepper.remodels if part.components]
+    def __init__(self, stepper: Stepper, plan: PathToRest):
+        self.stepper, self.state, self.plan = stepper, stepper.state, plan
+        self.remodeling = stepper.remodeling
+        self.remodels = [part for part in stepper.remodels if part.components]
         self.quadrature = self.state.cells.quadrature
-        control.level = logging.INFO  # no row of the way is a result; of points that turn over at once fronts tell
-        self.longest = control.longest
+        # no row of the way is a result; of points that turn over at once fronts tell
+        self.control = StepControl(stepper, plan.tolerance, plan.first, plan.stops, LONGEST, logging.INFO)
         self.steps, self._residual = 0, 0.0
         self._held: Snapshot | None = None  # the first state on the way under held loads
 
-    def march(self, time: float, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """The state at rest, as the step to a time; what is yielded is committed."""
+    def remaining(self) -> list[float]:
+        """Return the time of the state at rest, where it is left."""
+        return [self.plan.end] if self.state.time < self.plan.end else []
+
+    def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
+        """The state at rest, as a step; what is yielded is committed."""
         self.stepper.start(watchers)
-        if self.state.time < time:
+        for time in self.remaining():
             yield self.stepper.advance(time, watchers, is_last=True, way=self)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -72,16 +91,17 @@ class Homeostasis:
         state, work = self.state, Work()
         start, number, self.steps, self._held = state.time, state.number, 0, None
         remembers = any(part.depends_on_path for part in self.remodels)
-        coarsens = not (self.stepper.coupling.traits.accumulates or self.tolerance >= UNCHECKED or remembers)
-        if self.first is not None:
-            self._rest_before(*self.first, work)
-        self._go(time, loads, max(start, self.held_from), coarsens, work)
+        coarsens = not (self.stepper.coupling.traits.accumulates or self.plan.tolerance >= UNCHECKED or remembers)
+        if self.plan.before_change is not None:
+            self._rest_before(*self.plan.before_change, work)
+        held = max(start, self.plan.held_from)
+        self._go(self.control, time, loads, held, coarsens, work)
         if coarsens and self._held is not None and self._largest_jump()[0] > FRONT:
             log.info(
                 "the cells have a front, whose place depends on the path: the path is followed again with the tolerance"
             )
             state.restore(self._held)
-            self._go(time, loads, max(start, self.held_from), False, work)
+            self._go(self.control, time, loads, held, False, work)
         state.reach(start, number)
         for case in state.each_case().values():
             case.settle_cells()
@@ -90,28 +110,26 @@ class Homeostasis:
 
     def _rest_before(self, held: float, change: float, work: Work) -> None:
         """Wait under loads that are held until all rests; then begins what waits for that."""
-        control, stepper = self.control, self.stepper
-        stops, given = control.stops, stepper.load_values
-        control.stops = [*(stop for stop in stops if stop <= held), stops[-1]]
-        stepper.load_values = lambda time: given(min(time, held))
-        try:
-            self._go(stops[-1], given(held), held, False, work)
-        finally:
-            control.stops, stepper.load_values = stops, given
+        stops = [*(stop for stop in self.plan.stops if stop <= held), self.plan.stops[-1]]
+        control = self.control.with_stops(stops)
+        with self.stepper.holding(held):
+            self._go(control, stops[-1], self.stepper.load_values(held), held, False, work)
         self.state.settle_cells()
         log.info("all rests after %d steps, before time %g", self.steps, change)
         for part in self.remodels:
             part.rested(change)
         self.state.reach(change, self.state.number)
 
-    def _go(self, time: float, loads: LoadValues, held: float, coarsens: bool, work: Work) -> None:
+    def _go(
+        self, control: StepControl, time: float, loads: LoadValues, held: float, coarsens: bool, work: Work
+    ) -> None:
         """From where the state is until the cells rest."""
         # The error of a row that lags leaves nothing once the cells rest, unless they come to rest elsewhere. Where
         # collagen comes to rest depends on the way.
-        state, control, before, waiting, near = self.state, self.control, np.inf, 0.0, NEAR_REST
+        state, before, waiting, near, longest = self.state, np.inf, 0.0, NEAR_REST, LONGEST
         for part in self.remodels:
             part.begin_path()
-        control.tolerance, control.longest = self.tolerance, self.longest
+        control.limit(self.plan.tolerance, longest)
         start = held
         for step in control.march():
             self.steps += 1
@@ -122,7 +140,7 @@ class Homeostasis:
             if state.time < held:
                 continue
             if coarsens:
-                control.tolerance = UNCHECKED
+                control.limit(UNCHECKED, longest)
             ahead, solved = state.snapshot(), state.equilibrium_cells
             self._held = self._held or ahead
             state.cells.set(solved.dimension_values, solved.axis_values)  # those that the stress belongs to
@@ -135,8 +153,9 @@ class Homeostasis:
             work.residual, near = residual, min(near, AGAIN * left)
             state.restore(ahead)
             if coarsens:
-                longer = min(LENGTHENING_OF_STEPS * control.longest, LONGEST_AT_END)
-                control.longest, before = longer if left < before else self.longest, left
+                longer = min(LENGTHENING_OF_STEPS * longest, LONGEST_AT_END)
+                longest, before = longer if left < before else LONGEST, left
+                control.limit(UNCHECKED, longest)
 
     def _left(self, residual: float) -> float:
         """By how much all changes, relatively, in a time of 1/kappa from here."""
@@ -171,10 +190,10 @@ class Homeostasis:
             before, residual = state.snapshot(), work.residual
             for part, change in zip(self.remodels, changes, strict=True):
                 part.follow(change, factor, time, residual)
-            try:
-                found = coupling.balanced(state.time + 1 / self.stepper.slowest, loads, again=True)
-            except StepFailure as failure:
-                log.info("the tail of the path is not extrapolated further: %s", failure)
+            soon = state.time + 1 / self.stepper.slowest
+            found = attempted(partial(coupling.balanced, soon, loads, again=True), StepFailure)
+            if isinstance(found, StepFailure):
+                log.info("the tail of the path is not extrapolated further: %s", found)
                 state.restore(before)
                 return False
             work.add(found)

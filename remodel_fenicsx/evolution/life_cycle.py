@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,10 @@ class Remodels:
         Smallest rate above 0, and largest one, 1/time.
     depends_on_path
         Whether the values at rest depend on the path that leads there.
+    tissue
+        The tissue with what it brings.
+    watchers
+        Make watchers of its own, or None, of a scene and a stepper.
     """
 
     name = ""
@@ -38,6 +43,11 @@ class Remodels:
     slowest: float = 0.0
     fastest: float = 0.0
     depends_on_path = False
+    tissue: Any = None
+    watchers: Sequence[Callable[[Any, Any], Any]] = ()
+
+    def begin_with(self, values: Callable[[str], Array]) -> None:
+        """Take what files of an earlier run have, by name, (elements, points, ...)."""
 
     # ------------------------------------------------------------ a step
     def before(self, time: float, order: int) -> None:

@@ -14,7 +14,7 @@ from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.schema.settings import Solver
-from remodel_fenicsx.solver.continuation import StepFailure, Work
+from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.state import State
 
 
@@ -31,6 +31,7 @@ class LoadCase:
         kappa: Any = None,
     ):
         self.number, self.state, self.load_values = number, state, load_values
+        state.label = f"load case {number}: "
         self.tissue, self.each_case = stepper.tissue, [self]
         self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
         self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
@@ -38,14 +39,15 @@ class LoadCase:
 
     def solve(self, time: float, again: bool) -> Work:
         """Solve for equilibrium at `time` with the present cells; `again` as of `Staggered.balanced`."""
-        try:
-            return self.coupling.balanced(time, self.load_values(time), again)
-        except StepFailure as failure:
-            raise StepFailure(failure.time, f"load case {self.number}: {failure}", failure.refusal) from failure
+        return self.coupling.balanced(time, self.load_values(time), again)
 
     def drive(self) -> Drive:
         """Return the drive of the solved state."""
         return self.remodeling.drive(self.coupling.residual)
+
+    def watched(self, watcher: Watcher) -> Watcher:
+        """Return a watcher of the stepper that sees each step as it is here."""
+        return LoadCaseWatcher(self, watcher)
 
     def seen(self, step: Step) -> Step:
         """Return a step as it is in this case."""
@@ -74,9 +76,18 @@ class LoadCases(Remodels):
             case.coupling.close()
 
 
-def join(stepper: Stepper, cases: Sequence[LoadCase], weights: Sequence[float]) -> None:
-    """Let load cases drive the cells of a stepper too, with weights: of the first case, and of them."""
-    stepper.state.join([case.state for case in cases], weights)
+def join(
+    stepper: Stepper,
+    states: Sequence[State],
+    load_values: Sequence[Callable[[float], LoadValues]],
+    weights: Sequence[float],
+    solver: Solver,
+    kappa: Any = None,
+) -> None:
+    """Let further load cases drive the cells of a stepper too; weights are of all, the first one's first."""
+    given = enumerate(zip(states, load_values, strict=True), start=2)
+    cases = [LoadCase(number, state, values, stepper, solver, kappa) for number, (state, values) in given]
+    stepper.state.join(states, weights)
     stepper.each_case += cases
     stepper.remodeling.further += [case.drive for case in cases]
     stepper.remodeling.beside.append(LoadCases(cases))

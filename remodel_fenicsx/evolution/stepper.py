@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import math
 import time as clock
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver
 from remodel_fenicsx.solver.continuation import Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.solver.newton import GuardedNewton
-from remodel_fenicsx.state import State
+from remodel_fenicsx.state import Numbers, State
 from remodel_fenicsx.system.interrupts import Paused
 
 log = logging.getLogger(__name__)
@@ -149,6 +149,107 @@ class Watcher:
         """Free what PETSc has made for it."""
 
 
+class WarnsOnce(Watcher):
+    """Says one thing about a run, once; resumed runs know whether it was said.
+
+    Parameters
+    ----------
+    stepper
+        Whose solved states are looked at.
+
+    Attributes
+    ----------
+    name
+        Of what is remembered of it in the state.
+    initial
+        Numbers of its own that are remembered from step to step, by name.
+    level
+        Of logging.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> from remodel_fenicsx.extend import WATCHERS, WarnsOnce, WatcherKind
+    >>> class Stretched(WarnsOnce):
+    ...     name = "stretched"
+    ...
+    ...     def look(self, step):
+    ...         return "the cube is long" if step.row["mean_stretch"] > 1.5 else ""
+    >>> WATCHERS["stretched"] = WatcherKind(Stretched.of)
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> for step in simulation.steps():
+    ...     pass
+    >>> simulation.watchers[-1].said
+    True
+    >>> del WATCHERS["stretched"]
+    """
+
+    name = ""
+    initial: ClassVar[Mapping[str, float]] = {}
+    level = logging.WARNING
+
+    def __init__(self, stepper: Stepper):
+        self.stepper, self.state = stepper, stepper.state
+        self.quadrature = stepper.state.cells.quadrature
+        self._numbers = Numbers(self.state, self.name, {"said": 0} | dict(self.initial))
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> WarnsOnce | None:
+        """For a scene's stepper, or another load case (`WATCHERS`); None where there is nothing to watch.
+
+        Parameters
+        ----------
+        scene
+            The scene.
+        stepper
+            Its stepper, or the load case.
+        """
+        return cls(stepper)
+
+    @property
+    def said(self) -> bool:
+        """Whether it was."""
+        return bool(self._numbers["said"])
+
+    def due(self, step: Step) -> bool:
+        """Whether it is time to look.
+
+        Parameters
+        ----------
+        step
+            The step that is solved.
+        """
+        return step.is_due
+
+    def look(self, step: Step) -> str:
+        """What is to be said of the solved state; nothing where all is well.
+
+        Parameters
+        ----------
+        step
+            The step that is solved.
+        """
+        return ""
+
+    def solved(self, step: Step) -> None:
+        """Look, until it was said."""
+        if self.due(step) and not self.said and (text := self.look(step)):
+            self.find(step, text)
+
+    def find(self, step: Step, text: str) -> None:
+        """It is said where the step is accepted, and else forgotten.
+
+        Parameters
+        ----------
+        step
+            The step that is solved.
+        text
+            One line, without the time.
+        """
+        self._numbers["said"] = True
+        step.findings.append((self.level, f"{step.moment}: {text}"))
+
+
 class Stepper:
     """Advances a state in time; a step is all or nothing.
 
@@ -192,12 +293,12 @@ class Stepper:
         kappa: Any = None,
     ):
         self.state, self.load_values, self._solver = state, load_values, solver
+        beside: list[Remodels] = []
+        for name, make in BESIDE.items():
+            if getattr(remodeling, name).is_on:
+                beside.append(resolved(make)(state, tissue, remodeling))
+                tissue = beside[-1].tissue
         self.tissue = state.parameters(tissue).tissue
-        beside = [
-            resolved(make)(state, self.tissue, remodeling)
-            for name, make in BESIDE.items()
-            if getattr(remodeling, name).is_on
-        ]
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, beside)
         self.each_case: list[Any] = [self]  # whose states have these cells: this one, and further load cases
         # cells that never change are coupled to nothing
@@ -212,8 +313,6 @@ class Stepper:
         make = coupling or COUPLINGS[name].make
         self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
         self._closed = False
-        # asked when a step's pass is done; what it raises takes the step back (`time_steps`)
-        self.judge: Callable[[Step], object] = lambda step: None
 
     @property
     def remodels(self) -> list[Remodels]:
@@ -255,6 +354,7 @@ class Stepper:
         is_last: bool = False,
         rejected: Step | None = None,
         way: Any = None,
+        judge: Callable[[Step], object] = lambda step: None,
     ) -> Step:
         """One step: equilibrium with the loads of `time`, and remodeling.
 
@@ -268,7 +368,9 @@ class Stepper:
             The last attempt at it that was taken back: its work and seconds, which have those of the attempts before
             it, belong to the step.
         way
-            Solves and remodels in place of the coupling, and nobody judges its step (`homeostasis.Homeostasis`).
+            Solves and remodels in place of the coupling (`homeostasis.Homeostasis`).
+        judge
+            Asked when the step's pass is done; what it raises takes the step back (`time_steps`).
 
         Raises
         ------
@@ -302,8 +404,7 @@ class Stepper:
                 if rejected is not None:
                     step.seconds += rejected.seconds
                     step.processor_seconds += rejected.processor_seconds
-                if way is None:
-                    self.judge(step)
+                judge(step)
                 state.reach(time, step.number)
                 for watcher in watchers:
                     watcher.completed(step)
@@ -314,7 +415,12 @@ class Stepper:
             watcher.committed(step)
         return step
 
-    def march(self, times: Iterable[float], watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
+    def march(
+        self,
+        times: Iterable[float],
+        watchers: Sequence[Watcher] = (),
+        judge: Callable[[Step], object] = lambda step: None,
+    ) -> Iterator[Step]:
         """The loop through time: start, and every step to the end of `times`; what is yielded is committed.
 
         Parameters
@@ -323,16 +429,48 @@ class Stepper:
             Of the steps, ascending.
         watchers
             Who follows them.
+        judge
+            As of `advance`.
         """
         remaining = list(times)
         self.start(watchers)
         for number, time in enumerate(remaining, start=1):
-            yield self.advance(time, watchers, is_last=number == len(remaining))
+            yield self.advance(time, watchers, is_last=number == len(remaining), judge=judge)
+
+    def take(self, load_values: Callable[[float], LoadValues], kappa: Any) -> None:
+        """From now on take other loads and rates."""
+        self.load_values = load_values
+        self.remodeling.set_kappa(kappa)
+
+    @contextmanager
+    def holding(self, held: float) -> Iterator[None]:
+        """Meanwhile all loads stay what they are at a time."""
+        given = self.load_values
+        self.load_values = lambda time: given(min(time, held))
+        try:
+            yield
+        finally:
+            self.load_values = given
 
     def close(self) -> None:
         """Free PETSc's objects and options; the state stays, and takes no further step."""
         self._closed = True
         self.coupling.close()
+
+
+class FixedSteps:
+    """The way through time in steps of one length."""
+
+    def __init__(self, stepper: Stepper, end: float, step: float, judge: Callable[[Step], object] = lambda step: None):
+        self.stepper, self.end, self.step, self.judge = stepper, end, step, judge
+
+    def remaining(self) -> list[float]:
+        """Return the times of the steps that are left."""
+        return list(times(self.end, self.step))[self.stepper.state.number :]
+
+    def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
+        """From where the state is to the end; what is yielded is committed."""
+        return self.stepper.march(self.remaining(), watchers, self.judge)
 
 
 def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.model.tensors import largest_change_of_length
 from remodel_fenicsx.schema import same_time
+from remodel_fenicsx.solver.attempts import SHORTER, attempted, say
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Earlier, Numbers
 
@@ -50,8 +52,8 @@ class TimeError:
         self.remodels = [part for part in stepper.remodels if part.components]
         # the error of rows so far, by name; "row": that of the cells
         self._errors = ["row" if part is stepper.remodeling else part.name for part in self.remodels]
-        initial = {"speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0} | dict.fromkeys(self._errors, 0.0)
-        self._numbers = Numbers(stepper.state, "time_error", initial)
+        initial = {"speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0}
+        self._numbers = Numbers(stepper.state, "time_error", initial | dict.fromkeys(self._errors, 0.0))
         # with rows that lag the last error, with others the last row
         self._last = [
             Earlier(
@@ -226,18 +228,32 @@ class StepControl:
     """Marches a stepper to the last of some times, which are hit exactly, in steps of an error below a tolerance."""
 
     def __init__(
-        self, stepper: Stepper, tolerance: float, first: float, stops: Sequence[float], longest: float = math.inf
+        self,
+        stepper: Stepper,
+        tolerance: float,
+        first: float,
+        stops: Sequence[float],
+        longest: float = math.inf,
+        level: int = logging.WARNING,
     ):
-        self.stepper, self.state, self.tolerance = stepper, stepper.state, tolerance
-        self.first, self.stops = first, list(stops)
-        self.longest = min(longest, stepper.coupling.traits.longest)  # times kappa
+        self.stepper, self.state, self.first, self.stops = stepper, stepper.state, first, list(stops)
         self.error = TimeError(stepper)
-        self.level = logging.WARNING  # of what is said of steps above the tolerance
+        self.level = level  # of what is said of steps above the tolerance
         # "before": error of the last step; "usual": length of steps within the tolerance
         initial = {"wanted": first, "before": 1.0, "usual": first, "in_vain": 0.0, "said": 0.0}
         self._numbers = Numbers(stepper.state, "step_control", initial)
         self._rejected: list[StepTooLongError] = []  # attempts at the step under way
-        stepper.judge = self._judge
+        self.limit(tolerance, longest)
+
+    def limit(self, tolerance: float, longest: float) -> None:
+        """From now on take this tolerance in degrees, and no longer steps than this one times kappa."""
+        self.tolerance, self.longest = tolerance, min(longest, self.stepper.coupling.traits.longest)
+
+    def with_stops(self, stops: Sequence[float]) -> StepControl:
+        """Return one that goes on to other times."""
+        other = copy.copy(self)
+        other.stops = list(stops)
+        return other
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """From where the state is to the last stop; what is yielded is committed."""
@@ -254,20 +270,22 @@ class StepControl:
         self._rejected, duration, failures = [], self._numbers["wanted"], 0
         while True:
             time = self._end_of_step(duration, stop)
-            try:
-                before = self._rejected[-1].step if self._rejected else None
-                return self.stepper.advance(time, watchers, time == self.stops[-1], before)
-            except StepTooLongError as rejected:
-                log.debug("time %g: %s, taken back", time, rejected)
-                self._rejected.append(rejected)
+            before = self._rejected[-1].step if self._rejected else None
+            advance = partial(self.stepper.advance, time, watchers, time == self.stops[-1], before, judge=self._judge)
+            found = attempted(advance, StepFailure, StepTooLongError)
+            if isinstance(found, Step):
+                return found
+            if isinstance(found, StepTooLongError):
+                log.debug("time %g: %s, taken back", time, found)
+                self._rejected.append(found)
                 most = 1.0 if len(self._rejected) == 1 else HALVED
-                duration = max(self._best(rejected.error, rejected.duration, most), self._shortest())
-            except StepFailure as failure:
-                failures += 1
-                duration = (time - self.state.time) / 4
-                if failures > FAILED_STEPS or duration < SMALLEST * self.first:
-                    raise
-                log.info("%s; a shorter step is tried", failure)
+                duration = max(self._best(found.error, found.duration, most), self._shortest())
+                continue
+            failures += 1
+            duration = (time - self.state.time) / 4
+            if failures > FAILED_STEPS or duration < SMALLEST * self.first:
+                raise found
+            say(SHORTER, found)
 
     def _end_of_step(self, duration: float, stop: float) -> float:
         """Steps to a stop are alike: none that is left over is shorter than the others."""

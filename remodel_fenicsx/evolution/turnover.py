@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels
+from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
+from remodel_fenicsx.model.axes import GROWTH
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TurnoverRates
 from remodel_fenicsx.schema.settings import Remodeling, Turnover
@@ -22,15 +25,6 @@ LEAST_VOLUME = 0.05  # of that at the start, below which a step is refused: then
 GONE = Refusal("lost tissue", "take a smaller remodeling.turnover.volume or gain, or higher loads")
 LARGEST_TURNOVER = 0.5  # largest |change of ln rho| in a step: the prototype's; it does not act at rest
 MUCH = 10.0  # factor of the natural length, from which on a way to rest may be given up by its rates
-
-
-def turned_over(tissue: Tissue, state: State) -> Tissue:
-    """The tissue with content and natural length as functions of the state, 1 at the start."""
-    made = {name: state.cells.quadrature.function(name, ()) for name in TURNED_OVER}
-    for function in made.values():
-        function.x.array[:] = 1.0
-        state.remember(function)
-    return replace(tissue, **made)
 
 
 def changed(start: Array, rates: Array, duration: float) -> Array:
@@ -119,24 +113,32 @@ class TurnoverPass(Remodels):
         settings = remodeling.turnover
         assert settings.time is not None
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
-        self._parameters = state.parameters(tissue)
+        turned_over = {name: self.quadrature.function(name, ()) for name in TURNED_OVER}
+        for function in turned_over.values():
+            function.x.array[:] = 1.0
+            state.remember(function)
+        self._parameters = state.parameters(replace(tissue, **turned_over))
         self.tissue = self._parameters.tissue
         self._numbers = Numbers(state, "turnover", {"duration": 0.0})
         self._earlier = Earlier(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
         self.growth = Growth(state, settings) if state.kinematics.grows else None
         self._start = self._before = self._row = self._better = self.logarithms()  # before: of the last solved state
+        self.watchers = (GrowthWithoutRest.of,)
         self._start_rates: Array | None = None  # where those of both ends together are better
         self.begin_path()
 
-    def begin_with(self, ratio: Array) -> None:
-        """J_g of an earlier run, where it had this content."""
-        assert self.growth is not None
-        self.growth.begin_with(self._values("content"), ratio)
+    def begin_with(self, values: Callable[[str], Array]) -> None:
+        """Take content, natural length and J_g of an earlier run."""
+        for name in TURNED_OVER:
+            self._values(name)[:] = values(name)
+        self._start = self._before = self._row = self._better = self.logarithms()
+        if self.growth is not None:
+            self.growth.begin_with(self._values("content"), values(GROWTH))
 
     # ------------------------------------------------------------ over a step
     def before(self, time: float, order: int) -> None:
-        """Change m and rho with the rates of the last row over its step; of order 2, with those of the step's middle."""
+        """Change m and rho with the rates of the last row; of order 2, with those of the step's middle."""
         duration, last, rates = time - self.state.time, self._numbers["duration"], self.rates()
         self._numbers["duration"], self._start_rates = duration, None
         if order == 1:
@@ -281,3 +283,43 @@ class TurnoverPass(Remodels):
     def factors(self, name: str) -> Array:
         """By what `content` or `natural_length` has changed, up or down: 1 or more, (elements, points)."""
         return np.exp(np.abs(np.log(self._values(name))))
+
+
+# ---------------------------------------------------------------- a run that does not come to rest
+EARLY = 10.0  # times of turnover, before which rates say little: walls that rest have risen and fall by then
+FAR_FROM_REST = 0.01  # change of ln m or ln rho in a time of turnover
+
+
+class GrowthWithoutRest(WarnsOnce):
+    """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest (`Slowing`)."""
+
+    name, initial = "growth", Slowing.INITIAL
+
+    def __init__(self, stepper: Stepper, held_from: float):
+        super().__init__(stepper)
+        self.held_from, self._slowing = held_from, Slowing(self._numbers)
+
+    @classmethod
+    def of(cls, scene: Any, stepper: Any) -> GrowthWithoutRest:
+        return cls(stepper, scene.end_of_ramps)
+
+    def due(self, step: Step) -> bool:
+        return step.time > self.held_from
+
+    def look(self, step: Step) -> str:
+        """At the rates, while loads are held."""
+        turnover, elapsed = self.stepper.part("turnover"), step.time - self.held_from
+        rates, period = turnover.fastest_changes(), turnover.settings.time
+        rate = self.quadrature.maximum(rates)
+        goes_on = self._slowing.goes_on(elapsed, rate)
+        if not (goes_on and step.is_last and elapsed >= EARLY * period and rate * period >= FAR_FROM_REST):
+            return ""
+        return (
+            "the tissue has not come to rest: content or natural length change by up to "
+            f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at "
+            f"{self.quadrature.shown_place_of_largest(rates)}, "
+            f"and since time {self.held_from + self._numbers['early_time']:g} the rates have fallen no faster than "
+            "1/t. It goes on without bound (mechanobiological instability, docs/tissue_that_lives.md), "
+            "or rests much later; "
+            "with a larger remodeling.turnover.gain it rests sooner"
+        )

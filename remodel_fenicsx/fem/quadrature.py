@@ -278,6 +278,10 @@ class Quadrature:
             local = (float(owned.max()), (float(point[0]), float(point[1]), float(point[2])))
         return max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
 
+    def shown_place_of_largest(self, values: NDArray[np.float64]) -> str:
+        """Return this place in words."""
+        return f"({', '.join(f'{c:.4g}' for c in self.place_of_largest(values))})"
+
     def minimum(self, values: NDArray[np.float64]) -> float:
         """Smallest of values (elements, ...) over all ranks."""
         return -self.maximum(-values)

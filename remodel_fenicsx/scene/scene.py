@@ -388,6 +388,11 @@ class Scene(Table):
         return max((load.ramp[-1][0] for load in self.loads.values()), default=0.0)
 
     @property
+    def hold_before_change(self) -> tuple[float, float] | None:
+        """The last hold, from and to, where all rests in it before collagen takes room; None otherwise."""
+        return self.last_hold if self.remodeling.turnover.starts_at_rest else None
+
+    @property
     def last_hold(self) -> tuple[float, float] | None:
         """When loads stay for the last time before they change again: from and to; None where they never do."""
         corners = sorted({time for load in self.loads.values() for time, _ in load.ramp})

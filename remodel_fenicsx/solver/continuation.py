@@ -6,6 +6,7 @@ import functools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import dolfinx.fem
@@ -19,6 +20,7 @@ from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Solver
+from remodel_fenicsx.solver.attempts import attempted
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
 from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
@@ -159,14 +161,11 @@ class Change:
             part = self._started(min(part, 1.0 - done), done, work)
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
-            self.newton.convergence.intermediate = self.roughly and not is_last
-            try:
-                solution = self.newton.solve(origin=before)
-                work.add(solution)
-            except SolveFailure as failed:
+            solution = attempted(partial(self.newton.solve, before, self.roughly and not is_last), SolveFailure)
+            work.add(solution)
+            if isinstance(solution, SolveFailure):
                 self.state.unknown.x.array[:] = before
-                work.add(failed)
-                part = self._halved(part, done, failed, work)
+                part = self._halved(part, done, solution, work)
             else:
                 expected = 0.0 if self._direction is None else part * self._size(self._direction)
                 moved = self._size(self.state.unknown.x.array - before)
@@ -187,8 +186,6 @@ class Change:
                 self._direction = (self.state.unknown.x.array - before) / part
                 part *= 2
                 work.substeps += 1
-            finally:
-                self.newton.convergence.intermediate = False
 
     def _started(self, wanted: float, done: float, work: Work) -> float:
         """The next part, with the unknowns that it starts from."""
@@ -239,19 +236,16 @@ class Change:
         unknown = self.state.unknown.x.array
         found, parts = unknown.copy(), Work()
         unknown[:] = before
-        try:
-            self.advance(parts, part=0.5)
-        except StepFailure as failure:
+        failure = attempted(lambda: self.advance(parts, part=0.5), StepFailure)
+        leads_on = failure is None and self.refusal is None
+        if failure is not None:
             if self.refusal is None and failure.refusal.kind in WAYS_END:
                 self._jumped(found, failure.refusal)
-            leads_on = False
             log.info(
                 "time %g: the solution is far from what the tangent predicts, and parts of the step fail: %s",
                 self.time,
                 failure,
             )
-        else:
-            leads_on = self.refusal is None
         work.count(parts)
         if leads_on and self._size(unknown - found) > SAME_SOLUTION * self._size(found - before):
             log.info("time %g: there are several solutions; parts of the step lead to the one that is taken", self.time)
@@ -301,7 +295,7 @@ class Change:
 
     def _halved(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
         if part / 2 < self._smallest:
-            text = failure_text(self.time, self.stage, done, failure)
+            text = self.state.label + failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last state that was solved
             found = diagnosed(self.newton, failure, self._direction)
             refusal = found if found.kind or self.refusal is None else self.refusal
@@ -359,8 +353,8 @@ class Blend:
         self.theta.value = 1.0
         end = quadrature.owned(equilibrium.states()[..., 0])
         allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
-        growth = end - now
-        room = np.where(growth > 0, (allowed - now) / np.where(growth > 0, growth, 1.0), np.inf)
+        increase = end - now
+        room = np.where(increase > 0, (allowed - now) / np.where(increase > 0, increase, 1.0), np.inf)
         return (1.0 - done) * quadrature.minimum(room)
 
 

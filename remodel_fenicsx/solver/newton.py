@@ -24,6 +24,7 @@ from remodel_fenicsx.fem.solver_methods import (
     method_options,
 )
 from remodel_fenicsx.schema.settings import Solver
+from remodel_fenicsx.solver.attempts import SAFER, attempted, say
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.linear import EveryTangent
 from remodel_fenicsx.state import stress_rounding
@@ -290,24 +291,23 @@ class GuardedNewton:
             thing.destroy()
         self._snes = None
 
-    def solve(self, origin: Array | None = None) -> Solution:
-        """Solve from the present unknowns; on success they are the solution."""
-        try:
-            return self._attempt(origin, self._linear.more_iterations)
-        except SolveFailure as failure:
-            second = self._linear.second_try()
-            if second is None:
-                raise
-            words, other_way = second
-            log.info("the step is solved once more, %s: %s", words, failure.reason)
-            with other_way:
-                try:
-                    solution = self._attempt(origin)
-                except SolveFailure as again:
-                    again.count(failure)
-                    raise
-                solution.count(failure)
-                return solution
+    def solve(self, origin: Array | None = None, roughly: bool = False) -> Solution:
+        """Solve from the present unknowns; on success they are the solution. `roughly`: others follow."""
+        self.convergence.intermediate = roughly
+        first = attempted(lambda: self._attempt(origin, self._linear.more_iterations), SolveFailure)
+        if isinstance(first, Solution):
+            return first
+        second = self._linear.second_try()
+        if second is None:
+            raise first
+        words, other_way = second
+        say(SAFER, f"{words} ({first.reason})")
+        with other_way:
+            again = attempted(lambda: self._attempt(origin), SolveFailure)
+        again.count(first)
+        if isinstance(again, SolveFailure):
+            raise again
+        return again
 
     def may_start(self, last_extension: float) -> bool:
         """Whether the present unknowns, from which `solve` is to start, are admissible and not too near to locking."""

@@ -37,7 +37,8 @@ from remodel_fenicsx.schema.conventions import convention_doubt
 from remodel_fenicsx.schema.tables import Table, fault, shown
 from remodel_fenicsx.schema.text import read_columns, read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
-from remodel_fenicsx.simulation import Simulation, begin_again, with_choices
+from remodel_fenicsx.initial import with_choices
+from remodel_fenicsx.simulation import Simulation, begin_again
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.studies.page import COLOURS, Answer, Page, label, made_with, panels

@@ -27,7 +27,7 @@ from remodel_fenicsx.running import with_files_kept
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.simulation import with_choices
+from remodel_fenicsx.initial import with_choices
 from remodel_fenicsx.studies.page import Answer
 from remodel_fenicsx.system.children import Worker, cores, wait_for_one
 from remodel_fenicsx.system.files import check_no_link, make_own_folder, refusal_in_words, write_whole

@@ -71,6 +71,5 @@ WATCHERS = {
     "weak-tension": WatcherKind(_WARNINGS + "WeakTension.of"),
     "radial-chains": WatcherKind(_WARNINGS + "RadialChains.of"),
     "fronts": WatcherKind(_WARNINGS + "FrontsInLayers.of"),
-    "growth": WatcherKind(_WARNINGS + "GrowthWithoutRest.of"),
 }
 """By name, in the order in which they see a step."""

@@ -10,11 +10,10 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.stepper import Step, Stepper
+from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.state import Earlier
-from remodel_fenicsx.watch.warnings import WarnsOnce, largest_at
 
 Array = NDArray[np.float64]
 
@@ -160,7 +159,7 @@ class OverCorrection(WarnsOnce):
         return (
             "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
             f"changes by {swing.cells:.2g} r0^2 (root mean square; most at "
-            f"{largest_at(self.quadrature, change)}), the displacement by {swing.body:.2g} of its size; each pass "
+            f"{self.quadrature.shown_place_of_largest(change)}), the displacement by {swing.body:.2g} of its size; each pass "
             f"multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
             f"{self._advice(swing.cells_factor)} "
             "(docs/theory.md, Stability of the pass)"
@@ -217,7 +216,8 @@ class RestedCells(WarnsOnce):
             step,
             "cells that had rested without tension remodel again, and the law catches up in one pass. In "
             f"{100 * share:.2g} % of the body the structure tensor A changes by {change:.2g} r0^2 (root mean square "
-            f"over the body; most at {largest_at(self.quadrature, squares)}). When cells rest "
+            f"over the body; most at {self.quadrature.shown_place_of_largest(squares)}). "
+            "When cells rest "
             'depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a remodeling.law '
             "that is a rate (docs/theory.md, Stability of the pass)",
         )

@@ -12,14 +12,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import Strut
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce, Watcher
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
 from remodel_fenicsx.solver.linear import negative_pivots, uneven
 from remodel_fenicsx.state import Earlier, Numbers
-from remodel_fenicsx.watch.warnings import WarnsOnce
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]

@@ -1,11 +1,11 @@
-"""Warnings of a run, each said once: elements that lock, noise, buckling, lost volume, growth, fronts."""
+"""Warnings of a run, each said once: elements that lock, noise, buckling, lost volume, fronts."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import dolfinx.fem
 import dolfinx.la
@@ -15,121 +15,14 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Shape
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
-from remodel_fenicsx.evolution.turnover import Slowing
+from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.model.tensors import cofactor
-from remodel_fenicsx.state import Numbers
 from remodel_fenicsx.system import NOTICE
 
 Array = NDArray[np.float64]
-
-
-# ---------------------------------------------------------------- what warnings have in common
-# They follow the steps of a run, and speak once.
-
-
-class WarnsOnce(Watcher):
-    """Says one thing about a run, once; resumed runs know whether it was said.
-
-    Parameters
-    ----------
-    stepper
-        Whose solved states are looked at.
-
-    Attributes
-    ----------
-    name
-        Of what is remembered of it in the state.
-    initial
-        Numbers of its own that are remembered from step to step, by name.
-    level
-        Of logging.
-
-    Examples
-    --------
-    >>> from remodel_fenicsx import Simulation, preset_scene
-    >>> from remodel_fenicsx.extend import WATCHERS, WarnsOnce, WatcherKind
-    >>> class Stretched(WarnsOnce):
-    ...     name = "stretched"
-    ...
-    ...     def look(self, step):
-    ...         return "the cube is long" if step.row["mean_stretch"] > 1.5 else ""
-    >>> WATCHERS["stretched"] = WatcherKind(Stretched.of)
-    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
-    >>> for step in simulation.steps():
-    ...     pass
-    >>> simulation.watchers[-1].said
-    True
-    >>> del WATCHERS["stretched"]
-    """
-
-    name = ""
-    initial: ClassVar[Mapping[str, float]] = {}
-    level = logging.WARNING
-
-    def __init__(self, stepper: Stepper):
-        self.stepper, self.state = stepper, stepper.state
-        self.quadrature = stepper.state.cells.quadrature
-        self._numbers = Numbers(self.state, self.name, {"said": 0} | dict(self.initial))
-
-    @classmethod
-    def of(cls, scene: Any, stepper: Any) -> WarnsOnce | None:
-        """For a scene's stepper, or another load case (`WATCHERS`); None where there is nothing to watch.
-
-        Parameters
-        ----------
-        scene
-            The scene.
-        stepper
-            Its stepper, or the load case.
-        """
-        return cls(stepper)
-
-    @property
-    def said(self) -> bool:
-        """Whether it was."""
-        return bool(self._numbers["said"])
-
-    def due(self, step: Step) -> bool:
-        """Whether it is time to look.
-
-        Parameters
-        ----------
-        step
-            The step that is solved.
-        """
-        return step.is_due
-
-    def look(self, step: Step) -> str:
-        """What is to be said of the solved state; nothing where all is well.
-
-        Parameters
-        ----------
-        step
-            The step that is solved.
-        """
-        return ""
-
-    def solved(self, step: Step) -> None:
-        """Look, until it was said."""
-        if self.due(step) and not self.said and (text := self.look(step)):
-            self.find(step, text)
-
-    def find(self, step: Step, text: str) -> None:
-        """It is said where the step is accepted, and else forgotten.
-
-        Parameters
-        ----------
-        step
-            The step that is solved.
-        text
-            One line, without the time.
-        """
-        self._numbers["said"] = True
-        step.findings.append((self.level, f"{step.moment}: {text}"))
 
 
 # ---------------------------------------------------------------- elements that hold a body back
@@ -423,8 +316,6 @@ class VolumeResponse:
 # paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
 NOTED = 0.05  # mean loss that the log mentions at the end
 MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # from where on it is hardly meant
-EARLY = 10.0  # times of turnover, before which rates say little: walls that rest have risen and fall by then
-FAR_FROM_REST = 0.01  # change of ln m or ln rho in a time of turnover
 WEAK = 0.05  # the paper's tube by the law "tensor": angles were 0.02 degrees off at 0.014, 1.2 at 0.14, 12 at 1.4
 RADIAL_SHARE = 0.5  # of the chains: more of them out of the wall are said
 # degrees between two points of an element that are a front, not a slope: within its elements the paper's artery turns
@@ -483,40 +374,6 @@ class WeakTension(WarnsOnce):
                 f"the loads are weak: a tension of {weakness:.2g} times the largest stress of the body counts by half, "
                 "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains",
             )
-
-
-class GrowthWithoutRest(WarnsOnce):
-    """Warns at the end where turnover goes on, and its rates do not fall as those do that come to rest (`Slowing`)."""
-
-    name, initial = "growth", Slowing.INITIAL
-
-    def __init__(self, stepper: Stepper, held_from: float):
-        super().__init__(stepper)
-        self.held_from, self._slowing = held_from, Slowing(self._numbers)
-
-    @classmethod
-    def of(cls, scene: Any, stepper: Any) -> GrowthWithoutRest | None:
-        return None if stepper.part("turnover") is None else cls(stepper, scene.end_of_ramps)
-
-    def due(self, step: Step) -> bool:
-        return step.time > self.held_from
-
-    def look(self, step: Step) -> str:
-        """At the rates, while loads are held."""
-        turnover, elapsed = self.stepper.part("turnover"), step.time - self.held_from
-        rates, period = turnover.fastest_changes(), turnover.settings.time
-        rate = self.quadrature.maximum(rates)
-        goes_on = self._slowing.goes_on(elapsed, rate)
-        if not (goes_on and step.is_last and elapsed >= EARLY * period and rate * period >= FAR_FROM_REST):
-            return ""
-        return (
-            "the tissue has not come to rest: content or natural length change by up to "
-            f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at {largest_at(self.quadrature, rates)}, "
-            f"and since time {self.held_from + self._numbers['early_time']:g} the rates have fallen no faster than "
-            "1/t. It goes on without bound (mechanobiological instability, docs/tissue_that_lives.md), "
-            "or rests much later; "
-            "with a larger remodeling.turnover.gain it rests sooner"
-        )
 
 
 class RadialChains(WarnsOnce):
@@ -587,8 +444,3 @@ class FrontsInLayers(WarnsOnce):
         if not found:
             return ""
         return f"{'; '.join(found)}. A front lies there, so the mean depends on the mesh; set a larger mesh.refinement"
-
-
-def largest_at(quadrature: Any, values: Array) -> str:
-    """Where they are largest."""
-    return f"({', '.join(f'{c:.4g}' for c in quadrature.place_of_largest(values))})"

@@ -16,7 +16,8 @@ from remodel_fenicsx.body.gmsh_model import GeometryError
 from remodel_fenicsx.body.shape import WithRegions
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.schema.settings import Mesh, Region
-from remodel_fenicsx.simulation import Simulation, checked_domain, mesh_of
+from remodel_fenicsx.initial import checked_domain, mesh_of
+from remodel_fenicsx.simulation import Simulation
 
 SELF = MPI.COMM_SELF
 WALL = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0}

@@ -246,7 +246,7 @@ def test_a_step_that_can_never_be_solved_is_tried_three_times_more(monkeypatch: 
 def controlled(error: Callable[[float, float], float], end: float, **changes: Any) -> tuple[Simulation, list[float]]:
     """Times of the steps where the estimated error is this function of their start and length, over the tolerance."""
     simulation = Simulation(tube("staggered", end, **{"time.tolerance": 1.0, **changes}), MPI.COMM_SELF)
-    control = simulation.control
+    control = simulation.way
     assert control is not None
 
     def measured(step: Step) -> Estimate:

@@ -46,7 +46,7 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(caplo
             for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
                 values = turnover._values(name).ravel()[order]
                 assert values[[0, len(values) // 2, -1]] == pytest.approx(expected, rel=0.03)
-    assert simulation.rest.steps < 100
+    assert simulation.way.steps < 100
     assert 40.0 * np.abs(turnover.rates()).max() < 2e-4
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 

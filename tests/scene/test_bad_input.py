@@ -29,7 +29,7 @@ from remodel_fenicsx.body.tube import Tube
 from remodel_fenicsx.results.checkpoint_file import read_checkpoint
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.scene import preset_scene, read_scene
-from remodel_fenicsx.simulation import checked_domain
+from remodel_fenicsx.initial import checked_domain
 from remodel_fenicsx.system.environment import EXTENSIONS
 from tests.conftest import Refused
 from tests.parts import tube

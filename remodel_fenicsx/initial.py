@@ -1,0 +1,194 @@
+"""How a body begins: the choices and the mesh of a scene, its natural configuration, and its states without load."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from remodel_fenicsx.body.domain import Domain
+from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
+from remodel_fenicsx.body.wall import RoundWall
+from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
+from remodel_fenicsx.fem.quadrature import Quadrature
+from remodel_fenicsx.measured import Fibres, in_files, measured_fibres, read_fibres
+from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
+from remodel_fenicsx.scene import Scene, SceneError
+from remodel_fenicsx.scene.scene import in_region
+from remodel_fenicsx.state import State, UnitCells
+from remodel_fenicsx.system.files import typed
+
+log = logging.getLogger(__name__)
+
+NO_FIBRES: Fibres = {}
+BEYOND = 0.5
+"""Widths of the innermost layer: points that lie so far inside of a thin wall have rounding for stretches, for
+polynomials of degree 24 grow by T_24(1 + 2 BEYOND) = 3e13 up to there."""
+ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
+"""Elements of a body, and bytes of a file of fibres, that are looked at in a few seconds without a run."""
+
+
+def meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Scene, Domain]:
+    """The scene with its choices made, which are said, and the mesh."""
+    if scene.geometry.is_loaded:
+        raise SceneError(
+            f"geometry.is = 'loaded': the unloaded body is needed; {typed()} unload SCENE writes its scene"
+        )
+    if domain is None and comm.rank == 0:
+        for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
+            log.info("%s", line)
+    if scene.mesh.formulation == AUTO and comm.rank == 0:
+        log.info("%s", scene.formulation_in_words())
+    scene = with_choices(scene, domain)
+    return scene, checked_domain(mesh_of(scene, comm) if domain is None else domain, scene)
+
+
+def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
+    """One for each load case; made in the order of those of the first, so that all have the same kernels."""
+    made = [on_mesh_alone(scene, domain) for _ in scene.each_case()]
+    unknowns = [one.unknown(domain.mesh, scene.mesh.degree) for one in made]
+    quadrature = Quadrature(domain.mesh, scene.mesh.degree, made[0].weight(domain.mesh))
+    properties, local_axes = scene.properties(), scene.geometry.local_axes(domain, quadrature)
+    own = {name: properties[name].cells for name in scene.regions}
+    grows = scene.remodeling.turnover.grows
+    if grows or not scene.natural.is_of_the_mesh:
+        values, closed = np.eye(3), None
+        if not scene.natural.is_of_the_mesh:
+            values, closed = natural_gradient(scene, quadrature, domain, local_axes, fibres)
+        present, initial = (quadrature.function(f"{name}_gradient", (3, 3)) for name in ("natural", "initial"))
+        for function in (present, initial):
+            quadrature.values(function, (3, 3))[:] = values
+        made = [NaturalConfiguration(one, present, closed, initial if grows else None) for one in made]
+    cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, fibres)
+    if scene.natural.fibres and quadrature.shape[1] > 1:
+        tensors = quadrature.owned(cells.structure_tensor()).reshape(-1, quadrature.shape[1], 9)
+        between = np.sqrt(quadrature.maximum(quadrature.jumps(tensors / np.square(scene.cells.end_to_end_length))))
+        if domain.comm.rank == 0:
+            log.info(
+                "natural.fibres: files have the mean of each element, and the first row is off by what varies inside "
+                "them: elements differ from their neighbours by up to %.1f %% of tr A",
+                100 * between,
+            )
+    return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
+
+
+def on_mesh_alone(scene: Scene, domain: Domain) -> Any:
+    """The scene's kinematics, of a mesh that is free of stress."""
+    kinematics = KINEMATICS[scene.model.kinematics].on(domain.mesh, scene.geometry)
+    return FreeLength(kinematics, scene.geometry) if scene.has_free_length else kinematics
+
+
+def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells, domain: Domain) -> State:
+    """Unknowns of the body with its supports, and with loads that are zero."""
+    shape, loading = scene.geometry, Loading(domain, unknown, kinematics)
+    shape.support(loading, scene.supports.ends, scene.loads)
+    matrices = [one.material for one in scene.properties().values()]
+    modulus = max(material.lame_lambda + 2 * material.lame_mu for material in matrices)
+    shape.hold_faces(loading, scene.supports.faces, modulus, scene.loads)
+    return State(unknown, kinematics, cells, loading, FORMULATIONS[scene.mesh.formulation])
+
+
+def natural_gradient(
+    scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes, fibres: Fibres = NO_FIBRES
+) -> tuple[Any, Any]:
+    """G (elements, points, 3, 3) of a body whose tissue is free of stress elsewhere; what closes to it, if anything."""
+    from remodel_fenicsx.body.wall import gradient, prestretch
+    from remodel_fenicsx.model.residual_stress import closing
+
+    natural, shape, found = scene.natural, scene.geometry, None
+    if natural.fibres:
+        present, ratio = (in_files(fibres, name, quadrature, domain) for name in (NATURAL_GRADIENT, GROWTH))
+        across = np.einsum("...j,...k->...jk", *(2 * [local_axes.axes[..., 2, :]]))
+        return present @ (np.eye(3) + (ratio - 1.0)[..., None, None] * across), None  # G_0 of `evolution.turnover`
+    for index, layer in enumerate(natural.layers):
+        if layer.region is not None and layer.region not in domain.regions:
+            known = ", ".join(map(repr, domain.regions))
+            raise SceneError(f"natural.layers[{index}].region = {layer.region!r}: no such region; there are {known}")
+    if isinstance(shape, RoundWall):
+        tissues = {name: properties.tissue for name, properties in scene.properties().items()}
+        try:
+            found = closing(shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle)
+        except ArithmeticError as error:
+            asked = f"natural.opening_angle = {natural.opening_angle:g}"
+            raise SceneError(f"{asked}: must be smaller, or natural.layers nearer to 1: {error}") from error
+        radii, (inner, next_one, *_) = np.linalg.norm(local_axes.coordinates[..., :2], axis=-1), found.panels.edges
+        stretches = found.stretches(radii)
+        beyond = quadrature.maximum(((inner - radii) / (next_one - inner)).reshape(quadrature.shape))
+        if beyond > BEYOND or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:
+            rule = "must be smaller, or mesh.refinement larger: the sides of elements are chords that leave the wall"
+            raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
+    else:
+        stretches = prestretch(natural, local_axes, domain)
+    return gradient(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), found
+
+
+def check_files(scene: Scene) -> str:
+    """Refuse what a run would, of the files that a scene names; in words what was not looked at. For one rank."""
+    large = []
+    for name, cells in scene.measured_cells.items():
+        file = Path(str(cells.fibres))
+        if file.is_file() and file.stat().st_size > LARGEST_LOOK:
+            large.append(f"{in_region(name)}cells.fibres (over {LARGEST_LOOK / 1e6:g} MB)")
+        else:
+            read_fibres(cells, name)
+    number = scene.geometry.number_of_elements * scene.mesh.refinement**3
+    if large or number > ELEMENTS_OF_A_LOOK:
+        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; the run does"
+    scene = with_choices(scene)
+    domain = checked_domain(mesh_of(scene, MPI.COMM_SELF), scene)
+    scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
+    measured_fibres(scene, domain)
+    return ""
+
+
+def with_choices(scene: Scene, domain: Domain | None = None) -> Scene:
+    """The scene with what it is run with where it leaves the choice. A mesh of one's own is full."""
+    if AUTO not in (scene.model.kinematics, scene.mesh.formulation):
+        return scene
+    name = choice(scene).name if domain is None or scene.model.kinematics != AUTO else "full"
+    return scene.with_values({"model.kinematics": name, "mesh.formulation": scene.formulation})
+
+
+def mesh_of(scene: Scene, comm: MPI.Intracomm) -> Domain:
+    """The mesh of a scene: of its body, or of the part that stands for it. Collective."""
+    if KINEMATICS[scene.model.kinematics].reduced:
+        domain: Domain = scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
+        return domain
+    return scene.geometry.build_with(scene.regions, scene.mesh, comm)
+
+
+def checked_domain(domain: Domain, scene: Scene) -> Domain:
+    """The domain, if it is a mesh of the scene's body and elements."""
+    shape, mesh = scene.geometry, domain.mesh
+    kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
+    if domain.shape != shape.name:
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh is a {domain.shape!r}")
+    element = KINEMATICS[scene.model.kinematics].element(scene.mesh.element)
+    if kind != element:
+        raise SceneError(f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}")
+    if degree != scene.mesh.degree:
+        raise SceneError(f"mesh.degree = {scene.mesh.degree}: the mesh has degree {degree}")
+    for name in scene.regions:
+        if name not in domain.regions:
+            raise SceneError(f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}")
+    if isinstance(shape, RoundWall) and scene.regions and (others := set(domain.regions) - set(scene.regions)):
+        raise SceneError(f"regions.{min(others)}: missing; it is a region of the mesh")
+    needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.face_names
+    missing = [face for face in needed if face not in domain.faces]
+    if missing:
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}")
+    for name, value in domain.dimensions.items():
+        wanted = getattr(shape, name, value)
+        if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
+            raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
+    empty = [name for name in needed if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
+    if empty:
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
+    if not domain.comm.allreduce(bool(np.isfinite(mesh.geometry.x).all()), MPI.LAND):
+        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has nodes that are not finite")
+    return domain
