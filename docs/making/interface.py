@@ -24,6 +24,7 @@ from remodel_fenicsx import cli, extend, parts
 from docs.making.pages import DOCS, markdown
 from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, WithRegions, columns_of, columns_on_request
 from remodel_fenicsx.schema.tables import Table
+from remodel_fenicsx.solver.attempts import ATTEMPTS
 
 HEAD = """# The public interface
 
@@ -164,6 +165,12 @@ def of_shape(kind: type[Shape]) -> tuple[list[Column], list[Column]]:
     held = columns_on_request(kind, held=["NAME"] if kind.supported_faces is None else [])
     of_supports = [column for name, column in held.items() if name.startswith("support_force_")]
     return list(always), [*of_loads, *kind.columns_on_request, *of_supports]
+
+
+def attempts_table() -> str:
+    """What is tried where a solve fails, in its order."""
+    rows = ((str(number), one.what, f"`{one.where}`") for number, one in enumerate(ATTEMPTS, start=1))
+    return markdown(("", "what", "where"), rows)
 
 
 def columns_table() -> str:

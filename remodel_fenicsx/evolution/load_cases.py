@@ -18,7 +18,7 @@ from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.state import State
 
 
-class LoadCase:
+class FurtherCase:
     """A load case beside the first: solved after it in each step, and asked for its drive before the pass."""
 
     def __init__(
@@ -47,7 +47,7 @@ class LoadCase:
 
     def watched(self, watcher: Watcher) -> Watcher:
         """Return a watcher of the stepper that sees each step as it is here."""
-        return LoadCaseWatcher(self, watcher)
+        return FurtherCaseWatcher(self, watcher)
 
     def seen(self, step: Step) -> Step:
         """Return a step as it is in this case."""
@@ -60,7 +60,7 @@ class LoadCases(Remodels):
 
     name = "cases"
 
-    def __init__(self, cases: Sequence[LoadCase]):
+    def __init__(self, cases: Sequence[FurtherCase]):
         self.cases = cases
 
     def settle(self, time: float, again: bool) -> Work:
@@ -86,17 +86,17 @@ def join(
 ) -> None:
     """Let further load cases drive the cells of a stepper too; weights are of all, the first one's first."""
     given = enumerate(zip(states, load_values, strict=True), start=2)
-    cases = [LoadCase(number, state, values, stepper, solver, kappa) for number, (state, values) in given]
+    cases = [FurtherCase(number, state, values, stepper, solver, kappa) for number, (state, values) in given]
     stepper.state.join(states, weights)
     stepper.each_case += cases
     stepper.remodeling.further += [case.drive for case in cases]
     stepper.remodeling.beside.append(LoadCases(cases))
 
 
-class LoadCaseWatcher(Watcher):
+class FurtherCaseWatcher(Watcher):
     """A watcher of the states of another load case: it sees each step as it is there."""
 
-    def __init__(self, case: LoadCase, watcher: Watcher):
+    def __init__(self, case: FurtherCase, watcher: Watcher):
         def as_there(hook: Callable[[Step], None], step: Step) -> None:
             hook(case.seen(step))
 

@@ -105,9 +105,7 @@ class TimeError:
         if not self._last[0].known:
             return betters
         longer, parts = duration / self._numbers["duration"], zip(self.remodels, self._last, rows, strict=True)
-        return [
-            part.moved(row, longer * last.values[0].reshape(-1, part.components)) for part, last, row in parts
-        ]
+        return [part.moved(row, longer * last.values[0].reshape(-1, part.components)) for part, last, row in parts]
 
     # ------------------------------------------------------------ errors that add up
     def _added_up(self, step: Step, rows: Values, betters: Values, duration: float) -> Estimate:

@@ -566,7 +566,7 @@ class CouplingKind:
     takes_cases
         Whether it solves several load cases with the same cells.
     takes_turnover
-        Whether it changes content and natural length of the collagen (`remodeling.turnover`).
+        Whether it changes content and natural length of the collagen (`[remodeling.turnover]`).
     needs_a_target
         Whether it is for laws with a target alone (`Law.target`).
     solves_cells

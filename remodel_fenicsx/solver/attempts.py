@@ -34,9 +34,7 @@ PARTS = Attempt(
     "in parts: first what has remodeled, then the loads, a failed part halved", "Change", "a smaller part is tried"
 )
 REFUSED = Attempt("the step is refused, with its kind and advice", "diagnosed", "")
-SHORTER = Attempt(
-    "with a tolerance: a step of a quarter, up to three times", "StepControl", "a shorter step is tried"
-)
+SHORTER = Attempt("with a tolerance: a step of a quarter, up to three times", "StepControl", "a shorter step is tried")
 ATTEMPTS = (EXPECTED, LAST, SAFER, PARTS, REFUSED, SHORTER)
 """In their order; docs/architecture.md has the table."""
 

@@ -114,7 +114,9 @@ def test_walls_rest_where_an_independent_program_says(case: Any, caplog: pytest.
     """Radius, thickness, means, angles, what a cut shows, curves continued to the faces; nothing is said."""
     with simulated(at_rest(case)) as (simulation, (row,)):
         stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
-        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.part("turnover")._values("content")
+        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.part("turnover")._values(
+            "content"
+        )
     compare(row, RESTS[case])
     for values, expected, accuracy in zip((stress, content.ravel()), LOCAL.get(case, ()), (0.1, 0.02)):
         curve = np.polynomial.Polynomial.fit(depth, values, 8)

@@ -278,7 +278,7 @@ def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
         remodeling={"law": "none", "coupling": "staggered"},
     )
     with made(values | {"solver": {"maximum_halvings": 1}}) as simulation:
-        states, before = list(simulation.state.cases().values()), []
+        states, before = list(simulation.state.each_case().values()), []
         with pytest.raises(StepFailure, match="load case 2: no equilibrium at time"):
             for step in simulation.steps():
                 before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]

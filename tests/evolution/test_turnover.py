@@ -40,7 +40,9 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(caplo
     for end, degrees in ((960.0, 3.0), ("equilibrium", 0.5)):
         with made(wall(end, 8.0, GROWS, COLUMNS)) as simulation:
             row = list(simulation.steps())[-1].row
-            turnover, order = simulation.stepper.part("turnover"), np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
+            turnover, order = simulation.stepper.part("turnover"), np.argsort(
+                simulation.quadrature.coordinates[..., 0].ravel()
+            )
             assert [row[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
             assert opening_angle(simulation) == pytest.approx(115.4, abs=degrees)
             for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
