@@ -154,11 +154,6 @@ def test_the_largest_tension_of_a_pulse_is_that_of_systole() -> None:
     assert largest[1] < rest_of_the_mean()[1] - 5.0
 
 
-def test_with_residual_stress_the_mean_is_enough() -> None:
-    tables: Any = {"natural": {"opening_angle": 120.0}, "material": {"repulsion": "log"}}
-    assert rest(pulse(0.2), **tables) - rest(**tables) == pytest.approx(0.0, abs=0.3)
-
-
 @pytest.mark.parametrize("law, coupling", LAWS)
 def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
     """Equal halves take the steps of none; a pulse has an error as asked for."""

@@ -134,18 +134,3 @@ def test_it_is_that_of_bures() -> None:
     cosine = np.linalg.svd(roots[0] @ roots[1], compute_uv=False).sum(axis=1) / (sizes[0] * sizes[1])
     np.testing.assert_allclose(angle_between(first, second), np.degrees(np.arccos(cosine)), rtol=0.03)
     np.testing.assert_allclose(angle_between(first, first), 0.0, atol=1e-12)
-
-
-def test_no_angle_to_an_axis_changes_by_more() -> None:
-    """Nor does the pitch, times the cosine of the angle out of the wall."""
-    where = places(50)
-    local = cylindrical_axes(where)
-    first, direction = random_cells(50), np.array([0.0, 0.0, 1.0])
-    second = UnitCell(first.dimensions, first.axes @ rotations(np.linspace(0.1, 2.0, 50)))
-    apart = angle_between(first, second)
-    change = angle_to_axis(*second[:2], direction) - angle_to_axis(*first[:2], direction)
-    assert np.all(np.abs(change) <= 1.02 * apart) and np.abs(change).max() > 0.3 * apart.max()
-    pitch = np.abs(pitch_angle(*second[:2], local) - pitch_angle(*first[:2], local))
-    radial = np.einsum("na,nia->ni", where * [1, 1, 0] / np.linalg.norm(where[:, :2], axis=1)[:, None], first.axes)
-    out = np.linalg.norm(radial * first.dimensions, axis=1) / np.linalg.norm(first.dimensions, axis=1)
-    assert np.all(pitch * np.sqrt(1 - out**2) <= 1.1 * apart)
