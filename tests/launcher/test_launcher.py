@@ -11,7 +11,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -423,21 +422,6 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
     assert used not in rooted.roots() and len(rooted.roots()) == 2
 
 
-def test_a_browser_comes_with_an_environment_of_its_own(rooted):
-    """It takes no room from those without one, and a command in it knows nothing of the wish."""
-    browser = {"WITH_FENICSX_ADD": "browser"}
-    rooted.run("true")
-    inside = rooted.run("sh", "-c", "echo ${WITH_FENICSX_ADD-none}", environment=browser)
-    assert (inside.returncode, inside.stdout) == (0, "none\n")
-    first, second = (next(word for word in words if word.startswith("--include=")) for words in rooted.builds())
-    assert second == f"{first},chromium-headless-shell"
-    original = rooted.packages.read_text()
-    for number in range(2):
-        rooted.packages.write_text(f"{original}package-{number}\n")
-        rooted.run("true")
-    assert sorted(name.split("-")[0] for name in rooted.roots()) == ["trixie", "trixie", "trixie+browser"]
-
-
 # ---------------------------------------------------------------- what cannot work says so in one line
 @pytest.mark.parametrize(
     "environment, words",
@@ -508,15 +492,6 @@ def test_container(clone, tmp_path):
     for folder in (tmp_path, clone.folder, clone.environment["HOME"]):
         assert ("--volume", f"{folder}:{folder}") in pairs
     assert ("--env", "KEPT") in pairs and ("--env", "LD_LIBRARY_PATH") not in pairs
-
-
-def test_container_is_the_last_way(clone):
-    script(clone.stubs / "unshare", "#!/bin/sh\nexit 1\n")
-    fake = clone.stubs / "python3"
-    script(fake, f'#!/bin/sh\ncase "$*" in *fenics-dolfinx*) exit 1 ;; esac\nexec {sys.executable} "$@"\n')
-    result = clone.run("true", environment={"WITH_FENICSX": None, "STUB_ENGINE": "built"})
-    assert result.returncode == 0
-    assert clone.engine_calls()[-1][:2] == ["docker", "run"]
 
 
 def test_a_temporary_folder_that_is_none_is_said(ready):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx.model.cells import (
     UnitCell,
@@ -109,15 +110,6 @@ def test_angle_to_an_axis_is_that_of_the_chain(angle: float) -> None:
 
 
 # ---------------------------------------------------------------- between two cells
-def rotations(angles: np.ndarray) -> np.ndarray:
-    """About random axes by angles in degrees, (n, 3, 3)."""
-    direction = np.random.default_rng(3).normal(size=(len(angles), 3))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    cross = np.cross(direction[:, None], np.eye(3))
-    sine, cosine = np.sin(np.radians(angles))[:, None, None], np.cos(np.radians(angles))[:, None, None]
-    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
-
-
 def random_cells(count: int) -> UnitCell:
     """Any dimensions, any axes."""
     rng = np.random.default_rng(7)
@@ -128,7 +120,9 @@ def test_it_is_that_of_bures() -> None:
     """cos = tr sqrt(sqrt(A) B sqrt(A)) for small changes of any kind; no change is no angle."""
     first = random_cells(50)
     size = np.linspace(0.1, 3.0, 50)
-    second = UnitCell(first.dimensions * (1 + np.radians(size))[:, None] ** [1, -1, 2], first.axes @ rotations(size))
+    about = np.random.default_rng(3).normal(size=(50, 3))
+    turns = Rotation.from_rotvec(np.radians(size)[:, None] * about / np.linalg.norm(about, axis=1)[:, None]).as_matrix()
+    second = UnitCell(first.dimensions * (1 + np.radians(size))[:, None] ** [1, -1, 2], first.axes @ turns)
     roots = [np.swapaxes(axes, 1, 2) @ (lengths[:, :, None] * axes) for lengths, axes, _ in (first, second)]
     sizes = [np.linalg.norm(lengths, axis=1) for lengths, _, _ in (first, second)]
     cosine = np.linalg.svd(roots[0] @ roots[1], compute_uv=False).sum(axis=1) / (sizes[0] * sizes[1])

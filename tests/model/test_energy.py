@@ -15,6 +15,7 @@ from mpi4py import MPI
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.schema.settings import Material
+from tests.parts import random_rotations
 
 Array = npt.NDArray[np.float64]
 
@@ -104,11 +105,6 @@ def random_state(case: str, count: int = 64) -> tuple[Array, Array, Array]:
     return F[good][:count], l[good][:count], n[good][:count]
 
 
-def random_rotations(count: int) -> Array:
-    q = np.linalg.qr(np.random.default_rng(9).normal(size=(count, 3, 3)))[0]
-    return q * np.linalg.det(q)[:, None, None]
-
-
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("omega", [1, 4])
 def test_energy_on_arrays_has_the_stress_of_eq_7(points: Points, case: str, omega: int) -> None:
@@ -154,7 +150,7 @@ def test_energy_increment_is_the_slope_from_the_old_to_the_new_cell() -> None:
     """By central differences along the straight way between two cells, of which r^2 and W_rep are the shares."""
     F, l, n = random_state("orthotropic")  # noqa: E741
     rng = np.random.default_rng(8)
-    old, new = UnitCell(l, n), UnitCell(l[rng.permutation(len(l))], random_rotations(len(l)))
+    old, new = UnitCell(l, n), UnitCell(l[rng.permutation(len(l))], random_rotations(np.random.default_rng(9), len(l)))
     tissue, h = MATERIAL.tissue(R0), 1e-5
     energies = [
         tissue.strain_energy(F, [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]) for theta in (h, -h)
