@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx.body import SHAPES, Cube, Tendon, Tube
 from remodel_fenicsx.body.domain import Domain
@@ -29,27 +30,14 @@ MATERIAL = Material()
 TIGHT = Solver(absolute_tolerance=1e-11, relative_tolerance=1e-13)
 
 
-def cube(
-    side: float = 1.0,
-    refinement: int = 1,
-    element: Any = "hexahedron",
-    degree: Any = 1,
-    comm: MPI.Intracomm | None = None,
-) -> Domain:
+def cube(side: float = 1.0, comm: MPI.Intracomm | None = None, **mesh: Any) -> Domain:
     """The mesh of a cube."""
-    return Cube(side=side).build(Mesh(refinement=refinement, element=element, degree=degree), comm)
+    return Cube(side=side).build(Mesh(**mesh), comm)
 
 
-def tendon(
-    length: float = 10.0,
-    area: float = 10.0,
-    refinement: int = 1,
-    element: Any = "hexahedron",
-    degree: Any = 1,
-    comm: MPI.Intracomm | None = None,
-) -> Domain:
+def tendon(length: float = 10.0, area: float = 10.0, comm: MPI.Intracomm | None = None, **mesh: Any) -> Domain:
     """The mesh of a tendon."""
-    return Tendon(length=length, area=area).build(Mesh(refinement=refinement, element=element, degree=degree), comm)
+    return Tendon(length=length, area=area).build(Mesh(**mesh), comm)
 
 
 def tube(
@@ -68,12 +56,14 @@ def tube(
     return whole_tube(shape, (around, through, along), element, degree, comm)
 
 
-def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+def rotation(axis: Sequence[float], degrees: float) -> np.ndarray:
     """The rotation about an axis, (3, 3)."""
-    a = np.asarray(axis) / np.linalg.norm(axis)
-    cross = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
-    angle = np.radians(degrees)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return Rotation.from_rotvec(degrees / np.linalg.norm(axis) * np.asarray(axis), degrees=True).as_matrix()
+
+
+def symmetric(values: Any, axes: np.ndarray) -> np.ndarray:
+    """Tensors with these values (3,) or (n, 3) along the rows of axes (n, 3, 3)."""
+    return np.swapaxes(axes, 1, 2) @ (np.broadcast_to(values, axes.shape[:2])[:, :, None] * axes)
 
 
 def smooth(nodes: np.ndarray, scale: float, seed: int) -> np.ndarray:

@@ -22,8 +22,8 @@ Row = dict[str, Any]
 
 
 def comparison(setting: Any) -> Row:
-    """A setting of tests/radial_comparison.py and its errors; radii in percent, angles in degrees."""
-    from tests import radial_comparison
+    """A setting of docs/making/radial_comparison.py and its errors; radii in percent, angles in degrees."""
+    from docs.making import radial_comparison
 
     found = radial_comparison.errors(setting)
     return {
@@ -37,7 +37,7 @@ def comparison(setting: Any) -> Row:
 
 def layer_mean(setting: Any) -> Row:
     """The mean angle in the fourth of eight layers of the wall, the last before its middle."""
-    from tests import radial_comparison
+    from docs.making import radial_comparison
 
     run, exact = radial_comparison.finite_elements(setting), radial_comparison.reference(setting)
     layer = (run.R > 1.75) & (run.R < 2.0)
@@ -58,7 +58,7 @@ def stiff_tendon(name: str, **changes: Any) -> Row:
 # ---------------------------------------------------------------- all of them
 def jobs() -> dict[str, tuple[Callable[[Any], Row], list[Any]]]:
     """By table, what gives a row of it, and of which cases."""
-    from tests import radial_comparison as compared
+    from docs.making import radial_comparison as compared
 
     meshes = [setting for settings in compared.CONVERGENCE.values() for setting in settings]
     # Fig. 9's pure pressure on the paper's mesh, in one layer along z, and on one twice as fine

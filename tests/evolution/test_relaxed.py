@@ -42,11 +42,6 @@ def test_where_eigenvalues_agree_the_new_axes_decide() -> None:
     np.testing.assert_allclose(found.dimensions, 0.5, rtol=1e-12)
 
 
-def test_the_whole_share_is_the_pass_itself() -> None:
-    old, new = random_cells(1), random_cells(2)
-    assert relaxed(old, new, 1.0) is new
-
-
 def test_the_relaxed_cube_ends_where_the_papers_ends() -> None:
     """Where nothing turns the cells only lag: at t = 1000 both are along the load."""
     changes = {

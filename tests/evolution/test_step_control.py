@@ -210,7 +210,7 @@ def test_a_run_that_goes_on_takes_the_same_steps(coupling: str, changes: dict[st
     first, second = Recording(whole).history, Recording(part).history
     for name in first.keys() - {"seconds"}:
         np.testing.assert_array_equal(first[name], second[name], err_msg=name)
-    with pytest.raises(SceneError, match=r"time\.tolerance = 0\.5: was 0\.3; a resumed run may change"):
+    with pytest.raises(SceneError, match=r"^time\.tolerance = 0\.5: "):
         resume(part, ["time.tolerance=0.5"], MPI.COMM_SELF)
 
 

@@ -1,19 +1,14 @@
-"""Quadrature points: integrals and means by volume, and the deformation gradient there."""
+"""Quadrature points: integrals and means by volume."""
 
 from __future__ import annotations
 
 import dolfinx.mesh
 import numpy as np
 import pytest
-import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.kinematics import FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.schema.settings import Cells
-from tests import parts
-from tests.parts import cube, tube
+from tests.parts import tube
 
 AROUND, LENGTH, RADII = 8, 1.5, (1.0, 2.0, 3.0)
 
@@ -71,16 +66,3 @@ def test_areas_are_volume_over_the_least_and_the_largest_extent() -> None:
     np.testing.assert_allclose(points.largest_areas, [3.0 * 6.0] * 2, rtol=1e-14)
     np.testing.assert_allclose(points.smallest_areas, [2.0 * 3.0] * 2, rtol=1e-14)
     assert points.norm(np.array([3.0, 4.0])) == pytest.approx(5.0, rel=1e-15)
-
-
-def test_a_deformation_gradient_has_the_derivatives_of_a_component_in_its_row() -> None:
-    """x = F X with an F without symmetry."""
-    made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic"))
-    F = np.array([[1.1, 0.2, -0.3], [0.05, 0.9, 0.4], [-0.1, 0.15, 1.2]])
-    made.set_displacement(made.nodes @ (F - np.eye(3)).T)
-    gradient = FullKinematics().deformation_gradient(made.displacement)
-    expression = jit.expression(
-        ufl.as_vector([gradient[i, j] for i in range(3) for j in range(3)]), made.quadrature.points
-    )
-    found = made.quadrature.evaluate(expression, (3, 3))
-    np.testing.assert_allclose(found, np.broadcast_to(F, found.shape), atol=1e-14)

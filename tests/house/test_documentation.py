@@ -14,8 +14,6 @@ import pytest
 
 import remodel_fenicsx
 from remodel_fenicsx import cli
-from remodel_fenicsx.extend import SHAPES
-from remodel_fenicsx.parts import columns_of
 from tests.conftest import mpirun
 from tests.forks import COARSE, forked
 
@@ -33,13 +31,6 @@ def test_pages_that_need_no_run_are_those_that_the_code_makes() -> None:
     assert (
         made.returncode == 0
     ), f"if that is meant (CHANGELOG.md says so, where it is public):\n{made.stdout}{made.stderr}"
-
-
-def test_every_column_of_every_shape_is_in_the_table() -> None:
-    cells = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \|", page("docs/commands.md"), re.MULTILINE)
-    names = {name for cell in cells for name in re.findall(r"\w+", cell)}
-    assert names >= {"time", *(column.name for shape in SHAPES.values() for column in columns_of(shape))}
-    assert "| `force` | cube, tendon | force |" in page("docs/commands.md")
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:

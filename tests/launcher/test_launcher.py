@@ -11,7 +11,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -223,12 +222,6 @@ def test_another_python_does_not_reach_in(ready):
     assert "WITH_FENICSX" not in inside  # a command that calls the launcher again is inside already
 
 
-def test_session_folder_is_private(ready):
-    result = ready.run("sh", "-c", 'stat -c "%a %u" "$TMPDIR"')
-    # The last three digits: a system may set the sticky bit on all new folders.
-    assert result.stdout.split()[0][-3:] == "700"
-
-
 def test_ranks_must_start_inside(ready):
     for name in ("OMPI_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS"):
         one_line(ready.run("true", environment={name: "2"}), "must start inside: ./with-fenicsx mpirun -n 2 true\n")
@@ -319,18 +312,6 @@ def test_build_ends_with_the_launcher(rooted, number, group):
     assert len(rooted.builds()) == 2
 
 
-def test_killed_launcher_leaves_a_build_that_the_next_run_takes(rooted):
-    process = rooted.building("held")
-    process.kill()
-    process.wait()
-    after = rooted.start("echo", "after")
-    assert "waiting" in after.stderr.readline()
-    (rooted.record / "go").touch()
-    assert after.communicate(timeout=LONG)[0] == "after\n"
-    assert after.returncode == 0
-    assert len(rooted.builds()) == 1
-
-
 def a_user_builds(rooted, tmp_path) -> dict[str, str]:
     """The environment in which the launcher takes the way of one who is not root: the root comes as a tar stream."""
     script(rooted.stubs / "id", "#!/bin/sh\necho 1000\n")
@@ -381,24 +362,6 @@ def test_the_next_start_removes_what_a_killed_build_left(rooted, tmp_path, other
     assert (rooted.record / "helper").read_text() == f"find {left} -mindepth 2 -xdev -delete\n"
     assert list((rooted.cache / "remodel-fenicsx").glob("*.building")) == []
     assert rooted.run("true", environment=environment).stderr == ""
-
-
-def test_what_a_build_that_goes_on_needs_is_not_removed(rooted, tmp_path):
-    environment = a_user_builds(rooted, tmp_path)
-    first = rooted.building("held", **environment)
-    other = Clone(tmp_path / "other", cache=rooted.cache)
-    other.packages.write_text(other.packages.read_text() + "one-more\n")
-    a_user_builds(other, tmp_path / "other")
-    second = other.run("echo", "second", environment=environment)
-    assert (second.returncode, second.stdout) == (0, "second\n")
-    assert "removing" not in second.stderr
-    assert list((tmp_path / "temporary").glob("remodel-fenicsx-build-*/*/half"))
-    (rooted.record / "go").touch()
-    out, err = first.communicate(timeout=LONG)
-    assert (first.returncode, out) == (0, "first\n"), err
-    assert list((tmp_path / "temporary").iterdir()) == []
-    # what mmdebstrap leaves behind when it is killed must not hold up all later starts
-    assert (rooted.record / "held").read_text() == ""
 
 
 @pytest.mark.parametrize("damage", ["empty", "without /etc", "file"])
@@ -459,21 +422,6 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
     assert used not in rooted.roots() and len(rooted.roots()) == 2
 
 
-def test_a_browser_comes_with_an_environment_of_its_own(rooted):
-    """It takes no room from those without one, and a command in it knows nothing of the wish."""
-    browser = {"WITH_FENICSX_ADD": "browser"}
-    rooted.run("true")
-    inside = rooted.run("sh", "-c", "echo ${WITH_FENICSX_ADD-none}", environment=browser)
-    assert (inside.returncode, inside.stdout) == (0, "none\n")
-    first, second = (next(word for word in words if word.startswith("--include=")) for words in rooted.builds())
-    assert second == f"{first},chromium-headless-shell"
-    original = rooted.packages.read_text()
-    for number in range(2):
-        rooted.packages.write_text(f"{original}package-{number}\n")
-        rooted.run("true")
-    assert sorted(name.split("-")[0] for name in rooted.roots()) == ["trixie", "trixie", "trixie+browser"]
-
-
 # ---------------------------------------------------------------- what cannot work says so in one line
 @pytest.mark.parametrize(
     "environment, words",
@@ -491,25 +439,6 @@ def test_a_browser_comes_with_an_environment_of_its_own(rooted):
 def test_one_line_and_exit_5(rooted, environment, words):
     one_line(rooted.run("true", environment=environment), f"with-fenicsx: {words}")
     assert rooted.builds() == []
-
-
-@pytest.mark.parametrize(("inodes", "missing"), [(1, "cache"), (2, "lock"), (3, "log"), (4, "part")])
-def test_a_file_system_without_inodes(rooted, inodes, missing):
-    """One is its own root: the cache, its lock, the log and the unfinished root need one each."""
-    rooted.cache.mkdir()
-    mounted = f'mount -t tmpfs -o nr_inodes={inodes},size=8g tmpfs "$1" && exec "$2" true'
-    words = ["unshare", *MAPPED, "--mount", "sh", "-c", mounted, "sh", rooted.cache, rooted.launcher]
-    done = subprocess.run(words, env=rooted.environment, capture_output=True, text=True)
-    place = {"cache": "remodel-fenicsx: set", "lock": "remodel-fenicsx: set", "log": ".log: ", "part": ".part: "}
-    one_line(done, place[missing])
-    assert "No space left on device" in done.stderr
-    assert rooted.builds() == []
-
-
-def test_a_file_system_without_locks(ready, tmp_path):
-    clone = Clone(tmp_path, cache=ready.cache)
-    script(clone.stubs / "flock", "#!/bin/sh\necho 'flock: 10: No locks available' >&2; exit 71\n")
-    one_line(clone.run("true"), ".lock: No locks available")
 
 
 @pytest.mark.parametrize("way", ["root", None])
@@ -563,15 +492,6 @@ def test_container(clone, tmp_path):
     for folder in (tmp_path, clone.folder, clone.environment["HOME"]):
         assert ("--volume", f"{folder}:{folder}") in pairs
     assert ("--env", "KEPT") in pairs and ("--env", "LD_LIBRARY_PATH") not in pairs
-
-
-def test_container_is_the_last_way(clone):
-    script(clone.stubs / "unshare", "#!/bin/sh\nexit 1\n")
-    fake = clone.stubs / "python3"
-    script(fake, f'#!/bin/sh\ncase "$*" in *fenics-dolfinx*) exit 1 ;; esac\nexec {sys.executable} "$@"\n')
-    result = clone.run("true", environment={"WITH_FENICSX": None, "STUB_ENGINE": "built"})
-    assert result.returncode == 0
-    assert clone.engine_calls()[-1][:2] == ["docker", "run"]
 
 
 def test_a_temporary_folder_that_is_none_is_said(ready):

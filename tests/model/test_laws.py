@@ -158,16 +158,3 @@ def test_below_the_threshold_values_are_zero_and_differences_are_none() -> None:
     np.testing.assert_allclose(updated([0.02, 0.0009, -0.02]).dimensions, np.tile([1.3, 0.0, 0.0], (50, 1)), atol=1e-12)
     for name, values in zip(("dimensions", "axes"), updated([0.0009, -0.02, -0.03])):
         np.testing.assert_array_equal(values, getattr(old, name))
-
-
-def test_chain_length_of_eq_11_dips_along_the_chord() -> None:
-    """Erratum 3: |l|^2 = r0^2 (1 - 2 s (1-s)(1 - cos a)) between two points of the sphere, a the angle between them."""
-    rng = np.random.default_rng(2)
-    r0 = 1.2
-    l0, target = r0 * octant(rng, 2000), r0 * octant(rng, 2000)
-    cosine = np.sum(l0 * target, axis=1) / r0**2
-    for time in (1.0, 12.0, 27.7, 150.0):
-        s = 1 - np.exp(-KAPPA * time)
-        length = np.linalg.norm(explicit(l0, l0, target, KAPPA, time - 1.0, time), axis=1)
-        np.testing.assert_allclose(length**2, r0**2 * (1 - 2 * s * (1 - s) * (1 - cosine)), rtol=1e-12)
-        assert np.all(length >= r0 * np.sqrt(0.5) * (1 - 1e-12))

@@ -1,11 +1,11 @@
-"""Local axes: those of a tube to the last digit what functions of the place gave, and those of the deformed body."""
+"""Local axes of a tube, and those of the deformed body."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from remodel_fenicsx.body import Tube
-from remodel_fenicsx.model.cells import cylindrical_axes, pitch_angle, radial_share
+from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.axes import LocalAxes
 from tests import parts
 
@@ -24,24 +24,6 @@ def local_axes(places: np.ndarray, axes: np.ndarray | None = None) -> LocalAxes:
     return LocalAxes(
         places, lambda: found, lambda: tube.depth(places), lambda: tube.station(places), lambda: tube.depth(places)
     )
-
-
-def test_angles_in_a_tube_are_to_the_last_digit_those_of_the_place() -> None:
-    """Rows of a history stay what they were when the angle was a function of the place."""
-    rng, places = np.random.default_rng(5), wall_points()
-    dimensions, axes = rng.uniform(size=(60, 3)), parts.random_rotations(rng, 60)
-    radius = np.sqrt(places[:, 0] ** 2 + places[:, 1] ** 2)
-    cosine, sine = places[:, 0, None] / radius[:, None], places[:, 1, None] / radius[:, None]
-    x, y, z = (axes[..., i] for i in range(3))
-    circumferential, axial, radial = (
-        np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2 + v[:, 2] ** 2)
-        for v in (dimensions * (y * cosine - x * sine), dimensions * z, dimensions * (x * cosine + y * sine))
-    )
-    local = local_axes(places).axes
-    angle = np.degrees(np.arctan2(axial, circumferential))
-    np.testing.assert_array_equal(pitch_angle(dimensions, axes, local), angle)
-    trace = circumferential**2 + axial**2 + radial**2
-    np.testing.assert_array_equal(radial_share(dimensions, axes, local), radial**2 / trace)
 
 
 def test_depth_and_station_of_a_tube() -> None:

@@ -17,11 +17,6 @@ COUNT, KAPPA = 50, 0.05
 IDENTITY = np.broadcast_to(np.eye(3), (COUNT, 3, 3))
 
 
-def tensor(values: Array, axes: Array) -> Array:
-    """Symmetric tensors with these values (3,) or (n, 3) along the rows of axes (n, 3, 3)."""
-    return np.swapaxes(axes, 1, 2) @ (np.broadcast_to(values, axes.shape[:2])[:, :, None] * axes)
-
-
 def nearby(rng: np.random.Generator, axes: Array, degrees: float = 15.0) -> Array:
     """The same axes turned by up to some degrees."""
     small = [parts.rotation(tuple(rng.normal(size=3)), rng.uniform(0.0, degrees)) for _ in axes]
@@ -33,7 +28,7 @@ def test_each_axis_takes_the_place_of_the_one_that_it_continues() -> None:
     rng = np.random.default_rng(1)
     true = parts.random_rotations(rng, COUNT)
     values = rng.normal(size=(COUNT, 3))  # in any order
-    found, axes = continued(tensor(values, true), nearby(rng, true))
+    found, axes = continued(parts.symmetric(values, true), nearby(rng, true))
     np.testing.assert_allclose(found, values, atol=1e-13)
     np.testing.assert_allclose(axes, true, atol=1e-11)  # with their signs
 
@@ -42,7 +37,7 @@ def test_in_descending_order_it_is_the_printed_one() -> None:
     rng = np.random.default_rng(2)
     true = parts.random_rotations(rng, COUNT)
     for values in ([3.0, 1.0, -2.0], [3.0, 3.0, -2.0], [3.0, -2.0, -2.0], [1.0, 1.0, 1.0]):
-        tensors, previous = tensor(np.array(values), true), nearby(rng, true)
+        tensors, previous = parts.symmetric(np.array(values), true), nearby(rng, true)
         for one, other in zip(continued(tensors, previous), principal(tensors, previous), strict=True):
             np.testing.assert_array_equal(one, other)
 
@@ -56,7 +51,7 @@ def test_equal_values_keep_the_axes_that_they_continue(values: list[float], nois
     rng = np.random.default_rng(3)
     previous = parts.random_rotations(rng, COUNT)
     error = noise * rng.normal(size=previous.shape)
-    found, axes = continued(tensor(np.array(values), previous) + error, previous)
+    found, axes = continued(parts.symmetric(np.array(values), previous) + error, previous)
     np.testing.assert_allclose(found, np.broadcast_to(values, found.shape), atol=1e-10)
     np.testing.assert_allclose(axes, previous, atol=1e-10)
 
@@ -67,7 +62,7 @@ def test_where_several_pairings_are_as_good_rounding_does_not_choose() -> None:
     previous = parts.random_rotations(rng, COUNT)
     c = np.sqrt(0.5)
     half_way = np.array([[c, c, 0.0], [-c, c, 0.0], [0.0, 0.0, 1.0]]) @ previous
-    tensors = tensor(np.array([2.0, 1.0, 0.0]), half_way)
+    tensors = parts.symmetric(np.array([2.0, 1.0, 0.0]), half_way)
     for noise in (0.0, 1e-9):
         found, _ = continued(tensors + noise * rng.normal(size=tensors.shape), previous)
         np.testing.assert_allclose(found, np.broadcast_to([2.0, 1.0, 0.0], found.shape), atol=1e-8)
@@ -90,8 +85,8 @@ def jumps(law: str, pairing: str, F: Array, driver: str = "cauchy", steps: int =
     for step in range(1, steps + 1):
         share, true = step / steps, true @ turn
         values = np.array([3.0 - 2.5 * share, 1.0 + share, 0.6 + 2.1 * share])
-        cells = LAWS[law].update(cells, drive(tensor(values, true), F, pairing, driver), 20 + 40 * (step - 1) / steps,
-                                 20 + 40 * share)  # fmt: skip
+        driven, old = drive(parts.symmetric(values, true), F, pairing, driver), 20 + 40 * (step - 1) / steps
+        cells = LAWS[law].update(cells, driven, old, 20 + 40 * share)
         A = structure_tensor(*cells[:2])
         if before is not None:  # in its first pass a cell goes to where the law has it at t = 20
             largest = max(largest, np.abs(A - before).max())
@@ -128,7 +123,9 @@ def test_the_largest_dimension_is_the_fibre_that_is_carried_onto_its_direction()
     true = parts.random_rotations(rng, COUNT)
     back = np.linalg.solve(F, np.swapaxes(true, 1, 2)).swapaxes(1, 2)
     old = UnitCell(np.tile([0.1, 0.3, 0.9], (COUNT, 1)), np.linalg.qr(back.swapaxes(1, 2))[0].swapaxes(1, 2))
-    drive_ = drive(tensor(np.array([0.1, 0.2, 3.0]), true), F, "continuous")._replace(initial_dimensions=old.dimensions)
+    drive_ = drive(parts.symmetric(np.array([0.1, 0.2, 3.0]), true), F, "continuous")._replace(
+        initial_dimensions=old.dimensions
+    )
     new = LAWS["relaxation"].update(old, drive_, 0.0, 10.0)
     np.testing.assert_allclose(np.cross(np.einsum("nab,nb->na", F, new.axes[:, 2]), true[:, 2]), 0.0, atol=1e-12)
     assert np.all(new.dimensions[:, 2] > 0.9)
@@ -139,7 +136,7 @@ def test_continuous_pairing_is_objective() -> None:
     F = IDENTITY + rng.uniform(-0.25, 0.25, IDENTITY.shape)
     Q, true = parts.random_rotations(rng, COUNT), parts.random_rotations(rng, COUNT)
     old = UnitCell(np.tile([0.2, 0.9, 0.4], (COUNT, 1)), parts.random_rotations(rng, COUNT))
-    stress = tensor(np.array([0.5, -1.0, 3.0]), true)
+    stress = parts.symmetric(np.array([0.5, -1.0, 3.0]), true)
     still, turned = (
         LAWS["relaxation"].update(old, drive(R @ stress @ np.swapaxes(R, 1, 2), R @ F, "continuous"), 3.0, 4.0)
         for R in (IDENTITY, Q)

@@ -36,11 +36,6 @@ def cells_of(axes: Array, dimensions: Array = FIBRE) -> UnitCell:
     return UnitCell(np.broadcast_to(dimensions, (len(axes), 3)), axes)
 
 
-def tensor(values: list[float], axes: Array) -> Array:
-    """Symmetric tensors with the given values along the rows of axes (n, 3, 3)."""
-    return np.swapaxes(axes, 1, 2) @ (np.asarray(values)[:, None] * axes)
-
-
 def angle_to(axes: Array, goal: Array) -> Array:
     """Between the first axes and a line, radians."""
     across = np.linalg.norm(np.cross(axes[:, 0], goal), axis=1)
@@ -51,7 +46,7 @@ def random_case(seed: int = 1, count: int = 40) -> tuple[UnitCell, Array, Array]
     """Cells, driving tensors with one largest value, and the axes of these."""
     rng = np.random.default_rng(seed)
     goal = parts.random_rotations(rng, count)
-    return cells_of(parts.random_rotations(rng, count)), tensor([3.0, 1.0, -2.0], goal), goal
+    return cells_of(parts.random_rotations(rng, count)), parts.symmetric([3.0, 1.0, -2.0], goal), goal
 
 
 # ---------------------------------------------------------------- one fibre under a constant load
@@ -90,7 +85,7 @@ def test_axes_stay_orthonormal_and_keep_their_hand_and_the_cell_its_dimensions()
     axes[::2, 1] *= -1.0
     cells = cells_of(axes)
     for _ in range(300):
-        stress = tensor([3.0, 1.0, -2.0], parts.random_rotations(rng, 40))
+        stress = parts.symmetric([3.0, 1.0, -2.0], parts.random_rotations(rng, 40))
         cells = updated(cells, pulled(stress), rng.uniform(0.0, 10.0))
     np.testing.assert_allclose(cells.axes @ np.swapaxes(cells.axes, 1, 2), np.eye(3) + 0 * axes, atol=1e-13)
     np.testing.assert_allclose(np.linalg.det(cells.axes), np.where(np.arange(40) % 2, 1.0, -1.0), atol=1e-13)
@@ -150,7 +145,7 @@ def test_a_fibre_across_the_tension_turns_and_rounding_does_not_choose_where() -
 
 def test_equal_largest_values_take_the_fibre_to_their_plane_the_nearest_way() -> None:
     old, _, goal = random_case(8)
-    new = updated(old, pulled(tensor([3.0, 3.0, -2.0], goal)), 1e9).axes[:, 0]
+    new = updated(old, pulled(parts.symmetric([3.0, 3.0, -2.0], goal)), 1e9).axes[:, 0]
     projected = old.axes[:, 0] - np.sum(old.axes[:, 0] * goal[:, 2], axis=1)[:, None] * goal[:, 2]
     np.testing.assert_allclose(new, projected / np.linalg.norm(projected, axis=1)[:, None], atol=1e-7)
 
@@ -161,7 +156,7 @@ def test_equal_largest_values_take_the_fibre_to_their_plane_the_nearest_way() ->
 )
 def test_equal_values_and_no_tension_turn_nothing(values: list[float], threshold: float) -> None:
     old, _, goal = random_case(9)
-    new = updated(old, pulled(tensor(values, goal), threshold=threshold), 7.0)
+    new = updated(old, pulled(parts.symmetric(values, goal), threshold=threshold), 7.0)
     np.testing.assert_allclose(new.axes, old.axes, atol=1e-14)
 
 

@@ -4,17 +4,9 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.model.spectral import ROUNDING, Array, positive_direction, principal
+from tests.parts import random_rotations, symmetric
 
 COUNT = 50
-
-
-def random_axes(rng: np.random.Generator, count: int = COUNT) -> Array:
-    return np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
-
-
-def tensor(values: list[float], axes: Array) -> Array:
-    """Symmetric tensors with the given values along the rows of `axes`."""
-    return np.swapaxes(axes, 1, 2) @ (np.asarray(values)[:, None] * axes)
 
 
 def absolute_cosines(a: Array, b: Array) -> Array:
@@ -30,7 +22,7 @@ def test_distinct_values(size: float) -> None:
     rng = np.random.default_rng(1)
     random = rng.normal(size=(COUNT, 3, 3))
     tensors = size * (random + np.swapaxes(random, 1, 2))
-    previous = random_axes(rng)
+    previous = random_rotations(rng, COUNT)
     values, axes = principal(tensors, previous)
     assert np.all(np.diff(values, axis=1) <= 0)
     assert_orthonormal(axes)
@@ -41,7 +33,7 @@ def test_distinct_values(size: float) -> None:
 
 def test_only_the_symmetric_part_counts() -> None:
     rng = np.random.default_rng(2)
-    tensors, previous = rng.normal(size=(COUNT, 3, 3)), random_axes(rng)
+    tensors, previous = rng.normal(size=(COUNT, 3, 3)), random_rotations(rng, COUNT)
     for one, other in zip(principal(tensors, previous), principal(np.swapaxes(tensors, 1, 2), previous)):
         np.testing.assert_array_equal(one, other)
 
@@ -51,8 +43,8 @@ def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     values: list[float], single: int, pair: tuple[int, int]
 ) -> None:
     rng = np.random.default_rng(3)
-    true, previous = random_axes(rng), random_axes(rng)
-    found, axes = principal(tensor(values, true), previous)
+    true, previous = random_rotations(rng, COUNT), random_rotations(rng, COUNT)
+    found, axes = principal(symmetric(values, true), previous)
     np.testing.assert_allclose(found, np.broadcast_to(values, found.shape), atol=1e-13)
     assert_orthonormal(axes)
     normal = true[:, single]
@@ -69,16 +61,16 @@ def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     "values", [[3.0, 3.0, 1.0], [3.0, 1.0, 1.0], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0], [-1.0, -1.0, -1.0], [0.0, 0.0, -4.0]]
 )
 def test_previous_axes_that_are_principal_stay(values: list[float]) -> None:
-    previous = random_axes(np.random.default_rng(4))
-    _, axes = principal(tensor(values, previous), previous)
+    previous = random_rotations(np.random.default_rng(4), COUNT)
+    _, axes = principal(symmetric(values, previous), previous)
     np.testing.assert_allclose(axes, previous, atol=1e-14)
 
 
 @pytest.mark.parametrize("values", [[3.0, 3.0, 1.0], [3.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
 def test_rounding_does_not_choose_the_axes(values: list[float]) -> None:
     rng = np.random.default_rng(5)
-    true, previous = random_axes(rng), random_axes(rng)
-    exact = tensor(values, true)
+    true, previous = random_rotations(rng, COUNT), random_rotations(rng, COUNT)
+    exact = symmetric(values, true)
     noise = 1e-12 * rng.normal(size=exact.shape)
     noise += np.swapaxes(noise, 1, 2)
     # the noise does turn LAPACK's vectors, so there is something to be protected from
@@ -89,26 +81,17 @@ def test_rounding_does_not_choose_the_axes(values: list[float]) -> None:
 
 def test_values_that_agree_in_a_chain_are_one_cluster() -> None:
     rng = np.random.default_rng(6)
-    true, previous = random_axes(rng), random_axes(rng)
-    _, axes = principal(tensor([1.0, 1.0 - 0.8e-8, 1.0 - 1.6e-8], true), previous)
+    true, previous = random_rotations(rng, COUNT), random_rotations(rng, COUNT)
+    _, axes = principal(symmetric([1.0, 1.0 - 0.8e-8, 1.0 - 1.6e-8], true), previous)
     np.testing.assert_allclose(axes, previous, atol=1e-14)
-    _, axes = principal(tensor([1.0, 1.0 - 1.6e-8, 1.0 - 3.2e-8], true), previous)
+    _, axes = principal(symmetric([1.0, 1.0 - 1.6e-8, 1.0 - 3.2e-8], true), previous)
     np.testing.assert_allclose(absolute_cosines(axes, true), 1.0, atol=1e-12)
-
-
-def test_tolerance_is_relative_to_the_largest_absolute_value() -> None:
-    rng = np.random.default_rng(7)
-    true, previous = random_axes(rng), random_axes(rng)
-    _, axes = principal(tensor([1e-9, 0.0, -1.0], true), previous)
-    assert np.min(absolute_cosines(axes[:, 0], true[:, 0])) < 0.9
-    _, axes = principal(tensor([1e-9, 0.0, -1.0], true), previous, tolerance=1e-11)
-    np.testing.assert_allclose(absolute_cosines(axes, true), 1.0, atol=1e-10)
 
 
 def test_noise_below_the_scale_is_the_zero_tensor() -> None:
     rng = np.random.default_rng(8)
-    true, previous = random_axes(rng), random_axes(rng)
-    noise = tensor([3e-16, 1e-16, -2e-16], true)
+    true, previous = random_rotations(rng, COUNT), random_rotations(rng, COUNT)
+    noise = symmetric([3e-16, 1e-16, -2e-16], true)
     np.testing.assert_allclose(principal(noise, previous, threshold=ROUNDING)[1], previous, atol=1e-14)
     np.testing.assert_allclose(absolute_cosines(principal(noise, previous)[1], true), 1.0, atol=1e-12)
 
@@ -135,8 +118,8 @@ def test_without_previous_axes_the_coordinate_axes_decide() -> None:
     nothing = np.zeros((2, 3, 3))
     np.testing.assert_array_equal(principal(np.zeros((2, 3, 3)), nothing)[1], np.broadcast_to(np.eye(3), (2, 3, 3)))
     for values in ([2.0, 2.0, 1.0], [2.0, 1.0, 1.0]):
-        true = random_axes(np.random.default_rng(9))
-        _, axes = principal(tensor(values, true), np.zeros_like(true))
+        true = random_rotations(np.random.default_rng(9), COUNT)
+        _, axes = principal(symmetric(values, true), np.zeros_like(true))
         assert_orthonormal(axes)
 
 
@@ -144,11 +127,11 @@ def test_without_previous_axes_the_coordinate_axes_decide() -> None:
 def test_what_is_not_finite_is_named(bad: float) -> None:
     tensors = np.zeros((5, 3, 3))
     tensors[3, 0, 1] = tensors[4, 2, 2] = bad
-    with pytest.raises(FloatingPointError, match=r"^tensor 3 of 5 is not finite \(2 in all\): \[\[0\.0, -?(nan|inf), "):
+    with pytest.raises(FloatingPointError, match="^tensor 3 of 5 "):
         principal(tensors, np.zeros((5, 3, 3)))
-    with pytest.raises(FloatingPointError, match=r"^triad of previous axes 3 of 5 is not finite \(2 in all\)"):
+    with pytest.raises(FloatingPointError, match="^triad of previous axes 3 of 5 "):
         principal(np.zeros((5, 3, 3)), tensors)
-    with pytest.raises(FloatingPointError, match=r"^set of principal values 0 of 1 is not finite \(1 in all\)"):
+    with pytest.raises(FloatingPointError, match="^set of principal values 0 of 1 "):
         positive_direction([[bad, 0.0, 0.0]])
 
 

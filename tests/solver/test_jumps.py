@@ -14,7 +14,7 @@ from benchmarks.stability_map.cases import all_cases
 from benchmarks.stability_map.running import Runner
 from remodel_fenicsx import Scene
 from remodel_fenicsx.scene import scene_from_dict
-from remodel_fenicsx.solver.continuation import Change, StepFailure
+from remodel_fenicsx.solver.continuation import Change
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 from remodel_fenicsx.solver.diagnosis import diagnosed
@@ -57,21 +57,6 @@ def test_a_limit_point_that_is_jumped_over_is_named(
     assert "limit point" in said and "a smaller time.step" in said
     place = re.search(r"the path of the last one ends at pressure ([0-9.]+)\.", said)
     assert place is not None and float(place[1]) == pytest.approx(LARGEST, rel=5e-3)
-
-
-def test_a_part_that_starts_where_the_tangent_is_singular_is_no_way_on(caplog: pytest.LogCaptureFixture) -> None:
-    """A part ends 0.2 % below the largest pressure, 0.2745: from there the first Newton step goes beyond the jump."""
-    cells = {"cells.initial": [0.2, 0.6, 0.7745966692414834], "mesh.degree": 2}
-    material = {"chain_density": 2.0e21, "contour_length": 1.594, "persistence_length": 1.365}
-    values = cells | {f"material.{name}": value for name, value in material.items()}
-    scene = thin_tube(0.4384, **values, **{"time.step": 0.2, "solver.relative_tolerance": 1e-9})
-    try:
-        radii(scene)
-    except StepFailure as failure:  # whether Newton's method finds something beyond is a matter of luck
-        assert failure.refusal.kind == "limit point"
-    else:
-        (said,) = warnings(caplog)
-        assert "limit point" in said and "beyond pressure 0.274" in said
 
 
 def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:

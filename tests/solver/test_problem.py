@@ -1,4 +1,4 @@
-"""Residual and tangent with all loads, the guards r < L and J > 0, and the rates of convergence of the elements."""
+"""The tangent of a pressure, loads, the guards r < L and J > 0, and the rates of convergence of the elements."""
 
 from __future__ import annotations
 
@@ -22,70 +22,6 @@ RANDOM = Cells(initial="random", seed=3)
 
 
 # ---------------------------------------------------------------- residual and tangent
-def assembled_vector(problem: parts.Problem) -> np.ndarray:
-    """Internal forces minus loads at the present displacement, no support applied."""
-    total = np.zeros_like(problem.state.unknown.x.array)
-    for form in (*problem.internal_forms, problem.external_form):
-        if form is not None:
-            total += dolfinx.fem.assemble_vector(form).array
-    return total
-
-
-def assembled_tangent(problem: parts.Problem) -> np.ndarray:
-    """Dense tangent, no support applied."""
-    return sum(dolfinx.fem.assemble_matrix(form).to_dense() for form in problem.tangent_forms)
-
-
-def orders(remainders: list[float]) -> np.ndarray:
-    """Observed orders when the step is halved."""
-    return np.log2(np.array(remainders[:-1]) / np.array(remainders[1:]))
-
-
-@pytest.fixture(scope="module")
-def loaded_cube() -> tuple[parts.Body, parts.Problem]:
-    """Random cells with random axes, a dead force at the top and a follower pressure on a side, nothing held."""
-    made = parts.body(cube(refinement=2), RANDOM)
-    parts.random_axes(made, np.random.default_rng(5))
-    made.loading.add_dead_force("force", "z1", component=2)
-    made.loading.add_follower_pressure("pressure", "x1")
-    return made, made.problem()
-
-
-@pytest.mark.parametrize("pressure", [0.0, 4.8])
-def test_tangent_is_the_slope_of_the_residual_follower_pressure_included(loaded_cube: Any, pressure: float) -> None:
-    made, problem = loaded_cube
-    made.loading.set({"force": 3.0, "pressure": pressure})
-    start, direction = smooth(made.nodes, 0.1, 1).ravel(), smooth(made.nodes, 1.0, 2).ravel()
-    made.set_displacement(start)
-    residual, slope = assembled_vector(problem), assembled_tangent(problem) @ direction
-    remainders = []
-    for h in 0.02 * 0.5 ** np.arange(4):
-        made.set_displacement(start + h * direction)
-        remainders.append(float(np.linalg.norm(assembled_vector(problem) - residual - h * slope)))
-    assert remainders[0] > 1e-3 * np.linalg.norm(residual)  # far above rounding: the orders mean something
-    np.testing.assert_allclose(orders(remainders), 2.0, atol=0.1)
-
-
-def test_residual_and_tangent_are_the_slopes_of_the_energy(loaded_cube: Any) -> None:
-    """With a dead load there is a potential: stored energy minus force times mean displacement of the face."""
-    made, problem = loaded_cube
-    made.loading.set({"force": 3.0, "pressure": 0.0})
-    start, direction = smooth(made.nodes, 0.1, 1).ravel(), smooth(made.nodes, 1.0, 2).ravel()
-    external = dolfinx.fem.assemble_vector(problem.external_form).array
-
-    def potential(u: np.ndarray) -> float:
-        made.set_displacement(u)
-        return problem.stored_energy() + float(external @ u)
-
-    made.set_displacement(start)
-    first, second = assembled_vector(problem) @ direction, direction @ assembled_tangent(problem) @ direction
-    here = potential(start)
-    steps = 0.02 * 0.5 ** np.arange(4)
-    changes = np.array([potential(start + h * direction) - here for h in steps])
-    np.testing.assert_allclose(orders(np.abs(changes - steps * first).tolist()), 2.0, atol=0.1)
-    np.testing.assert_allclose(orders(np.abs(changes - steps * first - steps**2 / 2 * second).tolist()), 3.0, atol=0.1)
-
-
 @pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
 def test_pressure_tangent_is_symmetric_on_the_artery_and_not_with_free_ends(element: str) -> None:
     """The ends slide in planes: the edge terms vanish and the pressure has a potential."""

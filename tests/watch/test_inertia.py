@@ -15,8 +15,6 @@ from remodel_fenicsx import Scene, read_scene
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.fem.solver_methods import ProblemOptions
 from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
-from remodel_fenicsx.results.run_folder import History
-from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
@@ -185,15 +183,6 @@ def test_a_start_that_is_indefinite_is_told_apart(
     run(pushed_cube(-20.0, **COLUMN, **{"remodeling.law": "none", "solver.unstable": "stop"}))
     assert not warnings(caplog)
     assert sum("the equilibrium is not lost" in record.getMessage() for record in caplog.records) == 1
-
-
-def test_what_was_not_counted_is_an_empty_field(tmp_path: Path) -> None:
-    history = History(tmp_path / "history.csv")
-    history.append({"time": 1.0, "negative_eigenvalues": np.nan})
-    history.append({"time": 2.0, "negative_eigenvalues": 3})
-    history.close()
-    assert (tmp_path / "history.csv").read_text() == "time,negative_eigenvalues\n1.0,\n2.0,3\n"
-    np.testing.assert_array_equal(read_history(tmp_path)["negative_eigenvalues"], [np.nan, 3.0])
 
 
 # ---------------------------------------------------------------- refusals
