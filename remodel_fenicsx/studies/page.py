@@ -138,11 +138,15 @@ class Answer(ABC):
             page.save_figure(figure, made_with())
 
 
-def aligned(table: Mapping[str, ArrayLike], least: int, digits: int) -> list[str]:
-    """Columns of numbers under their names, each `least` wide or more."""
-    widths = [max(least, len(name)) for name in table]
-    rows = [list(table), *([f"{number:.{digits}g}" for number in row] for row in zip(*table.values(), strict=True))]
-    return [" ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+def aligned(table: Mapping[str, ArrayLike | Sequence[str]], least: int, digits: int) -> list[str]:
+    """Columns under their names, each `least` wide or more: numbers to the right, text to the left."""
+    columns = []
+    for name, values in table.items():
+        cells = [value if isinstance(value, str) else f"{value:.{digits}g}" for value in np.asarray(values).tolist()]
+        side = "<" if np.asarray(values).dtype.kind == "U" else ">"
+        width = max(least, *map(len, (name, *cells)))
+        columns.append([f"{cell:{side}{width}}" for cell in (name, *cells)])
+    return [" ".join(row).rstrip() for row in zip(*columns, strict=True)]
 
 
 def panels(number: int, height: float) -> tuple[Figure, list[Axes]]:
