@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import cycle
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,7 +38,7 @@ def grid(axes: Mapping[str, Sequence[Number]]) -> list[dict[str, Number]]:
     """All combinations, the last key fastest."""
     if (number := math.prod(map(len, axes.values()))) > MOST_RUNS:
         raise SceneError(f"sweep: {number} runs; allowed are at most {MOST_RUNS}")
-    return [dict(zip(axes, numbers, strict=True)) for numbers in itertools.product(*axes.values())]
+    return [dict(zip(axes, numbers, strict=True)) for numbers in product(*axes.values())]
 
 
 def latin_hypercube(ranges: Mapping[str, Sequence[Number]], samples: int, seed: int = 1) -> list[dict[str, Number]]:
@@ -47,14 +46,9 @@ def latin_hypercube(ranges: Mapping[str, Sequence[Number]], samples: int, seed: 
     random = np.random.default_rng(seed)
     shares = {key: (random.permutation(samples) + random.random(samples)) / samples for key in ranges}
     return [
-        {key: _rounded(low + (high - low) * shares[key][number]) for key, (low, high) in ranges.items()}
+        {key: float(f"{low + (high - low) * shares[key][number]:.6g}") for key, (low, high) in ranges.items()}
         for number in range(samples)
     ]
-
-
-def _rounded(number: float) -> float:
-    """Six digits, as somebody would write it: names of runs tell the numbers."""
-    return float(f"{number:.6g}")
 
 
 def read_axes(texts: Sequence[str], are_ranges: bool = False) -> dict[str, list[Number]]:
@@ -84,7 +78,8 @@ def _axis(text: str, is_range: bool) -> tuple[str, list[Number]]:
     if not fits or not re.fullmatch(r"[\w-]+(\.[\w-]+)+", key):
         raise SceneError(f"sweep {shown(text)}: {RANGE_RULE if is_range else RULE}")
     if has_ends and not is_range:
-        numbers = _spaced(numbers[0], numbers[1], int(numbers[2]))
+        spaced = np.linspace(numbers[0], numbers[1], int(numbers[2]))
+        numbers = [_number(f"{number:.6g}" if number % 1 else f"{number:.0f}") for number in spaced]
     if len(set(numbers)) < len(numbers):
         raise SceneError(f"sweep {shown(text)}: a number is there twice")
     return key, numbers
@@ -95,13 +90,6 @@ def _number(text: str) -> Number:
     if not math.isfinite(value := float(text)):
         raise ValueError(text)
     return int(text) if re.fullmatch(r"\s*[+-]?\d+\s*", text) else value
-
-
-def _spaced(low: Number, high: Number, count: int) -> list[Number]:
-    """Whole numbers where both ends and their distance are."""
-    if isinstance(low, int) and isinstance(high, int) and (high - low) % (count - 1) == 0:
-        return [low + (high - low) // (count - 1) * number for number in range(count)]
-    return [_rounded(float(number)) for number in np.linspace(low, high, count)]
 
 
 # ---------------------------------------------------------------- a sweep: the last rows over the numbers
@@ -176,31 +164,25 @@ class Sweep(Answer):
         return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items() if key != but)
 
     def figure(self) -> Figure:
-        """Columns over keys."""
+        """Columns over keys: a line for each combination of the other keys, points where these are many."""
         keys, columns = list(self.values)[:PANEL_KEYS], self.shown[:PANEL_COLUMNS]
         figure = Figure(figsize=(7.2, 2.2 * max(1, len(columns)) + 0.4), layout="constrained")
         grid = figure.subplots(max(1, len(columns)), len(keys), squeeze=False, sharey="row", sharex="col")
-        for row, name in zip(grid, columns, strict=False):
-            row[0].set(ylabel=label(self.scene, name))
-            for axes, key in zip(row, keys, strict=True):
-                self._draw(axes, name, key)
-        for top, bottom, key in zip(grid[0], grid[-1], keys, strict=True):
-            bottom.set(xlabel=key)
-            if top.get_legend_handles_labels()[0]:
-                top.legend(loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
+        for (row, name), (column, key) in product(enumerate(columns), enumerate(keys)):
+            axes, x, y = grid[row, column], self.values[key], self.ends[name]
+            groups: dict[str, list[int]] = {}
+            for run in np.argsort(x, kind="stable"):
+                groups.setdefault(self._at(run, but=key), []).append(run)
+            if len(groups) > MOST_LINES or len(groups) == len(x):
+                axes.plot(x, y, "o")
+            else:
+                for words, runs in groups.items():
+                    axes.plot(x[runs], y[runs], "o-", label=words or None)
+                if row == 0 and len(groups) > 1:
+                    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
+            axes.set(xlabel=key, ylabel=label(self.scene, name))
+            axes.label_outer()
         return figure
-
-    def _draw(self, axes: Any, name: str, key: str) -> None:
-        """A column over a key: a line for each combination of the other keys, points where these are many."""
-        x, y = self.values[key], self.ends[name]
-        groups: dict[str, list[int]] = {}
-        for run in np.argsort(x, kind="stable"):
-            groups.setdefault(self._at(run, but=key), []).append(run)
-        if len(groups) > MOST_LINES or len(groups) == len(x):
-            axes.plot(x, y, "o", color=COLOURS[0])
-            return
-        for (words, runs), colour in zip(groups.items(), cycle(COLOURS)):
-            axes.plot(x[runs], y[runs], "o-", color=colour, label=words or None)
 
 
 def sweep(
@@ -320,7 +302,7 @@ class Ensemble(Sweep):
     def lines(self) -> list[str]:
         """The columns that differ between seeds, at the end."""
         away, table = self.away(), self.table()
-        rows = {f"time {self.time[-1]:g}, {self.seeds} seeds": self.shown}
+        rows: dict[str, list[Any]] = {f"time {self.time[-1]:g}, {self.seeds} seeds": self.shown}
         for kind in ("mean", "deviation", "least", "most", ISOTROPIC):
             rows[kind] = [table[f"{name}_{kind}"][-1] if f"{name}_{kind}" in table else np.nan for name in self.shown]
         if self.seeds < KNOWN:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +22,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.studies.page import COLOURS, Answer
+from remodel_fenicsx.studies.page import COLOURS, Answer, aligned
 from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, Study, TooFewRuns
 from remodel_fenicsx.system.files import make_own_folder, write_whole
 
@@ -43,7 +42,7 @@ MESHES = (  # refinement and step in the scene's own, degree
     *((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25)),
 )
 SEEDS = 3  # of random cells
-COMPARED = 8  # times at which rows are compared, beside corners of ramps and the end
+COMPARED = 9  # times at which rows are compared, the last is the end
 KINEMATIC = "model.kinematics"
 
 
@@ -116,15 +115,6 @@ def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
             yield "", {KINEMATIC: name}
 
 
-def compared_times(scene: Scene, settings: Sequence[Setting]) -> list[float]:
-    """Times that every row has: corners of ramps, the end, and some between that are whole steps of all settings."""
-    fixed = [setting.scene.time for setting in settings if np.isfinite(setting.step)]
-    longest = max(time.step for time in fixed)
-    multiples = [longest * number for number in range(1, round(scene.time.end / longest))]
-    hit = [time for time in multiples if all(one.is_hit(time) for one in fixed)]
-    return sorted({*scene.stops(), *hit[:: -(-len(hit) // COMPARED) or 1]})
-
-
 def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
     """What the lengths of a body are called, and its columns of them: radii, or the stretch of what has none."""
     columns = scene.geometry.columns
@@ -134,10 +124,10 @@ def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
     return ("stretch", stretch) if stretch else ("volume", [c.name for c in columns if c.unit == "length^3"])
 
 
-def as_run(setting: Setting, seed: int, times: list[float]) -> Scene:
+def as_run(setting: Setting, seed: int = 1) -> Scene:
     """The scene of a run of the study: only what is compared is measured."""
     columns = [*compared_lengths(setting.scene)[1], "substeps", "seconds", "processor_seconds", *PROFILE]
-    values = {"output.fields": False, "output.columns": columns, "output.times": times, "output.every": 1}
+    values = {"output.fields": False, "output.columns": columns, "output.every": 1, "output.times": []}
     return setting.scene.with_values({**values, "cells.seed": seed, "name": f"{setting.name}-{seed}"})
 
 
@@ -148,7 +138,7 @@ FINER = 1.99  # how much finer steps and elements of the finest must be than tho
 
 @dataclass(frozen=True)
 class Result:
-    """What the runs of a setting give, (seeds, times, columns), and the seconds of one of them."""
+    """What the runs of a setting give, (seeds, columns, times), and the seconds of one of them."""
 
     setting: Setting
     angles: Array
@@ -165,7 +155,6 @@ class Row:
     seconds: float
     angle_error: float
     length_error: float
-    noise: float
     doubt: str
     on_front: bool = False
 
@@ -195,7 +184,7 @@ def compared(results: Sequence[Result]) -> list[Row]:
 def _row(result: Result, finest: Result) -> Row:
     setting, seeds = result.setting, len(result.angles)
     if result is finest:
-        return Row(setting, result.seconds, np.nan, np.nan, 0.0, "the others are compared with it")
+        return Row(setting, result.seconds, np.nan, np.nan, "the others are compared with it")
     apart = result.angles - finest.angles  # seed by seed: steps are compared on the same cells
     noise = typical(np.std(apart, axis=0, ddof=1)) / seeds**0.5 if seeds > 1 else 0.0
     error, ratio = typical(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
@@ -205,7 +194,7 @@ def _row(result: Result, finest: Result) -> Row:
     doubt = f"the finest has no finer {' and '.join(shared)}" if shared else ""
     if NOISY * noise > error:
         doubt = f"noise of random cells {noise:.2g}"
-    return Row(setting, result.seconds, error, float(np.nanmax(np.abs(ratio - 1))), noise, doubt)
+    return Row(setting, result.seconds, error, float(np.nanmax(np.abs(ratio - 1))), doubt)
 
 
 # ---------------------------------------------------------------- the runs
@@ -217,31 +206,32 @@ def trade(
     quiet: bool = True,
 ) -> tuple[Path, Trade]:
     """Run a scene with a ladder of settings, within a budget of seconds, and compare each with the finest."""
-    study = _TradeStudy(scene, folder, ladder(scene), budget, jobs, quiet)
+    study = _TradeStudy(scene, folder, budget, jobs, quiet)
     return study.answered(study.answer)
+
+
+@dataclass(frozen=True)
+class _SettingRun(Run):
+    setting: Setting
 
 
 class _TradeStudy(Study):
     """Runs in the order of their cost, within a budget."""
 
-    def __init__(self, scene: Scene, folder: Path | str | None, settings: list[Setting], budget: float, *how: Any):
-        self.settings, self.budget = settings, budget
-        self.times = compared_times(scene, settings)
-        self._setting_of = {f"{setting.name}-{seed}": setting for setting in settings for seed in setting.seeds}
-        scenes = {
-            f"{setting.name}-{seed}": as_run(setting, seed, self.times)
-            for setting in settings
-            for seed in setting.seeds
-        }
-        super().__init__("trade", scene, folder, scenes, *how)
-        self.deadline = clock.monotonic() + budget
-        self._results: dict[str, Result] = {}
+    def __init__(self, scene: Scene, folder: Path | str | None, budget: float, *how: Any):
+        super().__init__("trade", scene, folder, {}, *how)
+        self.settings, self.budget, self.deadline = ladder(scene), budget, clock.monotonic() + budget
+        for setting in self.settings:
+            for seed in setting.seeds:
+                run = as_run(setting, seed)
+                self.runs.append(_SettingRun(run.name, run, self.folder / run.name, setting))
+        self._results: dict[Setting, Result] = {}
 
     @property
     def left(self) -> list[Setting]:
         """Settings that have neither ended nor failed."""
-        failed = {self._setting_of[name].name for name in self.failed}
-        return [one for one in self.settings if one.name not in failed and one.name not in self._results]
+        failed = {run.setting for run in self.runs if run.name in self.failed}
+        return [one for one in self.settings if one not in failed and one not in self._results]
 
     def answer(self) -> Trade:
         """The table of what was run."""
@@ -255,13 +245,17 @@ class _TradeStudy(Study):
 
     def fits(self, run: Run) -> bool:
         """Whether a run that begins now would end in time, by what others have taken."""
-        return clock.monotonic() + self._seconds(self._setting_of[run.name]) < self.deadline
+        assert isinstance(run, _SettingRun)
+        return clock.monotonic() + self._seconds(run.setting) < self.deadline
 
     def _seconds(self, setting: Setting) -> float:
         """Seconds of a run, in proportion to those that have ended, of which the dearest count most."""
         took = sum(result.wall_seconds for result in self._results.values())
-        expected = sum(result.setting.expected_seconds for result in self._results.values())
+        expected = sum(setting.expected_seconds for setting in self._results)
         return START_SECONDS + setting.expected_seconds * (took / expected if expected else 1.0)
+
+    def _progress(self) -> str:
+        return super()._progress() + self._needed()
 
     def _needed(self) -> str:
         """What the settings that are left take, once one has ended; nothing where the budget has it."""
@@ -270,29 +264,26 @@ class _TradeStudy(Study):
             return ""
         return f"; all settings take about {seconds / 60:.2g} min more (--budget)"
 
-    def _progress(self) -> str:
-        return super()._progress() + self._needed()
-
     def learn(self) -> None:
         """Read what is new."""
-        for setting in (one for one in self.settings if one.name not in self._results):
-            runs = [run for run in self.runs if self._setting_of[run.name] is setting]
+        for setting in self.left:
+            runs = [run for run in self.runs if run.setting is setting]
             with suppress(RecordingError):  # one that is damaged will be among those that have failed
                 if all(run.is_complete() for run in runs):
-                    self._results[setting.name] = read(setting, runs, self.times)
+                    self._results[setting] = read(setting, [run.history() for run in runs])
 
 
-def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Result:
-    """The rows at some times of the runs of a setting."""
-    angles, lengths, seconds, wall = [], [], [], []
-    for run in runs:
-        history = run.history()
-        rows = [next(r for r, time in enumerate(history["time"]) if same_time(float(time), t)) for t in times]
-        angles.append(np.array([history[name] for name in PROFILE]).T[rows])
-        lengths.append(np.array([history[name] for name in compared_lengths(setting.scene)[1]]).T[rows])
-        seconds.append(float(np.nansum(history["processor_seconds"])))
-        wall.append(float(np.nansum(history["seconds"])))
-    return Result(setting, np.array(angles), np.array(lengths), float(np.mean(seconds)), float(np.mean(wall)))
+def read(setting: Setting, histories: Sequence[Mapping[str, Array]]) -> Result:
+    """What is compared of the runs of a setting, between rows on the straight line."""
+    times = np.linspace(0.0, setting.scene.last_time, COMPARED + 1)[1:]
+
+    def columns(names: Sequence[str]) -> Array:
+        return np.array([[np.interp(times, each["time"], each[name]) for name in names] for each in histories])
+
+    seconds, wall = (
+        float(np.mean([np.nansum(each[name]) for each in histories])) for name in ("processor_seconds", "seconds")
+    )
+    return Result(setting, columns(PROFILE), columns(compared_lengths(setting.scene)[1]), seconds, wall)
 
 
 # ---------------------------------------------------------------- the answer: words, a table, a picture, scenes
@@ -329,18 +320,20 @@ class Trade(Answer):
             "on_front": [int(row.on_front) for row in rows],
             "trusted": [int(not row.doubt) for row in rows],
             "doubt": [row.doubt for row in rows],
-            "noise": [row.noise for row in rows],
         }
 
     def lines(self) -> list[str]:
         """A row for each setting."""
-        lines = [f"{'':2}{'seconds':>9} {'degrees':>9} {compared_lengths(self.scene)[0] + ' %':>9}  setting"]
-        for row in self.rows:
-            numbers = f"{row.seconds:9.2g} {row.angle_error:9.2g} {100 * row.length_error:9.2g}"
-            doubt = f"  ({row.doubt})" if row.doubt else ""
-            lines.append(f"{'* ' if row.on_front else '  '}{numbers}  {row.setting.name}{doubt}")
+        rows, lengths = self.rows, f"{compared_lengths(self.scene)[0]} %"
+        numbers = {
+            "seconds": [row.seconds for row in rows],
+            "degrees": [row.angle_error for row in rows],
+            lengths: [100 * row.length_error for row in rows],
+        }
+        names = [row.setting.name + (f"  ({row.doubt})" if row.doubt else "") for row in rows]
         about = "*: no other setting is as good for less. Errors are differences from the finest setting; degrees: "
-        return [*lines, f"{about}fibre angle, root mean square."]
+        stars = ["*" if row.on_front else "" for row in rows]
+        return [*aligned({"": stars, **numbers, "setting": names}, 1, 2), f"{about}fibre angle, root mean square."]
 
     def verdict(self) -> str:
         """What `WANTED` degrees cost."""
@@ -364,28 +357,20 @@ class Trade(Answer):
 
     def figure(self) -> Figure:
         """Cost against error; beside the axes stands what the front is, from left to right."""
-        shown = [row for row in self.rows if row.angle_error > 0]
-        front = [row for row in shown if row.on_front]
-        kinds: dict[str, list[Row]] = {}
-        for row in shown:
-            kinds.setdefault(row.setting.scene.model.kinematics, []).append(row)
+        places = [(row.seconds, row.angle_error, row) for row in self.rows if row.angle_error > 0]
+        front = [place for place in places if place[2].on_front]
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         axes = figure.subplots()
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
-        axes.plot(*_places(front), color="0.6", zorder=0, lw=0.8)
-        for (kinematics, rows), colour in zip(kinds.items(), COLOURS, strict=False):
-            axes.plot(*_places(rows), "o", color=colour, markerfacecolor="white", markersize=4, label=kinematics)
-            axes.plot(*_places([row for row in rows if row.on_front]), "o", color=colour, markersize=5)
-        if kinds:
-            figure.legend(loc="outside lower left", ncols=3)
+        for shown, line, face in ((places, "o", "white"), (front, "o-", COLOURS[0])):
+            if shown:
+                axes.plot(*zip(*((x, y) for x, y, _ in shown), strict=True), line, color=COLOURS[0], mfc=face, lw=0.8)
+        if front:
             place: dict[str, Any] = {"loc": "outside right center", "handlelength": 0, "fontsize": 6.5}
             place |= {"title": "filled, from left to right: no\nother one is as good for less", "title_fontsize": 7.5}
-            figure.legend([Line2D([], [], linestyle="")] * len(front), [row.setting.name for row in front], **place)
+            names = [row.setting.name for *_, row in front]
+            figure.legend([Line2D([], [], linestyle="")] * len(front), names, **place)
         return figure
-
-
-def _places(rows: list[Row]) -> tuple[list[float], list[float]]:
-    return [row.seconds for row in rows], [row.angle_error for row in rows]

@@ -17,8 +17,8 @@ from PIL import Image
 
 import remodel_fenicsx
 from docs.making import verification
+from docs.making.pages import read_table
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
-from remodel_fenicsx.studies import page
 from tests.conftest import Refused
 from tests.forks import forked
 
@@ -89,7 +89,7 @@ def test_every_figure_of_the_paper_is_there_and_every_run_is_drawn() -> None:
 def test_an_older_table_is_read(tmp_path: Path) -> None:
     """It begins with what was said of it."""
     (tmp_path / "fig1.csv").write_text("# remodel_fenicsx figures 0.3.0: fig1\n# no simulation\nextension\n0.5\n")
-    assert page.read_table(tmp_path / "fig1.csv")["extension"].tolist() == [0.5]
+    assert read_table(tmp_path / "fig1.csv")["extension"].tolist() == [0.5]
 
 
 # ---------------------------------------------------------------- which recorded runs are valid
@@ -140,14 +140,14 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", ["fig1", "fig5"])
 def test_the_numbers_are_those_of_the_page(drawn: Path, name: str) -> None:
-    found, kept = (page.read_table(folder / f"{name}.csv") for folder in (drawn, DOCS / "figures"))
+    found, kept = (read_table(folder / f"{name}.csv") for folder in (drawn, DOCS / "figures"))
     assert list(found) == list(kept)
     for column, values in kept.items():
         np.testing.assert_allclose(found[column], values, rtol=1e-6, atol=1e-6)
 
 
 def test_fig1_is_eq_2(drawn: Path) -> None:
-    table = page.read_table(drawn / "fig1.csv")
+    table = read_table(drawn / "fig1.csv")
     x = table["extension"]
     assert len(x) > 100 and x[0] == 0 and 0.9 < x[-1] < 1
     for A in (0.1, 0.4, 0.8):
@@ -175,7 +175,7 @@ def test_all_numbers_are_those_of_the_page(tmp_path: Path, monkeypatch: pytest.M
     tables = [path for name in figures.FIGURES for path in (DOCS / "figures").glob(f"{name}[.-]*csv")]
     assert len(tables) == 14
     for path in tables:
-        found, kept = (page.read_table(folder / path.name) for folder in (tmp_path, DOCS / "figures"))
+        found, kept = (read_table(folder / path.name) for folder in (tmp_path, DOCS / "figures"))
         assert list(found) == list(kept)
         for column, values in kept.items():
             if values.dtype.kind == "f":
