@@ -640,11 +640,6 @@ class LikelihoodProfile:
     lower: float
     upper: float
 
-    def in_words(self) -> str:
-        """Its ends."""
-        ends = ["beyond what was tried" if np.isnan(end) else f"{end:.5g}" for end in (self.lower, self.upper)]
-        return " to ".join(ends)
-
 
 def minimised(
     problem: Problem,
@@ -807,7 +802,9 @@ class Fit(Answer):
         said = [(f"  at the bound: {ends}" if ends else "") + limit for ends in self.open]
         table = {"": self.keys, "fitted": self.values, "95 % from": lower, "to": upper, "start": self.starts, " ": said}
         lines = aligned(table, 12, 5)
-        return lines + [f"profile of {key}: 95 % from {one.in_words()}" for key, one in self.profiles.items()]
+        return lines + [
+            f"profile of {key}: 95 % from {p.lower:.5g} to {p.upper:.5g}" for key, p in self.profiles.items()
+        ]
 
     def verdict(self) -> str:
         """How far the model is off, how many starts agree, and which unknowns go together."""
@@ -821,9 +818,7 @@ class Fit(Answer):
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:
             text += f" Correlated above {CORRELATED:g}, so that profiles count, not bands: {', '.join(together)}."
-        away = np.abs(self.problem.bounds - self.logarithms[:, None]).min(axis=1)
-        edges = [key for key, distance in zip(keys, away, strict=True) if distance < 1e-3]
-        return text + (f" At the edge of what is allowed: {', '.join(edges)}." if edges else "")
+        return text
 
     def write(self, folder: Path) -> None:
         """Write tables and picture."""

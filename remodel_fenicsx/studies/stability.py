@@ -22,7 +22,7 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.newton import SolveFailure
-from remodel_fenicsx.studies.page import COLOURS, Answer, aligned
+from remodel_fenicsx.studies.page import COLOURS, Answer
 
 log = logging.getLogger(__name__)
 
@@ -87,12 +87,6 @@ class FactorWatcher(Watcher):
             log.warning("time %g: the factor of the pass is not known: %s", step.time, failure.reason)
             self.factors[step.time] = np.nan
 
-    def committed(self, step: Step) -> None:
-        """Log it."""
-        if step.time in self.factors:
-            factor = self.factors[step.time]
-            log.info("time %g: a pass multiplies a small change of the cells by %.3g", step.time, factor)
-
     def undone(self, step: Step) -> None:
         """Forget it."""
         self.factors.pop(step.time, None)
@@ -154,10 +148,6 @@ class Analysis(Answer):
     def table(self) -> dict[str, list[float]]:
         """A row for each time."""
         return {"time": [*self.factors], "factor": [*self.factors.values()]}
-
-    def lines(self) -> list[str]:
-        """A row for each time."""
-        return aligned(self.table(), 8, 5)
 
     def verdict(self) -> str:
         """Whether passes make small changes smaller; and what a reduction does not see."""

@@ -301,13 +301,10 @@ class Ensemble(Sweep):
 
     def lines(self) -> list[str]:
         """The columns that differ between seeds, at the end."""
-        away, table = self.away(), self.table()
-        rows: dict[str, list[Any]] = {f"time {self.time[-1]:g}, {self.seeds} seeds": self.shown}
+        table, rows = self.table(), dict[str, Any]()
+        rows[f"time {self.time[-1]:g}, {self.seeds} seeds"] = self.shown
         for kind in ("mean", "deviation", "least", "most", ISOTROPIC):
             rows[kind] = [table[f"{name}_{kind}"][-1] if f"{name}_{kind}" in table else np.nan for name in self.shown]
-        if self.seeds < KNOWN:
-            rows["deviation"] = ["not known"] * len(self.shown)
-        rows[""] = [f"{away[name]:+.1f} deviations" if name in away else "not compared" for name in self.shown]
         return aligned(rows, 11, 5)
 
     def verdict(self) -> str:

@@ -110,8 +110,9 @@ def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
     for tolerance in TOLERANCES if remodels else ():
         yield "", {"time.tolerance": tolerance}
         yield "", {"time.tolerance": tolerance, "mesh.refinement": 2 * base.mesh.refinement, "mesh.degree": 2}
-    for name in (choice(scene).name, "sector", "full"):
-        if name == choice(scene).name or not (objections(scene, name) or is_for_means(scene, name)):
+    yield "", {KINEMATIC: choice(scene).name}
+    for name in ("sector", "full"):
+        if not (objections(scene, name) or is_for_means(scene, name)):
             yield "", {KINEMATIC: name}
 
 
