@@ -544,6 +544,16 @@ class Part(Run):
         return pickle.loads(self.beside(".pickle").read_bytes())
 
 
+class _FitStudy(Study):
+    def learn(self) -> None:
+        """End it with the first part that fails."""
+        for name, words in self.failed.items():
+            raise LostProcess(
+                f"{name}: {words}; where memory is short, --jobs 1 takes less; all that is recorded is kept, the same "
+                "command goes on"
+            )
+
+
 def do_part(file: Path) -> None:
     """Do a part of a fit, in a process of a study: the task in the file gives way to its answer."""
     problem, task = pickle.loads(file.read_bytes())
@@ -573,18 +583,13 @@ def fit(
         stack.enter_context(RunLock(place))
         stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
         parts = stack.enter_context(TemporaryDirectory())
-        study = stack.enter_context(closing(Study("fit", scene, parts, {}, jobs, quiet)))
+        study = stack.enter_context(closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)))
         problem.begin(place, mark)
 
         def on_cores(tasks: Mapping[str, Task]) -> list[Any]:
             found = [Part(name, scene, Path(parts, name), (problem, task)) for name, task in tasks.items()]
             study.runs = [*found]
             study.do()
-            for name, words in study.failed.items():
-                raise LostProcess(
-                    f"{name}: {words}; where memory is short, --jobs 1 takes less; all that is recorded is kept, the "
-                    "same command goes on"
-                )
             problem.known |= read_journal(place)[1]
             return [part.answer for part in found]
 

@@ -121,12 +121,6 @@ class Sweep(Answer):
         return {key: np.array([point[key] for point in points], dtype=np.float64) for key in points[0]}
 
     @cached_property
-    def columns(self) -> dict[str, Array]:
-        """Columns of the histories of all runs that have one, (runs, rows), without those of the solver."""
-        made = [self.histories[run] for run in self.points if run in self.histories]
-        return {name: np.array([history[name] for history in made]) for name in made[0] if name not in OF_THE_SOLVER}
-
-    @cached_property
     def ends(self) -> dict[str, Array]:
         """Last rows of the runs by column; NaN where a run has failed."""
         names = next(iter(self.histories.values()))
@@ -273,14 +267,14 @@ class Ensemble(Sweep):
 
     def statistics(self, name: str) -> dict[str, Array]:
         """Of a column over the seeds, at each time."""
-        values = self.columns[name]
-        spread = {"least": values.min(axis=0), "most": values.max(axis=0)}
-        return {"mean": values.mean(axis=0), "deviation": values.std(axis=0, ddof=1)} | spread
+        values = np.array([self.histories[run][name] for run in self.points if run in self.histories])
+        mean, deviation = values.mean(axis=0), values.std(axis=0, ddof=1)
+        return {"mean": mean, "deviation": deviation, "least": values.min(axis=0), "most": values.max(axis=0)}
 
     def table(self) -> dict[str, Array]:
         """Of each column mean, standard deviation, least, most, and isotropic cells."""
         found = {"time": self.time}
-        for name in self.columns:
+        for name in (name for name in next(iter(self.histories.values())) if name not in OF_THE_SOLVER):
             found |= {f"{name}_{kind}": values for kind, values in self.statistics(name).items()}
             if name in self.isotropic:
                 found[f"{name}_isotropic"] = self.isotropic[name]

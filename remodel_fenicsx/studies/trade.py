@@ -88,9 +88,9 @@ def ladder(scene: Scene) -> list[Setting]:
         except SceneError as error:  # a step of which a corner is no multiple, an element that a formulation has not
             log.debug("left out: %s", error)
             continue
-        name = f"{changed.model.kinematics}-{changed.mesh.refinement}-degree-{changed.mesh.degree}-"
         time = changed.time
-        name += f"step-{time.step:g}" if time.tolerance is None else f"tolerance-{time.tolerance:g}"
+        steps = f"step-{time.step:g}" if time.tolerance is None else f"tolerance-{time.tolerance:g}"
+        name = f"{changed.model.kinematics}-{changed.mesh.refinement}-degree-{changed.mesh.degree}-{steps}"
         found.setdefault(name, Setting(f"profile-{profile}" if profile else name, changed, seeds))
     return sorted(found.values(), key=lambda setting: setting.expected_seconds)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import signal
-import subprocess
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import sweep as study
-from remodel_fenicsx.studies.page import Answer
 from remodel_fenicsx.studies.study import Run, Study, TooFewRuns
 from remodel_fenicsx.system.interrupts import Paused
-from tests import forks
 from tests.conftest import Refused, forked_children
 from tests.parts import pulled_cube
 
@@ -49,8 +46,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, study.Ensemble
         return study.ensemble(scene(), folder, seeds=3)
 
 
-def test_one_that_fails_loses_only_itself(made: tuple[Path, study.Ensemble]) -> None:
+def test_one_that_fails_loses_only_itself(
+    made: tuple[Path, study.Ensemble], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The others are evaluated; the command names it, and its exit code is 3."""
     folder, found = made
+    (tmp_path / "scene.toml").write_text(scene().to_toml())
+    with forked_children():
+        assert cli.main(["ensemble", str(tmp_path / "scene.toml"), "-o", str(folder), "--seeds", "3", "-q"]) == 3
+    written = capsys.readouterr()
+    assert "time 5, 2 seeds" in written.out and "seed-2 has failed: " in written.err
     assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"]
     assert (folder / "seed-2").read_text() == "a file of the user's\n"
     assert found.seeds == 2 and found.time.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
@@ -84,33 +89,6 @@ def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> No
     np.testing.assert_array_equal(again.columns["mean_stretch"], found.columns["mean_stretch"])
     with pytest.raises(SceneError, match="holds a run of another scene"):
         study.ensemble(scene(solver={"maximum_halvings": 3}), folder, seeds=3)
-
-
-@pytest.mark.parametrize(
-    ("code", "said"), [(3, "no equilibrium"), (4, "SIGUSR1: all is kept"), (-9, "it said nothing")]
-)
-def test_the_command_says_whose_run_has_failed_or_was_stopped(
-    code: int,
-    said: str,
-    tmp_path: Path,
-    made: tuple[Path, study.Ensemble],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """The others are evaluated; the exit code is 3."""
-
-    def ended(program: str, *words: str) -> subprocess.CompletedProcess[str]:
-        assert program == "remodel-fenicsx" and "seed-2" in " ".join(words)
-        return subprocess.CompletedProcess(words, code, "", f"remodel-fenicsx: {said}\n")
-
-    monkeypatch.setattr(forks, "forked", ended)
-    monkeypatch.setattr(Answer, "write", lambda *of: None)
-    path = tmp_path / "scene.toml"
-    path.write_text(scene().to_toml())
-    with forked_children():
-        assert cli.main(["ensemble", str(path), "-o", str(made[0]), "--seeds", "3", "-q"]) == 3
-    written = capsys.readouterr()
-    assert "time 5, 2 seeds" in written.out and f"seed-2 has failed: {said}" in written.err
 
 
 def test_two_seeds_are_needed(tmp_path: Path) -> None:
