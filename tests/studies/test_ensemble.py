@@ -49,46 +49,35 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, study.Ensemble
 def test_one_that_fails_loses_only_itself(
     made: tuple[Path, study.Ensemble], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The others are evaluated; the command names it, and its exit code is 3."""
+    """The others are evaluated, and not run again; the command names it, and its exit code is 3."""
     folder, found = made
+    assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"] and found.seeds == 2
+    assert status(folder) == [f"{folder}: 3 runs: 3 finished"]  # the fourth has not begun
     (tmp_path / "scene.toml").write_text(scene().to_toml())
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")}
     with forked_children():
         assert cli.main(["ensemble", str(tmp_path / "scene.toml"), "-o", str(folder), "--seeds", "3", "-q"]) == 3
     written = capsys.readouterr()
     assert "time 5, 2 seeds" in written.out and "seed-2 has failed: " in written.err
-    assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"]
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")} == before
     assert (folder / "seed-2").read_text() == "a file of the user's\n"
-    assert found.seeds == 2 and found.time.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    said = status(folder)
-    assert said == [f"{folder}: 3 runs: 3 finished"]  # the fourth has not begun
+    with pytest.raises(SceneError, match="holds a run of another scene"):
+        study.ensemble(scene(solver={"maximum_halvings": 3}), folder, seeds=3)
 
 
 def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> None:
     folder, _ = made
-    runs = [Recording(folder / f"seed-{seed}") for seed in (1, 3)]
-    assert [run.scene.cells.seed for run in runs] == [1, 3]
+    runs = [Recording(folder / name) for name in ("seed-1", "seed-3", "isotropic")]
+    assert [run.scene.cells.seed for run in runs[:2]] == [1, 3] and runs[2].scene.cells.initial == "isotropic"
     rows = list(csv.DictReader((folder / "ensemble.csv").read_text().splitlines()))
-    for row, when in enumerate(runs[0].history["time"]):
-        one, two = (run.history["mean_stretch"][row] for run in runs)
-        assert float(rows[row]["time"]) == when
-        assert float(rows[row]["mean_stretch_mean"]) == pytest.approx((one + two) / 2, rel=1e-6)
-        assert float(rows[row]["mean_stretch_deviation"]) == pytest.approx(abs(one - two) / 2**0.5, rel=1e-4, abs=1e-6)
-        assert float(rows[row]["mean_stretch_most"]) == pytest.approx(max(one, two), rel=1e-6)
-    isotropic = Recording(folder / "isotropic")
-    assert isotropic.scene.cells.initial == "isotropic"
-    assert float(rows[-1]["mean_stretch_isotropic"]) == pytest.approx(isotropic.history["mean_stretch"][-1], rel=1e-6)
+    found = [
+        [float(row[f"mean_stretch_{kind}"]) for row in rows] for kind in ("mean", "deviation", "most", "isotropic")
+    ]
+    one, two, isotropic = (run.history["mean_stretch"] for run in runs)
+    expected = [(one + two) / 2, np.abs(one - two) / 2**0.5, np.maximum(one, two), isotropic]
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+    assert [float(row["time"]) for row in rows] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert (folder / "ensemble.png").stat().st_size > 10_000
-
-
-def test_what_is_there_is_not_run_again(made: tuple[Path, study.Ensemble]) -> None:
-    folder, found = made
-    before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")}
-    with forked_children():
-        _, again = study.ensemble(scene(), folder, seeds=3)
-    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")} == before
-    np.testing.assert_array_equal(again.columns["mean_stretch"], found.columns["mean_stretch"])
-    with pytest.raises(SceneError, match="holds a run of another scene"):
-        study.ensemble(scene(solver={"maximum_halvings": 3}), folder, seeds=3)
 
 
 def test_two_seeds_are_needed(tmp_path: Path) -> None:
