@@ -170,15 +170,15 @@ def label(scene: Scene, name: str, unit: str = "") -> str:
     return words(name) + (f", {unit}" if unit else "")
 
 
-LETTER, LINE = 0.0585, 0.155  # inches: mean letter and line of a head
+HEAD_LETTER, HEAD_LINE = 0.0585, 0.155  # inches: mean letter and line of a head
 TICK_LABEL = 0.14  # half of one at the end of an axis: which labels there are is settled after the layout
 
 
 def add_head(figure: Figure, title: str, verdict: str) -> None:
     """Write title and verdict over a figure of constrained layout, which becomes that much taller."""
     wide, tall = figure.get_size_inches()
-    lines = [title, *textwrap.wrap(verdict, int((wide - 0.16) / LETTER))]
-    figure.set_size_inches(wide, tall + LINE * len(lines))
+    lines = [title, *textwrap.wrap(verdict, int((wide - 0.16) / HEAD_LETTER))]
+    figure.set_size_inches(wide, tall + HEAD_LINE * len(lines))
     engine: Any = figure.get_layout_engine()
     engine.set(w_pad=TICK_LABEL)
     figure.suptitle("\n".join(lines), x=0.08 / wide, ha="left", fontsize=8, parse_math=False)
