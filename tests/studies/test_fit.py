@@ -190,7 +190,7 @@ def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path) -> None:
         assert ("limited by the model, not the noise" in one.in_words()) is (name != "noise")
     np.testing.assert_allclose(found["a"].band, found["b"].band, rtol=1e-3)
     assert found["a"].open == [""] and found["a"].band[0] < found["a"].logarithms < found["a"].band[1]
-    assert found["bound"].open == ["upper"] and found["bound"].values == [12.0]
+    assert found["bound"].open == ["upper"] and found["bound"].values == pytest.approx([12.0])
 
 
 def test_what_changes_nothing_is_named(folder: Path) -> None:
