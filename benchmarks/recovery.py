@@ -122,7 +122,7 @@ def main() -> None:
     for _ in range(options.starts):
         factors = np.exp(random.uniform(-np.log(FACTOR), np.log(FACTOR), len(TRUTH)))
         ends.append(fitted(scene, data, factors))
-        print(f"  start: {_line(*ends[-1])}", flush=True)
+        print(f"  start: {_line(*ends[-1])}")
     least = min(end.minima[0] for end, _ in ends)
     same = sum(end.minima[0] - least < 1e-2 * max(least, 1.0) for end, _ in ends)
     inside: Any = np.zeros(len(TRUTH), dtype=int)
@@ -130,7 +130,7 @@ def main() -> None:
         ends.append(fitted(scene, noisy(clean, random), np.ones(len(TRUTH))))
         found = ends[-1][0]
         inside += (found.band[0] <= np.log(truth)) & (np.log(truth) <= found.band[1])
-        print(f"  draw: {_line(*ends[-1])}", flush=True)
+        print(f"  draw: {_line(*ends[-1])}")
     last = ends[0][0]
     print(f"{same} of {options.starts} starts end in one minimum")
     for key, covered, low, high in zip(TRUTH, inside, *np.exp(last.band), strict=True):

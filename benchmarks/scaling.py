@@ -105,12 +105,6 @@ def row(record: dict) -> list[str]:
     return [f"{size:,}", f"{record['ranks']}", record["method"], *(f"{number:.3g}" for number in (*numbers, *memory))]
 
 
-def report() -> None:
-    """The table of all that was measured."""
-    records = sorted(read(), key=lambda r: (r["unknowns"], r["ranks"], r["method"]))
-    print(markdown(HEAD, map(row, records)))
-
-
 def main() -> None:
     """Measure, or report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -125,7 +119,7 @@ def main() -> None:
         measure(options.case, options.steps, options.method)
         return
     if options.report:
-        report()
+        print(markdown(HEAD, map(row, sorted(read(), key=lambda r: (r["unknowns"], r["ranks"], r["method"])))))
         return
     print(markdown(HEAD, []))
     for unknowns in options.unknowns or SIZES:

@@ -64,7 +64,8 @@ def test_the_command_writes_table_and_picture(
 @pytest.mark.parametrize(("factors", "words"), [
     ([-0.5, 0.2, 1.0], "Stable: at all 3 times a pass makes small changes of the cells smaller, or keeps them."),
     ([-0.5, -1.5, -3.0], "Unstable: at 2 of 3 times a pass makes small changes of the cells larger, first at 2; the "
-     "worst by a factor of -3, at time 3. The coupling 'relaxed' with a relaxation_factor below 0.5 damps what swings."),
+     "worst by a factor of -3, at time 3. The coupling 'relaxed' with a relaxation_factor below 0.5 damps what "
+     "swings."),
     ([-0.5, 1.2], "Unstable: at 1 of 2 times a pass makes small changes of the cells larger, first at 2; the "
      "worst by a factor of 1.2, at time 2."),
     ([-0.5, np.nan], "Not known: at 1 of 2 times no factor was found; stable at all others."),
