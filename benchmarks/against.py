@@ -68,11 +68,6 @@ def farthest(one: dict[float, dict[str, float]], other: dict[float, dict[str, fl
     return found
 
 
-def iterations(rows: dict[float, dict[str, float]]) -> int:
-    """Newton iterations of a run."""
-    return int(sum(row.get("newton_iterations", 0) for row in rows.values()))
-
-
 def main() -> None:
     """Warm up, measure in turns, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -106,7 +101,7 @@ def main() -> None:
         print(
             f"{name:6} {statistics.median(seconds[name]):8.2f} s "
             f"({min(seconds[name]):.2f} to {max(seconds[name]):.2f}), "
-            f"start {statistics.median(starts[name]):.2f} s, {iterations(rows[name])} Newton iterations"
+            f"start {statistics.median(starts[name]):.2f} s"
         )
     print(f"ratio  {statistics.median(ratios):8.3f}   ({min(ratios):.3f} to {max(ratios):.3f})")
     for name, difference in sorted(farthest(rows["there"], rows["here"]).items(), key=lambda pair: -pair[1]):

@@ -1,13 +1,12 @@
 #!/usr/bin/env python3
-"""Which law and coupling gives most for its processor time: error against time, and cost on the paper's artery.
+"""Which law and coupling gives most for its processor time: error against time.
 
-    ./with-fenicsx benchmarks/couplings.py [--steps N]  # 15 minutes on an idle core
+    ./with-fenicsx benchmarks/couplings.py              # minutes on an idle core
     ./with-fenicsx benchmarks/couplings.py --page       # only the page, from what has been measured
 
-Tables and picture of docs/laws_and_couplings.md.
+Table and picture of docs/laws_and_couplings.md.
 
 Error: one layer of the artery's elements along z to t = 40, with steps from 5 to 5/8; each law against its own limit.
-Cost: the whole artery, N steps (40) of all schemes in turn, so that a noisy machine is noisy for all of them.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from docs.making.pages import DOCS, FIGURES, between_marks, by_column, markdown
-from remodel_fenicsx import Simulation, read_scene
+from docs.making.pages import DOCS, FIGURES, between_marks, by_column, markdown, panel_letters, read_table
+from remodel_fenicsx import read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page, panel_letters, read_table
+from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
 from tests.runs import made
 
 PAGE = DOCS / "laws_and_couplings.md"
@@ -63,16 +62,17 @@ Columns = dict[str, np.ndarray]
 
 
 # ---------------------------------------------------------------- error
-def layer(scheme: Scheme, cells: str, step: float, coupling: str) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """A and u at the end, processor time of the steps, Newton iterations."""
+def layer(scheme: Scheme, cells: str, step: float, coupling: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """A and u at the end, and processor time of the steps."""
     changes = {"geometry.length": 0.5, "cells.initial": cells, "output.fields": False, "remodeling.coupling": coupling}
     scene = read_scene(ARTERY, ["time.end=40.0", f"time.step={step}"]).with_values(scheme.values | changes)
     domain = whole_tube(TUBE, (12, 8, 1), "hexahedron", 1, MPI.COMM_SELF)
     with made(scene, domain) as simulation:
         start = clock.process_time()
-        iterations = sum(step.work.newton_iterations for step in simulation.steps())
+        for _ in simulation.steps():
+            pass
         spent = clock.process_time() - start
-        return simulation.cells.structure_tensor(), simulation.unknown.x.array.copy(), spent, iterations
+        return simulation.cells.structure_tensor(), simulation.unknown.x.array.copy(), spent
 
 
 def errors() -> Iterator[dict[str, Any]]:
@@ -90,40 +90,13 @@ def errors() -> Iterator[dict[str, Any]]:
                 share = 0.0 if printed_random else 1 / (2**order - 1)  # of a law without a limit the finest steps
                 limits[key] = fine[0] + share * (fine[0] - coarse[0]), fine[1] + share * (fine[1] - coarse[1])
             for step in STEPS:
-                tensor, unknown, spent, iterations = layer(scheme, cells, step, scheme.coupling)
+                tensor, unknown, spent = layer(scheme, cells, step, scheme.coupling)
                 apart = np.linalg.norm(tensor - limits[key][0], axis=(-1, -2))
                 moved = np.linalg.norm(unknown - limits[key][1]) / np.linalg.norm(limits[key][1])
                 yield {
                     "cells": cells, "scheme": name, "step": step, "error_A": float(np.sqrt(np.mean(apart**2))),
-                    "error_u": float(moved), "seconds": spent, "newton_iterations": iterations,
+                    "error_u": float(moved), "seconds": spent,
                 }  # fmt: skip
-
-
-# ---------------------------------------------------------------- cost
-COMPARED = ("printed-staggered", "tensor-staggered", "tensor-extrapolated")
-
-
-def cost(number: int) -> Iterator[dict[str, Any]]:
-    """Processor time and iterations on the whole artery, random cells, steps of all schemes in turn."""
-    runs = {}
-    for name in COMPARED:
-        scheme = SCHEMES[name]
-        frame = {"remodeling.frame": "spatial"} if name == "printed-staggered" else {}  # the preset
-        changes = {"output.fields": False, "remodeling.coupling": scheme.coupling, "time.end": float(number)}
-        runs[name] = Simulation(read_scene(ARTERY).with_values(scheme.values | changes | frame)).steps()
-    rows = {
-        name: {"scheme": name, "steps": number, "newton_iterations": 0, "in_parts": 0, "seconds": 0.0} for name in runs
-    }
-    for at in range(number):
-        for name, steps in runs.items():
-            start = clock.process_time()
-            work = next(steps).work
-            rows[name]["seconds"] += clock.process_time() - start
-            rows[name]["newton_iterations"] += work.newton_iterations
-            rows[name]["in_parts"] += work.substeps > 1
-        print(f"step {at + 1}: {({name: round(row['seconds'], 1) for name, row in rows.items()})}", flush=True)
-    for row in rows.values():
-        yield row | {"ratio": row["seconds"] / rows["printed-staggered"]["seconds"]}
 
 
 # ---------------------------------------------------------------- the page
@@ -165,35 +138,21 @@ def rows_of(table: Columns) -> Iterator[list[str]]:
                 yield [scheme.label, cells, f"{A:.1e}", f"{u:.1e}", *orders, f"{spent:.1f}"]
 
 
-def cost_table() -> str:
-    """What a step of the whole artery costs, where it has been measured."""
-    if not (FIGURES / "couplings-cost.csv").is_file():
-        return "(Not measured for this page.)"
-    costs = read_table(FIGURES / "couplings-cost.csv")
-    shown = (costs[key] for key in ("scheme", "steps", "newton_iterations", "ratio"))
-    rows = [[SCHEMES[name].label, f"{steps:.0f}", f"{newton:.0f}", f"{ratio:.2f}"]
-            for name, steps, newton, ratio in zip(*shown, strict=True)]  # fmt: skip
-    return markdown(["law, coupling", "steps", "Newton iterations", "processor time over that of the preset"], rows)
-
-
 def page() -> str:
-    """docs/laws_and_couplings.md with both tables made anew."""
+    """docs/laws_and_couplings.md with its table made anew."""
     head = ["law, coupling", "cells", "error of A", "of u", "order in A", "in u", "seconds"]
     errors_table = markdown(head, rows_of(read_table(FIGURES / "couplings.csv")))
-    text = between_marks(PAGE.read_text(encoding="utf-8"), "errors of couplings", errors_table)
-    return between_marks(text, "cost of couplings", cost_table())
+    return between_marks(PAGE.read_text(encoding="utf-8"), "errors of couplings", errors_table)
 
 
 def main() -> None:
     """Measure, draw, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=40, help="of the cost on the whole artery")
     parser.add_argument("--page", action="store_true", help="measure nothing")
     options = parser.parse_args()
     source = "benchmarks/couplings.py"
     if not options.page:
-        for name, measured in (("couplings", errors()), ("couplings-cost", cost(options.steps))):
-            Page(FIGURES, name, *CAPTION).save_table(by_column(measured), [source])
+        Page(FIGURES, "couplings", *CAPTION).save_table(by_column(errors()), [source])
     with matplotlib.rc_context(STYLE):
         Page(FIGURES, "couplings", *CAPTION).save_figure(draw(read_table(FIGURES / "couplings.csv")), source)
     PAGE.write_text(page(), encoding="utf-8")

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx import Scene, preset_scene
-from remodel_fenicsx.studies.fit import ROUGHLY, Fit, Problem, minimised, result_of
-from remodel_fenicsx.studies.fit import Measured, Unknown
+from remodel_fenicsx.studies.fit import ROUGHLY, Fit, Measured, Problem, Unknown, minimised, result_of
 
 Array = NDArray[np.float64]
 
@@ -49,10 +48,10 @@ def tube() -> Scene:
     return preset_scene("consistent", "tube").with_values(values | numbers)
 
 
-def unknowns(factors: Array) -> list[Unknown]:
+def unknowns(factors: Array) -> dict[str, Unknown]:
     """Those of `TRUTH`, from starts off by factors."""
     pairs = zip(TRUTH.items(), factors, strict=True)
-    return [Unknown(key, value * factor, value / 1e2, value * 1e2) for (key, value), factor in pairs]
+    return {key: Unknown(start=value * factor, lower=value / 1e2, upper=value * 1e2) for (key, value), factor in pairs}
 
 
 def tables(scene: Scene) -> list[Measured]:
@@ -61,7 +60,7 @@ def tables(scene: Scene) -> list[Measured]:
     def table(state: str, along: str, places: Array, *names: str, time: float = 0.0) -> Measured:
         columns = {along: places} | dict.fromkeys(names, np.zeros(len(places)))
         loads, scaled = ((), ()) if along == "time" else ((along,), (along,))
-        return Measured(state, state, time, columns, loads, dict.fromkeys(names, 1.0), scaled)
+        return Measured(state, state, time, columns, loads, dict.fromkeys(names, 1.0), scaled, {})
 
     passive = ("outer_radius", "reduced_axial_force")
     angles = ("fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")
@@ -104,7 +103,7 @@ def fitted(scene: Scene, data: list[Measured], factors: Array) -> tuple[Fit, flo
     """One fit from one start, and its seconds of one processor."""
     began = clock.process_time()
     problem = Problem(scene, unknowns(factors), data)
-    rough = minimised(problem, np.log([unknown.start for unknown in problem.unknowns]), enough=ROUGHLY)
+    rough = minimised(problem, np.log([unknown.start for unknown in problem.unknowns.values()]), enough=ROUGHLY)
     return result_of(problem, [minimised(problem, rough.x)]), clock.process_time() - began
 
 
@@ -123,24 +122,24 @@ def main() -> None:
     for _ in range(options.starts):
         factors = np.exp(random.uniform(-np.log(FACTOR), np.log(FACTOR), len(TRUTH)))
         ends.append(fitted(scene, data, factors))
-        print(f"  start: {_line(*ends[-1])}", flush=True)
+        print(f"  start: {_line(*ends[-1])}")
     least = min(end.minima[0] for end, _ in ends)
     same = sum(end.minima[0] - least < 1e-2 * max(least, 1.0) for end, _ in ends)
     inside: Any = np.zeros(len(TRUTH), dtype=int)
     for _ in range(options.draws):
         ends.append(fitted(scene, noisy(clean, random), np.ones(len(TRUTH))))
         found = ends[-1][0]
-        inside += (found.lower <= truth) & (truth <= found.upper)
-        print(f"  draw: {_line(*ends[-1])}", flush=True)
+        inside += (found.band[0] <= np.log(truth)) & (np.log(truth) <= found.band[1])
+        print(f"  draw: {_line(*ends[-1])}")
     last = ends[0][0]
     print(f"{same} of {options.starts} starts end in one minimum")
-    for key, covered, low, high in zip(TRUTH, inside, last.lower, last.upper, strict=True):
+    for key, covered, low, high in zip(TRUTH, inside, *np.exp(last.band), strict=True):
         print(f"{key}: the band covers the truth in {covered} of {options.draws}; +-{50 * np.log(high / low):.0f} %")
-    print(f"most runs {max(end.runs for end, _ in ends)}, most seconds {max(s for _, s in ends):.1f}")
+    print(f"most runs {max(len(end.problem.known) for end, _ in ends)}, most seconds {max(s for _, s in ends):.1f}")
 
 
 def _line(found: Fit, seconds: float) -> str:
-    return f"sum of squares {found.minima[0]:.4f}, {found.runs} runs, {seconds:.2f} s"
+    return f"sum of squares {found.minima[0]:.4f}, {len(found.problem.known)} runs, {seconds:.2f} s"
 
 
 if __name__ == "__main__":

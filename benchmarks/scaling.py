@@ -2,12 +2,12 @@
 """How time and memory grow with the body: the artery on finer meshes, on one rank and on two.
 
     ./with-fenicsx benchmarks/scaling.py [--unknowns N]... [--ranks N]... [--steps 3] [--method auto]    # measures
-    ./with-fenicsx benchmarks/scaling.py --report       # table and cost model (docs/speed_and_accuracy.md)
+    ./with-fenicsx benchmarks/scaling.py --report       # the table (docs/speed_and_accuracy.md)
 
 Each case is a run of its own (the paper's tube, random cells, no fields, predictor on) with the mesh whose number of
 unknowns is nearest to N; its first load steps are solved. Results are lines of results/scaling.jsonl: wall and
-processor seconds of a step after the first, Newton and linear iterations, peak memory of all ranks, and what parts
-took. Cases that are there are measured again and replaced. Wall time says something on an idle machine only.
+processor seconds of a step after the first, Newton and linear iterations, peak memory of all ranks. Cases that are
+there are measured again and replaced. Wall time says something on an idle machine only.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ import time as clock
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from docs.making.pages import lines, markdown
 from remodel_fenicsx.body.tube import Tube, whole_tube
@@ -35,7 +33,6 @@ PROJECT = Path(__file__).resolve().parents[1]
 RESULTS = PROJECT / "results" / "scaling.jsonl"
 SIZES = [5_616, 17_000, 41_000, 81_000, 133_000, 310_000, 600_000, 1_000_000]
 PAPER = (16, 8, 12)  # elements around, through the wall, along
-EVENTS = {"tangent": "SNESJacobianEval", "residual": "SNESFunctionEval", "setup": "PCSetUp", "solve": "KSPSolve"}
 
 
 def divisions(unknowns: int) -> tuple[int, int, int]:
@@ -50,7 +47,6 @@ def measure(unknowns: int, steps: int, method: str) -> None:
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(
         {"time.end": steps + 1.0, "solver.method": method, "solver.predictor": "autoregressive"}
     )
-    PETSc.Log.begin()
     begun = clock.perf_counter()
     body = Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
     simulation = Simulation(scene, comm, whole_tube(body, chosen, "hexahedron", 1, comm))
@@ -63,11 +59,8 @@ def measure(unknowns: int, steps: int, method: str) -> None:
         record["newton"].append(step.work.newton_iterations)
         record["linear"].append(step.work.linear_iterations)
         before, spent = clock.perf_counter(), clock.process_time()
-        if (
-            len(record["wall"]) == steps
-        ):  # the last step of a run counts negative eigenvalues, which is no part of a step
+        if len(record["wall"]) == steps:  # the last step of a run counts negative eigenvalues, which is no part of it
             break
-    record["parts"] = {name: PETSc.Log.Event(event).getPerfInfo()["time"] for name, event in EVENTS.items()}
     record["memory"] = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
     newton = simulation.stepper.coupling.newton
     record |= {"unknowns": newton._x.getSize(), "method": newton.method}
@@ -112,54 +105,6 @@ def row(record: dict) -> list[str]:
     return [f"{size:,}", f"{record['ranks']}", record["method"], *(f"{number:.3g}" for number in (*numbers, *memory))]
 
 
-# ---------------------------------------------------------------- what it would cost elsewhere
-ON_PAPER = (5, 12)  # Newton iterations a step, and linear ones each
-LARGER = ((1e6, 16), (1e7, 64), (1e7, 256), (1e8, 1024))
-LATENCY, REDUCTIONS, LEVELS = 20e-6, 3, 5  # seconds of a message; reductions and multigrid levels of a linear iteration
-
-
-def prices(records: list[dict]) -> dict[str, float]:
-    """Seconds per unknown: of a tangent, a residual, a setup, a linear iteration, and a step's rest; of one rank."""
-    price = dict.fromkeys((*EVENTS, "rest"), 0.0)
-    for record in records:
-        newton, linear, steps = sum(record["newton"]), sum(record["linear"]), len(record["wall"])
-        counts = {"tangent": newton, "residual": newton + steps, "setup": newton, "solve": linear}
-        share = 1 / len(records) / record["unknowns"]
-        for name in EVENTS:
-            price[name] += share * record["parts"][name] / counts[name]
-        price["rest"] += share * (sum(record["wall"]) - sum(record["parts"][name] for name in EVENTS)) / steps
-    return price
-
-
-def predicted(price: dict[str, float], unknowns: float, ranks: int, newton: float, linear: float) -> float:
-    """Wall seconds of a step: work shared by all ranks, and what their messages wait for."""
-    work = newton * (price["tangent"] + price["residual"] + price["setup"]) + newton * linear * price["solve"]
-    messages = newton * linear * (REDUCTIONS * np.log2(max(ranks, 1)) + 4 * LEVELS * (ranks > 1))
-    return (work + price["rest"]) * unknowns / ranks + messages * LATENCY
-
-
-def report() -> None:
-    """Table, prices, prediction against measurement, and larger machines."""
-    records = sorted(read(), key=lambda r: (r["unknowns"], r["ranks"], r["method"]))
-    print(markdown(HEAD, map(row, records)))
-    iterative = [record for record in records if record["method"] == "iterative"]
-    fitted = [record for record in iterative if record["ranks"] == 1]
-    if not fitted:
-        return
-    price = prices(fitted)
-    each = ", ".join(f"{name} {1e6 * value:.3g}" for name, value in price.items())
-    print(f"\nSeconds per million unknowns, one rank: {each}.\n")
-    rows = []
-    for r in iterative:
-        steps, newton = len(r["wall"]), sum(r["newton"])
-        found = predicted(price, r["unknowns"], r["ranks"], newton / steps, sum(r["linear"]) / newton)
-        rows.append([f"{r['unknowns']:,}", f"{r['ranks']}", f"{found:.3g}", f"{sum(r['wall']) / steps:.3g}"])
-    print(markdown(["unknowns", "ranks", "predicted, s a step", "measured"], rows))
-    print("\nOn paper, {} Newton iterations of {} linear ones:\n".format(*ON_PAPER))
-    larger = [[f"{size:.0e}", f"{ranks}", f"{predicted(price, size, ranks, *ON_PAPER):.3g}"] for size, ranks in LARGER]
-    print(markdown(["unknowns", "ranks", "s a step"], larger))
-
-
 def main() -> None:
     """Measure, or report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -174,7 +119,7 @@ def main() -> None:
         measure(options.case, options.steps, options.method)
         return
     if options.report:
-        report()
+        print(markdown(HEAD, map(row, sorted(read(), key=lambda r: (r["unknowns"], r["ranks"], r["method"])))))
         return
     print(markdown(HEAD, []))
     for unknowns in options.unknowns or SIZES:

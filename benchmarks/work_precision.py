@@ -14,7 +14,7 @@ makes no page, --report makes it from what is there. What is recorded is used ag
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -22,57 +22,117 @@ from textwrap import fill
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from benchmarks.precision import whole
-from benchmarks.precision.kept import EVERY_TANGENT, Array, Found, Kept
 from docs.making.pages import DOCS, FIGURES, between_marks, filled, lines, made_with, markdown
-from remodel_fenicsx.body.shape import profile_weights
+from remodel_fenicsx.body.shape import PROFILE, profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.studies import trade as rungs
+from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
-from remodel_fenicsx.studies.trade import pareto
+from remodel_fenicsx.studies.trade import Setting, as_run, ladder, pareto, typical
 from tests.reference.radial import solve_radial
+from tests.runs import rows_of
+
+Array = NDArray[np.float64]
+Run = Mapping[str, Array]
 
 PICTURE = "speed_and_accuracy"
 PAGE = DOCS / "speed_and_accuracy.md"
 HEAD = ["seconds", "degrees", "largest", "radii, %", "method", "setting"]
 PARTS = ("artery", "paper", "whole")
-COARSE = (8.0, 4.0)  # tolerances, degrees
+COARSE = (8.0, 4.0)  # tolerances, degrees, below what a study asks for
 RADIAL = {"model.kinematics": "radial"}
 TIMES = [5.0, 25.0, 45.0, 65.0, 85.0, 105.0, 125.0, 145.0, 150.0]
 REFERENCE = {"explicit": (150, 1 / 8, 1 / 16), "tensor": (60, 1 / 2, 1 / 4)}  # elements and steps, by law
+# how the tables of docs/speed_and_accuracy.md were measured: the presets named this up to 0.2.0
+EVERY_TANGENT = {"solver.method": "direct", "solver.predictor": "with-tolerance"}
+# the whole tube is solved as a user would
+SOLVED = {"model.kinematics": "full", "solver.method": "auto", "solver.predictor": "autoregressive"}
+SELECTIVE = {"mesh.formulation": "selective-integration"}
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way of marching: its preset, coupling and the law of the reference."""
+    """A way of marching: its preset, coupling, the law of the reference, and steps of the whole tube."""
 
     words: str
     preset: str
     coupling: str
     law: str
+    steps: Mapping[tuple[int, int], tuple[float, ...]]  # by refinement and degree
 
 
 METHODS = {
-    "printed": Method("printed: explicit law, staggered", "kuhl-holzapfel-2007", "staggered", "explicit"),
-    "consistent": Method("law tensor, extrapolated", "consistent", "extrapolated", "tensor"),
-}
+    "printed": Method(
+        "printed: explicit law, staggered", "kuhl-holzapfel-2007", "staggered", "explicit",
+        {(1, 1): (5.0, 2.5, 1.0), (1, 2): (5.0, 2.5, 1.0, 0.5, 0.25), (2, 1): (1.0,)},
+    ),
+    "consistent": Method(
+        "law tensor, extrapolated", "consistent", "extrapolated", "tensor",
+        {(1, 1): (5.0, 1.0), (1, 2): (5.0, 1.0, 0.25, 0.125)},
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Point:
-    """A setting with its true errors."""
+    """A setting with its true errors.
+
+    Attributes
+    ----------
+    seconds
+        Of the processor.
+    typical, anywhere
+        Error of the fibre angle, degrees: root mean square over places and times, and the largest.
+    percent
+        Largest relative error of the lengths.
+    """
 
     method: str
     name: str
-    words: str
-    found: Found
+    seconds: float
+    typical: float
+    anywhere: float
+    percent: float
 
     @property
     def is_whole(self) -> bool:
         """Whether it is the whole tube in three dimensions."""
         return self.name.startswith(("full", "whole"))
+
+
+class Kept:
+    """A folder with a file for each run."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def __contains__(self, name: str) -> bool:
+        return (self.folder / f"{name}.npz").exists()
+
+    def __getitem__(self, name: str) -> Run:
+        with np.load(self.folder / f"{name}.npz") as found:
+            return dict(found)
+
+    def keep(self, name: str, run: Run) -> None:
+        """A file."""
+        np.savez(self.folder / f"{name}.npz", **run)  # type: ignore[arg-type]
+        print(name, float(run.get("seconds", np.nan)), flush=True)
+
+    def measure(self, name: str, setting: Setting) -> None:
+        """Angles and radii at the compared times, and seconds of the processor, of a run that is not kept yet."""
+        if name in self:
+            return
+        rows = rows_of(as_run(setting).with_values({"output.times": TIMES}))
+        asked = [next(row for row in rows if same_time(row["time"], time)) for time in TIMES]
+        angles, lengths = ([[row[n] for n in names] for row in asked] for names in (PROFILE, LENGTHS))
+        seconds = np.array(sum(row["processor_seconds"] for row in rows))
+        self.keep(name, {"angles": np.array(angles), "lengths": np.array(lengths), "seconds": seconds})
+
+
+LENGTHS = ("inner_radius", "outer_radius")
 
 
 def scene(method: Method) -> Scene:
@@ -81,20 +141,28 @@ def scene(method: Method) -> Scene:
     return preset_scene(method.preset, "tube").with_values(EVERY_TANGENT | changes)
 
 
-def settings(method: Method) -> list[rungs.Setting]:
-    """Those of the ladder, and the profiles."""
+def settings(method: Method) -> list[Setting]:
+    """The profiles, those of the ladder, and coarser ones."""
     base = scene(method)
-    profiles = [
-        rungs.Setting(profile.values, base.with_values({**profile.values, **RADIAL}), (1,), name)
-        for name, profile in PROFILES.items()
+    found = [
+        Setting(f"profile-{name}", base.with_values({**profile.values, **RADIAL})) for name, profile in PROFILES.items()
     ]
-    return [*coarse(base), *(one for one in rungs.ladder(base) if not one.profile), *profiles]
+    for tolerance in COARSE:
+        coarse = base.with_values({**RADIAL, "time.tolerance": tolerance})
+        found.append(Setting(f"radial-1-degree-1-tolerance-{tolerance:g}", coarse))
+    return found + [one for one in ladder(base) if not one.name.startswith("profile")]
 
 
-def coarse(base: Scene) -> list[rungs.Setting]:
-    """Below what a study asks for: steps as long as the compared times allow, on the coarsest elements."""
-    every = [{**RADIAL, "time.tolerance": tolerance} for tolerance in COARSE]
-    return [rungs.Setting(values, base.with_values(values), (1,)) for values in every]
+def whole(method: Method) -> list[Setting]:
+    """The whole tube from coarse to fine: the price where no part stands for the body."""
+    steps = [(*mesh, "step", step, {}) for mesh, every in method.steps.items() for step in every]
+    steps += [(1, 1, "tolerance", 1.0, {}), (1, 2, "tolerance", 0.5, {}), (1, 1, "step", 1.0, SELECTIVE)]
+    found = []
+    for refinement, degree, kind, value, other in steps:
+        values = SOLVED | {"mesh.refinement": refinement, "mesh.degree": degree, f"time.{kind}": value} | other
+        name = f"whole-{refinement}-degree-{degree}-{kind}-{value:g}{'-selective-integration' if other else ''}"
+        found.append(Setting(name, scene(method).with_values(values)))
+    return sorted(found, key=lambda setting: setting.expected_seconds)
 
 
 def reference(law: str, kept: Kept) -> tuple[Array, Array]:
@@ -117,51 +185,35 @@ def _reference(law: str, step: float, elements: int) -> tuple[Array, Array]:
 
 
 def run(kept: Kept, parts: Sequence[str], budget: float) -> None:
-    """What is asked for and not kept yet."""
-    if "artery" in parts:
-        run_artery(kept, budget, paper=False)
-    if "paper" in parts:
-        run_artery(kept, 0.0, paper=True)
-    if "whole" in parts:
-        for name, method in METHODS.items():
-            for setting in whole.settings(name, scene(method)):
-                kept.measure(f"{name}-{setting.name}", setting.scene, TIMES)
-
-
-def run_artery(kept: Kept, budget: float, paper: bool) -> None:
-    """All settings of a few expected seconds and the profiles, or the paper's own."""
+    """What is asked for and not kept yet: of the artery profiles and settings of a few expected seconds."""
     for name, method in METHODS.items():
-        for setting in sorted(settings(method), key=lambda setting: not setting.name.startswith("profile")):
-            own = paper and name == "printed" and setting.mesh[0] == "full"
-            asked = own or (setting.name.startswith("profile") and not paper)
-            if setting.expected_seconds < budget or asked:
-                kept.measure(f"{name}-{setting.name}", setting.scene, TIMES)
+        for setting in settings(method):
+            is_paper = name == "printed" and setting.name.startswith("full")
+            is_asked = setting.name.startswith("profile") or setting.expected_seconds < budget
+            if ("artery" in parts and is_asked) or ("paper" in parts and is_paper):
+                kept.measure(f"{name}-{setting.name}", setting)
+        for setting in whole(method) if "whole" in parts else ():
+            kept.measure(f"{name}-{setting.name}", setting)
 
 
 def points(kept: Kept) -> Iterator[Point]:
-    """All that is kept."""
+    """All that is kept, against the reference."""
     for name, method in METHODS.items():
-        exact = reference(method.law, kept)
-        for setting in [*settings(method), *whole.settings(name, scene(method))]:
+        angles, lengths = reference(method.law, kept)
+        for setting in [*settings(method), *whole(method)]:
             if (file := f"{name}-{setting.name}") in kept:
-                yield Point(name, setting.name, words_of(setting), kept.found(file, *exact))
-
-
-def words_of(setting: rungs.Setting) -> str:
-    """What a row calls it."""
-    if setting.profile:
-        return setting.name
-    kinematics, refinement, degree = setting.mesh
-    every = ", every tangent factorised" if setting.name.startswith("full") else whole.other_words(setting.name)
-    return f"{kinematics} refinement {refinement} degree {degree} {setting.steps_in_words}{every}"
+                run = kept[file]
+                apart, percent = run["angles"] - angles, 100 * np.max(np.abs(run["lengths"] / lengths - 1))
+                numbers = run["seconds"], typical(apart), np.abs(apart).max(), percent
+                yield Point(name, setting.name, *map(float, numbers))
 
 
 def report(kept: Kept) -> None:
     """Write the page, its appendix and its picture."""
-    found = sorted(points(kept), key=lambda point: point.found.seconds)
+    found = sorted(points(kept), key=lambda point: point.seconds)
     whole_tube = [point for point in found if point.is_whole]
     made = fill(f"Made with {made_with()}.", 100)
-    parts = {"rows": rows_of(found), "whole": rows_of(whole_tube), "made": made}
+    parts = {"rows": table_rows(found), "whole": table_rows(whole_tube), "made": made}
     text = filled(Path(__file__).with_suffix(".template.md"), parts)
     (kept.folder / "tables.md").write_text(text, encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")
@@ -171,7 +223,7 @@ def report(kept: Kept) -> None:
     _draw(found)
 
 
-def rows_of(found: Sequence[Point]) -> str:
+def table_rows(found: Sequence[Point]) -> str:
     """Settings, the cheapest first; those on their front stand out."""
     return lines(_row(point, on) for point, on in zip(found, _front(found), strict=True))
 
@@ -183,27 +235,28 @@ def best(found: Sequence[Point]) -> str:
 
 
 def _row(p: Point, is_best: bool) -> list[str]:
-    seconds = f"{p.found.seconds:.2g}" if p.found.seconds < 99.5 else f"{p.found.seconds:.0f}"
-    errors = (f"{value:.2g}" for value in (p.found.typical, p.found.anywhere, p.found.percent))
-    return [f"**{seconds}**" if is_best else seconds, *errors, METHODS[p.method].words, p.words]
+    seconds = f"{p.seconds:.2g}" if p.seconds < 99.5 else f"{p.seconds:.0f}"
+    errors = (f"{value:.2g}" for value in (p.typical, p.anywhere, p.percent))
+    words = p.name if p.name.startswith("profile") else p.name.replace("-", " ")
+    return [f"**{seconds}**" if is_best else seconds, *errors, METHODS[p.method].words, words]
 
 
 def paper_rows(found: Sequence[Point]) -> str:
     """The paper's own setting beside the wall alone on the same elements."""
-    printed = {point.name: point.found for point in found if point.method == "printed"}
-    whole, wall = printed["full-1-degree-1-step-1"], printed["radial-1-degree-1-step-1"]
+    printed = {point.name: point for point in found if point.method == "printed"}
+    tube, wall = printed["full-1-degree-1-step-1"], printed["radial-1-degree-1-step-1"]
     own = [
         "the whole tube, every tangent factorised",
-        f"{whole.seconds:.3g}",
-        f"{whole.typical:.2g}",
-        f"{whole.anywhere:.2g}",
+        f"{tube.seconds:.3g}",
+        f"{tube.typical:.2g}",
+        f"{tube.anywhere:.2g}",
     ]
     alone = ["the wall alone on the same elements", f"{wall.seconds:.1g}", f"{wall.typical:.2g}", ""]
     return markdown(["the printed method", "seconds", "degrees", "largest"], [own, alone])
 
 
 def _front(found: Sequence[Point]) -> list[bool]:
-    return pareto([p.found.seconds for p in found], [p.found.typical for p in found])
+    return pareto([p.seconds for p in found], [p.typical for p in found])
 
 
 def _draw(found: Sequence[Point]) -> None:
@@ -213,20 +266,17 @@ def _draw(found: Sequence[Point]) -> None:
     with rc_context(STYLE):
         figure = Figure(figsize=(6.6, 4.4), layout="constrained")
         axes = figure.subplots()
-        mine = [p for p in found if p.is_whole]
-        best = [(p.found.seconds, p.found.typical) for p, on in zip(mine, _front(mine), strict=True) if on]
-        axes.plot(*zip(*best, strict=True), "-", color="0.7", linewidth=0.8, zorder=0, label="front of the whole tube")
         for (name, method), colour in zip(METHODS.items(), COLOURS, strict=False):
             axes.plot([], [], "o", color=colour, label=method.words)
             for point, on in zip(found, front, strict=True):
                 if point.method == name:
                     marker = "D" if point.name.startswith("profile") else "s" if point.is_whole else "o"
-                    at, face = (point.found.seconds, point.found.typical), colour if on else "white"
+                    at, face = (point.seconds, point.typical), colour if on else "white"
                     axes.plot(*at, marker, color=colour, markerfacecolor=face)
                     if marker == "D" or point.name.startswith("full"):
                         text = point.name.removeprefix("profile-") if marker == "D" else "the paper's mesh and step"
-                        side = {"xytext": (5, 3 if marker == "D" else -3)}
-                        axes.annotate(text, at, textcoords="offset points", fontsize=6.5, color="0.3", **side)
+                        side = (5, 3 if marker == "D" else -3)
+                        axes.annotate(text, at, side, textcoords="offset points", fontsize=6.5, color="0.3")
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):

@@ -19,7 +19,7 @@ from remodel_fenicsx._lazy import Late
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, BAD_INPUT, PAUSED, RemodelError, SOLVE_FAILED, printable, shortened
 from remodel_fenicsx.system import interrupts
-from remodel_fenicsx.system.children import SERVE, serve
+from remodel_fenicsx.system.children import PART, SERVE, serve
 from remodel_fenicsx.system.environment import (
     EXTENSIONS,
     blamed,
@@ -682,6 +682,13 @@ def _info(options: argparse.Namespace) -> None:
     }
     for name, version in found.items():
         _say(f"{name:16} {version}")
+
+
+@command(PART, [], option("file_of_part FILE  The task, which its answer replaces."), needs=COMPUTES)
+def _part(options: argparse.Namespace) -> None:
+    from remodel_fenicsx.studies.fit import do_part
+
+    do_part(options.file_of_part)
 
 
 @command(SERVE, [])

@@ -104,12 +104,8 @@ def _one(seed: int, limit: float) -> int:
     scene, counts = made(seed)
     other = relations.chosen(scene, Random(seed))
     print(tomlkit.dumps(scene), f"# elements: {counts}\n# held against: {other.name} {other.asked}", sep="")
-    changed = {
-        f"{table}.{key}": value
-        for table, values in other.scene.items() if isinstance(values, dict)
-        for key, value in values.items() if scene.get(table, {}).get(key) != value
-    }  # fmt: skip
-    print("\n".join(f"#     {key} = {value}" for key, value in changed.items()))
+    changed = [line for line in tomlkit.dumps(other.scene).splitlines() if line not in tomlkit.dumps(scene)]
+    print("\n".join(f"#     {line}" for line in changed))
     with closing(running.Runner(limit)) as runner:
         record = evaluated(seed, runner)
     print(said(record))

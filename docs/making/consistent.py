@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from docs.making.pages import EDGES, FIGURES, Columns, drawn
+from docs.making.pages import EDGES, FIGURES, Columns, drawn, panel_letters, read_table
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
+from remodel_fenicsx.studies.page import COLOURS, Page
 from tests.runs import made
 
 END, KAPPA = 150.0, 0.025

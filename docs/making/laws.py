@@ -15,14 +15,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from docs.making.pages import DOCS, FIGURES, Columns, between_marks, by_column, drawn, markdown
+from docs.making.pages import (
+    DOCS,
+    FIGURES,
+    Columns,
+    between_marks,
+    by_column,
+    drawn,
+    markdown,
+    panel_letters,
+    read_table,
+)
 from remodel_fenicsx import Scene
 from remodel_fenicsx.body import Cube, LoadKind
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
+from remodel_fenicsx.studies.page import COLOURS, Page
 from tests.runs import made
 
 PAGE = DOCS / "laws_and_couplings.md"

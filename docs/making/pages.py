@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -11,13 +12,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, Page, read_table
+from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, Page, made_with
 from remodel_fenicsx.system.children import cores
-from remodel_fenicsx.system.environment import versions
 
 DOCS = Path(__file__).resolve().parents[1]
 FIGURES = DOCS / "figures"
@@ -54,11 +55,6 @@ def filled(template: Path, words: Mapping[str, str]) -> str:
     return text
 
 
-def made_with() -> str:
-    """Versions of what counts."""
-    return ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
-
-
 # ---------------------------------------------------------------- tables
 def by_column(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """Rows as columns; says each row as it comes."""
@@ -75,6 +71,20 @@ def side_by_side(function: Callable[[Any], Any], cases: Iterable[Any]) -> list[A
     os.environ["OMP_NUM_THREADS"] = "1"  # of these processes
     with ProcessPoolExecutor(cores(), get_context("spawn")) as pool:
         return list(pool.map(function, cases))
+
+
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a table that `Page.save_table` wrote: numbers, or text where one of them is none."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(line for line in file if not line.startswith("#")))
+    return {name: _as_numbers([row[index] for row in rows[1:]]) for index, name in enumerate(rows[0])}
+
+
+def _as_numbers(values: list[str]) -> np.ndarray:
+    try:
+        return np.array(values, dtype=float)
+    except ValueError:
+        return np.array(values)
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
@@ -96,3 +106,17 @@ def drawn(page: Page, draw: Callable[..., Figure], *tables: Any, made: str = "",
                 about.add_text(key, value)
         small = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE)
     small.save(path, pnginfo=about, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
+
+
+def panel_letters(*axes_of_panels: Axes) -> None:
+    """Letter the panels of a figure a, b, c, ...: bold, on the line of the titles, left of the axes."""
+    for letter, axes in zip("abcdefgh", axes_of_panels, strict=False):
+        axes.annotate(
+            letter,
+            (0, 1),
+            (-28.0, STYLE["axes.titlepad"]),
+            "axes fraction",
+            "offset points",
+            fontsize=10,
+            fontweight="bold",
+        )

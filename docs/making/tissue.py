@@ -13,13 +13,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from docs.making.pages import FIGURES, Columns, by_column, drawn
+from docs.making.pages import FIGURES, Columns, by_column, drawn, panel_letters, read_table
 from remodel_fenicsx import Scene, Simulation
 from remodel_fenicsx.body.shape import columns_on_request
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.studies.page import COLOURS, Page, panel_letters, read_table
+from remodel_fenicsx.studies.page import COLOURS, Page
 from tests.runs import made
 
 OPENING_ANGLES = (0, 60, 120, 160)  # degrees

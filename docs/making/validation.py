@@ -18,10 +18,21 @@ from matplotlib.figure import Figure
 from scipy.optimize import brentq
 from scipy.special import ive
 
-from docs.making.pages import DOCS, FIGURES, Columns, by_column, drawn, filled, markdown, rows_of, side_by_side
+from docs.making.pages import (
+    DOCS,
+    FIGURES,
+    Columns,
+    by_column,
+    drawn,
+    filled,
+    markdown,
+    read_table,
+    rows_of,
+    side_by_side,
+)
 from remodel_fenicsx import RemodelError, extend, read_scene
 from remodel_fenicsx.studies.fit import fit
-from remodel_fenicsx.studies.page import COLOURS, Page, read_table
+from remodel_fenicsx.studies.page import COLOURS, Page
 from tests.body.test_peers import passive
 from tests.runs import last_row
 from tests.runs import rows_of as run

@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 
 from demos import figures
 from docs.making.consistent import page_values
-from docs.making.pages import DOCS, EDGES, FIGURES, Columns, drawn, markdown, rows_of
+from docs.making.pages import DOCS, EDGES, FIGURES, Columns, drawn, markdown, read_table, rows_of
 from docs.making.studies import study
-from remodel_fenicsx.studies.page import COLOURS, Page, read_notes, read_table
+from remodel_fenicsx.studies.page import COLOURS, Page, read_notes
 from remodel_fenicsx.system.children import cores
 from tests.reference.radial import RadialHistory, solve_radial
 

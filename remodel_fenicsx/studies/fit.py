@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import json
 import logging
+import pickle
 import re
-import signal
-import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import cycle, product
-from multiprocessing import active_children, get_context
+from functools import cached_property, partial
+from itertools import zip_longest
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -41,11 +37,11 @@ from remodel_fenicsx.initial import with_choices
 from remodel_fenicsx.simulation import Simulation, begin_again
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
-from remodel_fenicsx.studies.page import COLOURS, Answer, Page, label, made_with, panels
-from remodel_fenicsx.system import interrupts
-from remodel_fenicsx.system.children import cores
+from remodel_fenicsx.studies.page import COLOURS, Answer, Page, aligned, label, made_with, panels
+from remodel_fenicsx.studies.study import Run, Study
+from remodel_fenicsx.system.children import PART, Worker
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
-from remodel_fenicsx.system.terminal import Line, hold_log, open_log, unsaid
+from remodel_fenicsx.system.terminal import hold_log, open_log, unsaid
 from remodel_fenicsx.unloading import PASSIVE
 from remodel_fenicsx.watch.warnings import WarnsOnce
 
@@ -57,7 +53,7 @@ Array = NDArray[np.float64]
 # ---------------------------------------------------------------- what is read: data, checked before any solve
 LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
 DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
-SCALE_BOUNDS = (1e-3, 1e3)  # bounds of a scale
+SCALE, SCALE_BOUNDS = "scale.", (1e-3, 1e3)  # what keys of factors on columns begin with, and their bounds
 WIDE = 1e3  # a bound that nobody gives over the start
 FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look `LOGARITHM_CHANGE` to both sides
 
@@ -67,8 +63,8 @@ Positive = Annotated[float, Field(gt=0)]
 _Number = Annotated[Positive | None, Field(json_schema_extra={"allowed": "a finite number greater than 0"})]
 
 
-class UnknownTable(Table):
-    """An entry of [unknowns]."""
+class Unknown(Table):
+    """An entry of [unknowns]: a number that is fitted, in logarithms."""
 
     start: float = Field(gt=0)
     lower: _Number = None
@@ -77,7 +73,7 @@ class UnknownTable(Table):
     prior_sd: _Number = None
 
     @model_validator(mode="after")
-    def _go_together(self) -> UnknownTable:
+    def _go_together(self) -> Unknown:
         lower, upper = self.bounds
         if not lower <= self.start <= upper or lower == upper:
             raise fault(f"must lie between lower {lower:g} and upper {upper:g}", "start", self.start)
@@ -112,7 +108,7 @@ class MeasuredTable(Table):
 class DataFile(Table):
     """DATA.toml."""
 
-    unknowns: dict[str, UnknownTable] = Field(
+    unknowns: dict[str, Unknown] = Field(
         min_length=1, json_schema_extra={"allowed": 'a table of keys, as "material.lame_mu" = { start = 10.0 }'}
     )
     measured: tuple[MeasuredTable, ...] = Field(
@@ -121,18 +117,6 @@ class DataFile(Table):
 
 
 # ---------------------------------------------------------------- the same beside a scene
-@dataclass(frozen=True)
-class Unknown:
-    """A number that is fitted, in logarithms."""
-
-    key: str
-    start: float
-    lower: float
-    upper: float
-    prior: float | None = None
-    prior_sd: float | None = None
-
-
 @dataclass(frozen=True)
 class Measured:
     """A table of measurements in the scene's units."""
@@ -158,66 +142,57 @@ class Measured:
 
     @property
     def protocols(self) -> list[NDArray[np.int64]]:
-        """Rows of each protocol in their order: between two of them the loads fall by more than half of the first's."""
-        if not self.loads:
-            return [np.arange(self.rows)]
-        sizes = np.max(
-            [np.abs(self.columns[name]) / (np.abs(self.columns[name]).max() or 1.0) for name in self.loads], axis=0
-        )
-        starts = [0]
-        for row in range(1, self.rows):
-            if sizes[row - 1] - sizes[row] > sizes[starts[-1] : row].max() / 2:
-                starts.append(row)
-        return np.split(np.arange(self.rows), starts[1:])
+        """Rows of each protocol in their order: between two of them the loads fall by more than half."""
+        sizes = [np.abs(self.columns[name]) / (np.abs(self.columns[name]).max() or 1.0) for name in self.loads]
+        size = np.max([np.zeros(self.rows), *sizes], axis=0)
+        return np.split(np.arange(self.rows), np.flatnonzero(np.diff(size) < -0.5) + 1)
 
 
-def read_measurements(path: Path, scene: Scene) -> tuple[list[Unknown], list[Measured]]:
-    """Unknowns and tables of DATA.toml, checked against a scene."""
+def read_measurements(path: Path, scene: Scene) -> tuple[dict[str, Unknown], list[Measured]]:
+    """Unknowns by key, with bounds, and tables of DATA.toml, checked against a scene."""
     data = DataFile(**read_toml(path))
     measured = [
         _measured(table, f"measured[{number}]", path.parent, scene) for number, table in enumerate(data.measured)
     ]
-    starts = {key: table.start for key, table in data.unknowns.items()}
+    starts = {key: unknown.start for key, unknown in data.unknowns.items()}
     for key, start in starts.items():
         scene.with_values({key: start})  # a key that there is not, or that takes no such number, is refused
     scene.with_values(starts)  # and what does not go together
-    unknowns = [
-        Unknown(key, table.start, *_bounds(key, table, scene, starts), table.prior, table.prior_sd)
-        for key, table in data.unknowns.items()
-    ]
-    scales = dict.fromkeys(name for table in measured for name in table.scaled)
-    unknowns += [Unknown(f"scale.{name}", 1.0, *SCALE_BOUNDS) for name in scales]
+    unknowns = {key: _bounded(key, unknown, scene, starts) for key, unknown in data.unknowns.items()}
+    for name in (name for table in measured for name in table.scaled):
+        unknowns[f"{SCALE}{name}"] = Unknown(start=1.0, lower=SCALE_BOUNDS[0], upper=SCALE_BOUNDS[1])
     if len(unknowns) > sum(table.rows * len(table.sd) for table in measured):
         raise SceneError(f"unknowns: {len(unknowns)} unknowns need as many measurements at least")
     return unknowns, measured
 
 
-def _bounds(key: str, table: UnknownTable, scene: Scene, starts: Mapping[str, float]) -> tuple[float, float]:
-    """Those of the table, or the last numbers before them that are of the key's own range."""
+def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, float]) -> Unknown:
+    """With bounds: its own, or the last numbers before them that are of the key's own range."""
 
-    def allowed(number: float) -> bool:
+    def allowed(logarithm: float) -> bool:
         """Whether it may be, with the others as they are or moved by the same factor: a wall keeps its form."""
-        moved = {other: start * number / table.start for other, start in starts.items()}
+        number = float(np.exp(logarithm))
+        moved = {other: start * number / unknown.start for other, start in starts.items()}
         for values in ({**starts, key: number}, moved):
             with suppress(SceneError):
                 return bool(scene.with_values(values))
         return False
 
     ends = []
-    for given, end in zip((table.lower, table.upper), table.bounds, strict=True):
-        if given is not None and not allowed(given):
+    for given, end in zip((unknown.lower, unknown.upper), unknown.bounds, strict=True):
+        inside, outside = np.log([unknown.start, end])
+        if given is not None and not allowed(outside):
             scene.with_values({key: given})  # refuses what somebody has typed
-        inside, outside = np.log([table.start, end])
         back = FROM_EDGE * np.sign(inside - outside)
-        if not allowed(float(np.exp(outside - back))):
+        if not allowed(outside - back):
             while abs(outside - inside) > FROM_EDGE:
                 middle = (inside + outside) / 2
-                inside, outside = (middle, outside) if allowed(float(np.exp(middle - back))) else (inside, middle)
+                inside, outside = (middle, outside) if allowed(middle - back) else (inside, middle)
             end = float(np.exp(inside))
         ends.append(end)
     if not ends[0] < ends[1]:
-        raise SceneError(f"unknowns.{key}: the scene takes no number beside {table.start:g}, so it is not fitted")
-    return ends[0], ends[1]
+        raise SceneError(f"unknowns.{key}: the scene takes no number beside {unknown.start:g}, so it is not fitted")
+    return unknown.model_copy(update=dict(zip(("lower", "upper"), ends, strict=True)))
 
 
 def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> Measured:
@@ -348,44 +323,41 @@ def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], kept: K
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
-    scene = _with_loads_of(table, scene)
-    changes = PASSIVE | {"time.step": 1.0, "time.end": float(table.rows)}
-    for name, load in scene.loads.items():
-        values: Array = np.full(table.rows, load.value * load.factor(scene.last_time))
+    replaced = {scene.load_kinds[name].instead_of for name in table.loads}  # cannot be beside those of the table
+    loads = {}
+    for name in [name for name in dict.fromkeys((*scene.loads, *table.loads)) if name not in replaced]:
         if name in table.loads:
             values = scales.get(name, 1.0) * table.columns[name]
+        else:
+            values = np.full(table.rows, scene.loads[name].value * scene.loads[name].factor(scene.last_time))
         largest = float(values[np.abs(values).argmax()]) or 1.0
-        ramp = [[0.0, 0.0], *([number + 1.0, float(value / largest)] for number, value in enumerate(values))]
-        changes |= {f"loads.{name}.value": largest, f"loads.{name}.ramp": ramp}
-    return scene.with_values(changes)
+        ramp = ((0.0, 0.0), *((number + 1.0, float(value / largest)) for number, value in enumerate(values)))
+        loads[name] = Load(value=largest, ramp=ramp)
+    changes = PASSIVE | {"time.step": 1.0, "time.end": float(table.rows)}
+    return scene.model_copy(update={"loads": loads}).with_values(changes)
 
 
-def _with_loads_of(table: Measured, scene: Scene) -> Scene:
-    """With the table's loads in place of those of the scene that cannot be beside them."""
-    replaced = {scene.load_kinds[name].instead_of for name in table.loads}
-    loads = {name: load for name, load in scene.loads.items() if name not in replaced}
-    new = {name: Load(value=1.0, ramp=((0.0, 0.0), (1.0, 1.0))) for name in table.loads if name not in loads}
-    return scene.model_copy(update={"loads": loads | new})
-
-
-class Kept:
+class Kept(dict[Any, tuple[Simulation, Snapshot]]):
     """Simulations on the way, which nobody hears: they stay, and get other numbers where a scene differs in no more."""
 
-    def __init__(self, keys: Sequence[str]):
-        self._may_stay = all(re.fullmatch(CAN_BE_SET, key) for key in keys)
-        self._known: dict[Any, tuple[Simulation, Snapshot]] = {}
+    def __init__(self, keys: tuple[str, ...]):
+        super().__init__()
+        self.keys_of_scene = keys
+
+    def __reduce__(self) -> Any:
+        return Kept, (self.keys_of_scene,)  # another process builds its own
 
     def simulation(self, scene: Scene, table: Measured, has_own_cells: bool) -> Simulation:
         """At t = 0."""
         use = id(table), has_own_cells, scene.model.kinematics, scene.mesh.formulation
-        if use in self._known:
-            if self._may_stay and begin_again(*self._known[use], scene):
-                return self._known[use][0]
-            self._known.pop(use)[0].close()
+        if use in self:
+            if all(re.fullmatch(CAN_BE_SET, key) for key in self.keys_of_scene) and begin_again(*self[use], scene):
+                return self[use][0]
+            self.pop(use)[0].close()
         made = Simulation(scene, MPI.COMM_SELF)
         made.watchers = [one for one in made.watchers if not isinstance(one, WarnsOnce)]
         made.observer.columns = tuple(one for one in made.observer.columns if one.name in ("time", *table.sd))
-        self._known[use] = made, made.state.snapshot()
+        self[use] = made, made.state.snapshot()
         return made
 
 
@@ -414,45 +386,30 @@ LARGEST_JOURNAL = 10**9  # bytes
 Point = tuple[float, ...]
 
 
-class Journal:
-    """The file in the folder of a fit, from which the same fit goes on; its first line says which fit it is."""
-
-    def __init__(self, folder: Path):
-        self.path, self._begun = folder / JOURNAL, False
-        self.mark: str | None = None  # of the fit in the folder
-        self.known: dict[Point, Array] = {}  # residuals (n,) of all points
-        text = read_regular(self.path, LARGEST_JOURNAL).decode(errors="replace") if self.path.exists() else ""
-        with suppress(ValueError):  # the last line may have been cut off
-            for line in map(json.loads, text.splitlines()):
-                if "at" in line:
-                    self.known[tuple(map(float, line["at"]))] = np.array(line["residuals"], np.float64)
-                else:
-                    self.mark = str(line.get("fit"))
-
-    def begin(self, mark: str) -> None:
-        """Open the file for more, without a line that was cut off; what was evaluated before is there too."""
-        check_no_link(self.path)
-        self.path.write_text(json.dumps({"fit": mark}) + "\n", encoding="utf-8")
-        self._begun = True
-        for point, residuals in self.known.items():
-            self.add(point, residuals)
-
-    def add(self, point: Point, residuals: Array) -> None:
-        """One line more; once the file is open it is on the disk when this returns."""
-        if self._begun:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"at": list(point), "residuals": residuals.tolist()}) + "\n")
+def read_journal(folder: Path) -> tuple[str | None, dict[Point, Array]]:
+    """Which fit is in a folder, None where there is none, and the residuals of all points that were evaluated."""
+    path, mark, known = folder / JOURNAL, None, dict[Point, Array]()
+    text = read_regular(path, LARGEST_JOURNAL).decode(errors="replace") if path.exists() else ""
+    with suppress(ValueError):  # the last line may have been cut off
+        for line in map(json.loads, text.splitlines()):
+            mark = mark or str(line.get("fit"))
+            if "at" in line:
+                known[tuple(map(float, line["at"]))] = np.array(line["residuals"], np.float64)
+    return mark, known
 
 
-def fingerprint(scene: Scene, unknowns: Sequence[Unknown], tables: Sequence[Measured]) -> str:
+def _line(point: Point, residuals: Array) -> str:
+    return json.dumps({"at": list(point), "residuals": residuals.tolist()}) + "\n"
+
+
+def fingerprint(problem: Problem) -> str:
     """SHA-256 of all that a fit depends on but its starts."""
-    said = [[t.name, t.state, t.time, t.sd, t.scaled, {n: v.tolist() for n, v in t.columns.items()}] for t in tables]
-    text = json.dumps([__version__, PRECISE, scene.to_toml(), [list(vars(u).values()) for u in unknowns], said])
+    parts = [__version__, PRECISE, problem.scene.to_toml(), problem.unknowns, problem.tables]
+    text = json.dumps(parts, default=lambda part: part.tolist() if isinstance(part, np.ndarray) else vars(part))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 # ---------------------------------------------------------------- least squares
-SCALE = "scale."  # what keys of factors on columns begin with
 LOGARITHM_CHANGE = 1e-4  # of a logarithm: central differences err by 1e-8, those to one side by 1e-4
 BLIND = 1e-7  # smallest singular value over the largest, below which the data say nothing: what differences err by
 NAMED = 0.1  # share of a blind direction from which on an unknown is named
@@ -462,7 +419,7 @@ SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
 ENOUGH = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
 TELLING = 0.5  # of a change of the residuals: where a Jacobian misses more, the next is made by differences
 CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
-PROFILE_STEP, PROFILE_REACH = 1.0, 4.0  # standard deviations of the straight line
+PROFILE_STEPS = (-4, -2.5, -1.5, 1.5, 2.5, 4)  # standard deviations of the straight line
 ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
 LIMITED_BY_MODEL = 1.5  # standard deviations that a model is off: the noise of ten rows alone is below 1.35 at 95 %
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
@@ -471,28 +428,29 @@ NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distri
 class Problem:
     """Residuals over their standard deviations as a function of the logarithms of the unknowns."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        unknowns: Sequence[Unknown],
-        tables: Sequence[Measured],
-        journal: Journal | None = None,
-    ):
-        self.scene, self.unknowns, self.tables, self._journal = scene, list(unknowns), list(tables), journal
-        self.known = {} if journal is None else journal.known
-        self.bounds = np.log([[unknown.lower, unknown.upper] for unknown in unknowns])
-        self.differences = 0  # Jacobians that were made
-        self.kept = Kept([unknown.key for unknown in unknowns])
+    def __init__(self, scene: Scene, unknowns: Mapping[str, Unknown], tables: Sequence[Measured]):
+        self.scene, self.unknowns, self.tables = scene, dict(unknowns), list(tables)
+        self.bounds = np.log([unknown.bounds for unknown in unknowns.values()])
+        self.known: dict[Point, Array] = {}
+        self.journal: Path | None = None
+        self.kept = Kept(tuple(unknowns))
+
+    def begin(self, folder: Path, mark: str) -> None:
+        """Keep what is evaluated in the folder, from now on and before; a line that was cut off goes."""
+        self.journal = folder / JOURNAL
+        check_no_link(self.journal)
+        head = json.dumps({"fit": mark}) + "\n"
+        self.journal.write_text(head + "".join(_line(*one) for one in self.known.items()), encoding="utf-8")
 
     def scene_of(self, logarithms: Array) -> Scene:
         """The scene with these numbers."""
-        found = {u.key: float(np.exp(x)) for u, x in zip(self.unknowns, logarithms, strict=True)}
+        found = dict(zip(self.unknowns, map(float, np.exp(logarithms)), strict=True))
         return self.scene.with_values({key: value for key, value in found.items() if not key.startswith(SCALE)})
 
     def scales_of(self, logarithms: Array) -> dict[str, float]:
         """Factors on columns, by name."""
-        pairs = zip(self.unknowns, logarithms, strict=True)
-        return {u.key.removeprefix(SCALE): float(np.exp(x)) for u, x in pairs if u.key.startswith(SCALE)}
+        found = zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
+        return {key.removeprefix(SCALE): value for key, value in found if key.startswith(SCALE)}
 
     def models(self, logarithms: Array, kept: Kept | None = None) -> list[dict[str, Array]]:
         """What the model says of each table."""
@@ -505,28 +463,27 @@ class Problem:
         if key not in self.known:
             with unsaid():
                 self.known[key] = self._evaluated(np.array(logarithms))
-            if self._journal is not None:
-                self._journal.add(key, self.known[key])
+            if self.journal is not None:
+                with self.journal.open("a", encoding="utf-8") as file:
+                    file.write(_line(key, self.known[key]))
         return self.known[key]
 
     def _evaluated(self, x: Array) -> Array:
-        scales = self.scales_of(x)
-        parts: list[Array] = []
-        models: list[dict[str, Array]] | None = None
+        scales, models = self.scales_of(x), list[dict[str, Array]]()
         with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
             models = self.models(x, self.kept)
-        for number, table in enumerate(self.tables):
+        parts: list[Any] = []
+        for table, model in zip_longest(self.tables, models):
             for name, sd in table.sd.items():
-                off = models[number][name] - scales.get(name, 1.0) * table.columns[name] if models else UNSOLVED * sd
+                off = model[name] - scales.get(name, 1.0) * table.columns[name] if model else UNSOLVED * sd
                 parts.append(np.full(table.rows, off / sd))
-        for unknown, value in zip(self.unknowns, x, strict=True):
-            if unknown.prior is not None and unknown.prior_sd is not None:
-                parts.append(np.array([(value - np.log(unknown.prior)) / unknown.prior_sd]))
+        for unknown, value in zip(self.unknowns.values(), x, strict=True):
+            if unknown.prior is not None:
+                parts.append([(value - np.log(unknown.prior)) / unknown.prior_sd])
         return np.concatenate(parts)
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
         """Derivatives, (residuals, unknowns), by differences of runs."""
-        self.differences += 1
         columns = []
         for k, way in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
             ahead, behind = (np.clip(logarithms + side * way, *self.bounds.T) for side in (1, -1))
@@ -541,7 +498,7 @@ class Problem:
         if singular[-1] > BLIND * singular[0]:
             return
         blind = directions[-1] * np.sign(directions[-1][np.abs(directions[-1]).argmax()])
-        pairs = [(u.key, part) for u, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
+        pairs = [(key, part) for key, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
         named = [f"{key} ({part:+.2f})" for key, part in pairs]
         if len(named) == 1:
             raise SceneError(f"unknowns: {pairs[0][0]} changes nothing that is measured; fix it or give it a prior")
@@ -558,9 +515,50 @@ class NoStart(RemodelError):  # noqa: N818
 
 
 class LostProcess(RemodelError):  # noqa: N818
-    """A process of a fit was killed by somebody else."""
+    """A process of a fit has ended too early, as where somebody kills it."""
 
     exit_code = BAD_ENVIRONMENT
+
+
+Task = Callable[[Problem], Any]
+
+
+@dataclass(frozen=True)
+class Part(Run):
+    """A part of a fit, for a worker: what a task makes of the problem is left in its file."""
+
+    work: tuple[Problem, Task]
+
+    def is_complete(self) -> bool:
+        """It is not recorded: what was evaluated for it is known."""
+        return False
+
+    def begin(self, worker: Worker) -> None:
+        """Begin it."""
+        file = self.beside(".pickle")
+        file.write_bytes(pickle.dumps(self.work))
+        worker.begin([PART, str(file)], self.beside(".txt"))
+
+    @property
+    def answer(self) -> Any:
+        """What its process has left."""
+        return pickle.loads(self.beside(".pickle").read_bytes())
+
+
+class _FitStudy(Study):
+    def learn(self) -> None:
+        """End it with the first part that fails."""
+        for name, words in self.failed.items():
+            raise LostProcess(
+                f"{name}: {words}; where memory is short, --jobs 1 takes less; all that is recorded is kept, the same "
+                "command goes on"
+            )
+
+
+def do_part(file: Path) -> None:
+    """Do a part of a fit, in a process of a study: the task in the file gives way to its answer."""
+    problem, task = pickle.loads(file.read_bytes())
+    write_whole(file, pickle.dumps(task(problem)))
 
 
 def fit(
@@ -575,58 +573,33 @@ def fit(
     """Fit numbers of a scene to measurements."""
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
-    random = np.random.default_rng(1)
+    with hold_log(quiet=quiet) as held:
+        problem = Problem(scene, *read_measurements(Path(data), scene))
+        mark = fingerprint(problem)
+        place, problem.known = _place(folder, f"{scene.name}-fit", mark)
+        for words in (*explained(scene), scene.formulation_in_words()):
+            log.info("%s", words)
+        first, jacobian = _begun(problem)
     with ExitStack() as stack:
-        line = stack.enter_context(Line(f"{scene.name} fit", quiet))
-        with hold_log(quiet=quiet) as held:
-            unknowns, tables = read_measurements(Path(data), scene)
-            mark = fingerprint(scene, unknowns, tables)
-            place, journal = _place(folder, f"{scene.name}-fit", mark)
-            for words in (*explained(scene), scene.formulation_in_words()):
-                log.info("%s", words)
-            problem, first = Problem(scene, unknowns, tables, journal), np.log([u.start for u in unknowns])
-            for words in problem.scene_of(first).warnings():
-                log.warning("%s", words)
-            line.show(f"the start, and derivatives there: {2 * len(unknowns) + 1} runs")
-            try:
-                at_start = problem.models(first)
-            except StepFailure as failure:
-                raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
-            for doubt in doubts(tables, at_start, scene):
-                log.warning("%s", doubt)
-            near = first, problem.jacobian(first, central=True)
-            problem.check_tells_apart(near[1])
-        points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
         stack.enter_context(RunLock(place))
-        journal.begin(mark)
         stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
-        pool = ProcessPoolExecutor(jobs or cores(), get_context("fork"), _begin_with, (problem,))
-        stack.callback(_end, pool, active_children())
+        parts = stack.enter_context(TemporaryDirectory())
+        study = stack.enter_context(closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)))
+        problem.begin(place, mark)
 
-        def on_cores(tasks: Mapping[str, Callable[[Problem], Any]]) -> list[Any]:
-            asked = [pool.submit(_told, *task) for task in tasks.items()]
-            left, processes = set(asked), active_children()
-            while left:
-                left = wait(left, 0.5).not_done
-                runs = journal.path.read_bytes().count(b"\n") - 1
-                line.show(f"{runs} runs, {len(left)} of {len(asked)} left: {', '.join(tasks)}")
-            try:
-                answers = [one.result() for one in asked]
-            except BrokenProcessPool as error:
-                pool.shutdown()  # it has ended the others by SIGTERM
-                codes = [one.exitcode for one in processes if one.exitcode]
-                first = min(codes, key=lambda code: code == -signal.SIGTERM)
-                raise LostProcess(
-                    f"a process was ended by {signal.Signals(-first).name}, as where memory is short (--jobs 1 takes "
-                    "less); all that is recorded is kept, the same command goes on"
-                ) from error
-            problem.known |= Journal(place).known
-            return answers
+        def on_cores(tasks: Mapping[str, Task]) -> list[Any]:
+            found = [Part(name, scene, Path(parts, name), (problem, task)) for name, task in tasks.items()]
+            study.runs = [*found]
+            study.do()
+            problem.known |= read_journal(place)[1]
+            return [part.answer for part in found]
 
-        rough = partial(minimised, near=near, enough=ROUGHLY)
+        random = np.random.default_rng(1)
+        points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
+        rough = partial(minimised, near=(first, jacobian), enough=ROUGHLY)
         found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
         best = int(np.argmin([one.cost for one in found]))
-        found[best] = on_cores({f"from the end of start {best + 1}": partial(minimised, start=found[best].x)})[0]
+        (found[best],) = on_cores({f"from the end of start {best + 1}": partial(minimised, start=found[best].x)})
         log.info("sums of squares: %s", ", ".join(f"{2 * one.cost:.6g}" for one in found))
         result = result_of(problem, found)
         if profiles:
@@ -637,45 +610,31 @@ def fit(
     return place, result
 
 
-_problem: Problem  # of a process
+def _begun(problem: Problem) -> tuple[Array, Array]:
+    """The start, doubts of which are logged, and the derivatives there, which must tell the unknowns apart."""
+    first = np.log([unknown.start for unknown in problem.unknowns.values()])
+    for words in problem.scene_of(first).warnings():
+        log.warning("%s", words)
+    try:
+        at_start = problem.models(first)
+    except StepFailure as failure:
+        raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
+    for doubt in doubts(problem.tables, at_start, problem.scene):
+        log.warning("%s", doubt)
+    jacobian = problem.jacobian(first, central=True)
+    problem.check_tells_apart(jacobian)
+    return first, jacobian
 
 
-def _begin_with(problem: Problem) -> None:
-    """A process of a fit, which has all that the fit knows, begins."""
-    global _problem
-    _problem = problem
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # it ends with its parent, which minds the other signals
-    for number in (signal.SIGTERM, signal.SIGHUP, interrupts.PAUSE):
-        signal.signal(number, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _told(words: str, task: Callable[[Problem], Any]) -> Any:
-    """What a task returns; what was evaluated for it stands in the journal, and the log counts it."""
-    before, differences, begun = len(_problem.known), _problem.differences, clock.monotonic()
-    answer = task(_problem)
-    numbers = len(_problem.known) - before, clock.monotonic() - begun, _problem.differences - differences
-    log.info("%s: %d runs in %.1f s; derivatives by differences at %d points", words, *numbers)
-    return answer
-
-
-def _end(pool: ProcessPoolExecutor, others: Sequence[Any]) -> None:
-    """At once, whatever its processes do."""
-    pool.shutdown(wait=False, cancel_futures=True)
-    for process in set(active_children()).difference(others):
-        process.kill()
-
-
-def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, Journal]:
-    """The folder of the same fit, or a new one."""
+def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, dict[Point, Array]]:
+    """The folder of the same fit with what it knows, or a new one."""
     wanted = Path(folder or Path("results") / name)
-    journal = Journal(wanted)
-    if journal.mark == mark:
-        return wanted, journal
-    if journal.mark is not None and folder is not None:
+    present, known = read_journal(wanted)
+    if present == mark:
+        return wanted, known
+    if present is not None and folder is not None:
         raise SceneError(f"folder {wanted}: holds a fit of another scene, data or version; choose another folder")
-    place = chosen_folder(folder, name, MPI.COMM_SELF)
-    return place, Journal(place)
+    return chosen_folder(folder, name, MPI.COMM_SELF), {}
 
 
 @dataclass(frozen=True)
@@ -686,11 +645,6 @@ class LikelihoodProfile:
     increases: Array
     lower: float
     upper: float
-
-    def in_words(self) -> str:
-        """Its ends."""
-        ends = ["beyond what was tried" if np.isnan(end) else f"{end:.5g}" for end in (self.lower, self.upper)]
-        return " to ".join(ends)
 
 
 def minimised(
@@ -730,62 +684,44 @@ def minimised(
     )
 
 
-def _half_profile(
-    problem: Problem, best: Array, jacobian: Array, way: Array, number: int, inflation: float
-) -> tuple[list[tuple[float, float]], float]:
-    """Of an unknown, from the minimum one way until the band ends: points, and the end."""
-    least, x, points = float(np.sum(problem.residuals(best) ** 2)), best, [(float(best[number]), 0.0)]
-    ends = problem.bounds[number]
-    for _ in range(round(PROFILE_REACH / PROFILE_STEP)):
-        x = x + way
-        x[number] = np.clip(x[number], *ends)
-        if len(x) > 1:
-            others = np.arange(len(x)) != number
-            x[others] = minimised(problem, x, held=number, near=(best, jacobian), enough=ROUGHLY).x
-        points.append((float(x[number]), float(np.sum(problem.residuals(x) ** 2)) - least))
-        if points[-1][1] > (inflation * NORMAL_95) ** 2:  # the root is nearly a straight line
-            (inner, low), (outer, high) = points[-2:]
-            roots = np.sqrt([max(low, 0.0), high])
-            return points, float(np.exp(np.interp(inflation * NORMAL_95, roots, [inner, outer])))
-        if x[number] in ends:
-            return points, float(np.exp(x[number]))
-    return points, float("nan")
-
-
 def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
     """The best of several minima, with bands."""
     logarithms: Array = min(found, key=lambda one: float(one.cost)).x
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_tells_apart(jacobian)
     misfit = float(np.sqrt(np.mean(problem.residuals(logarithms) ** 2)))
-    return Fit(
-        problem.unknowns,
-        logarithms,
-        problem.bounds,
-        np.asarray(np.linalg.inv(jacobian.T @ jacobian), np.float64),
-        misfit,
-        [2 * float(one.cost) for one in found],
-        len(problem.known),
-        problem.models(logarithms),
-        problem.scene_of(logarithms),
-        problem.tables,
-    )
+    covariance, minima = np.asarray(np.linalg.inv(jacobian.T @ jacobian)), [2 * float(one.cost) for one in found]
+    scene, models = problem.scene_of(logarithms), problem.models(logarithms)
+    return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
 
 
-def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Any]], list[Any]]) -> Fit:
+def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Task]], list[Any]]) -> Fit:
     """The fit with profiles of what goes together: the others are fitted again at each value."""
-    best = found.logarithms
-    numbers = np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1)
-    tasks, half = {}, partial(_half_profile, best=best, jacobian=problem.jacobian(best, central=True))
-    for number, side in product(numbers, (-1, 1)):
-        way = side * PROFILE_STEP * found.inflation * found.covariance[:, number] / found.deviations[number]
-        task = partial(half, way=way, number=int(number), inflation=found.inflation)
-        tasks[f"profile of {found.unknowns[number].key}, {'down' if side < 0 else 'up'}wards"] = task
-    halves, profiles = on_cores(tasks), {}
-    for number, (down, lower), (up, upper) in zip(numbers, halves[::2], halves[1::2], strict=True):
-        values, increases = np.array(sorted([*down, *up[1:]])).T
-        profiles[found.unknowns[number].key] = LikelihoodProfile(np.exp(values), increases, lower, upper)
-    return replace(found, profiles=profiles)
+    best, ends, keys = found.logarithms, problem.bounds.T, found.keys
+    least, near = float(np.sum(problem.residuals(best) ** 2)), (best, problem.jacobian(best, central=True))
+    points: dict[str, tuple[int, float, Array]] = {}
+    for number in np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1):
+        way = found.inflation * found.covariance[:, number] / found.deviations[number]
+        for steps in PROFILE_STEPS:
+            points[f"profile of {keys[number]} at {steps:+g}"] = number, steps, np.clip(best + steps * way, *ends)
+    tasks = {
+        name: partial(minimised, start=x, held=number, near=near, enough=ROUGHLY)
+        for name, (number, _, x) in points.items()
+    }
+    rows: dict[int, list[tuple[float, float, float]]] = {}
+    for (number, steps, x), one in zip(points.values(), on_cores(tasks), strict=True):
+        increase = max(2 * float(one.cost) - least, 0.0)
+        rows.setdefault(number, [(0.0, float(best[number]), 0.0)]).append((steps, float(x[number]), increase))
+    return replace(found, profiles={keys[n]: _profile(rows[n], found.inflation, ends[:, n]) for n in rows})
+
+
+def _profile(rows: list[tuple[float, float, float]], inflation: float, bounds: Array) -> LikelihoodProfile:
+    """Where the root of the increase, which is nearly a straight line, is that of the band; NaN beyond all points."""
+    steps, values, increases = np.array(sorted(rows)).T
+    beyond = [value if value in bounds else np.nan for value in (values[0], values[-1])]
+    roots = np.sign(steps) * np.sqrt(increases) / inflation
+    ends = np.exp(np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond))
+    return LikelihoodProfile(np.exp(values), increases, *map(float, ends))
 
 
 # ---------------------------------------------------------------- the answer
@@ -793,20 +729,17 @@ def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str,
 class Fit(Answer):
     """What a fit has found."""
 
-    unknowns: list[Unknown]
+    scene: Scene
+    problem: Problem
     logarithms: Array
-    bounds: Array
     covariance: Array  # of the logarithms, by the noise alone
     misfit: float
     minima: list[float]
-    runs: int
     modelled: list[dict[str, Array]]
-    scene: Scene
-    tables: list[Measured]
     profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
 
     name = "fit"
-    caption = "Points: measured, with one standard deviation; lines: the fitted model. A panel is a protocol."
+    caption = "Points: measured, with one standard deviation; lines: the fitted model. Each protocol has its panels."
 
     @property
     def title(self) -> str:
@@ -816,7 +749,12 @@ class Fit(Answer):
     @property
     def keys(self) -> list[str]:
         """Of the unknowns."""
-        return [unknown.key for unknown in self.unknowns]
+        return list(self.problem.unknowns)
+
+    @property
+    def starts(self) -> list[float]:
+        """Of the unknowns."""
+        return [unknown.start for unknown in self.problem.unknowns.values()]
 
     @property
     def values(self) -> Array:
@@ -838,26 +776,16 @@ class Fit(Answer):
         """What widens the bands: the misfit, where it says that the model and not the noise limits them."""
         return self.misfit if self.misfit > LIMITED_BY_MODEL else 1.0
 
-    @property
-    def _band(self) -> Array:
+    @cached_property
+    def band(self) -> Array:
         """Ends of the logarithms, (2, n), not beyond the bounds."""
         half = NORMAL_95 * self.inflation * self.deviations
-        return np.clip([self.logarithms - half, self.logarithms + half], *self.bounds.T[:, None])
-
-    @property
-    def lower(self) -> Array:
-        """Ends of the bands."""
-        return np.exp(self._band[0])
-
-    @property
-    def upper(self) -> Array:
-        """Ends of the bands."""
-        return np.exp(self._band[1])
+        return np.clip([self.logarithms - half, self.logarithms + half], *self.problem.bounds.T[:, None])
 
     @property
     def open(self) -> list[str]:
         """Which ends of each band are bounds: nothing, lower, upper or both."""
-        return [("", "lower", "upper", "both")[low + 2 * high] for low, high in self._band.T == self.bounds]
+        return [("", "lower", "upper", "both")[low + 2 * high] for low, high in self.band.T == self.problem.bounds]
 
     @property
     def limited_by(self) -> str:
@@ -866,21 +794,23 @@ class Fit(Answer):
 
     def table(self) -> dict[str, Any]:
         """A row for each unknown."""
-        table = {"key": self.keys, "value": self.values, "lower": self.lower, "upper": self.upper, "open": self.open}
+        lower, upper = np.exp(self.band)
+        table = {"key": self.keys, "value": self.values, "lower": lower, "upper": upper, "open": self.open}
         table["limited_by"] = [self.limited_by] * len(self.keys)
         for end in ("lower", "upper"):
             table[f"profile_{end}"] = [getattr(self.profiles.get(key), end, np.nan) for key in self.keys]
-        return table | {"start": [unknown.start for unknown in self.unknowns]}
+        return table | {"start": self.starts}
 
     def lines(self) -> list[str]:
         """A row for each unknown, and its profile."""
-        width = max(len(key) for key in self.keys)
-        lines = [f"{'':{width}} {'fitted':>12} {'95 % from':>12} {'to':>12} {'start':>12}"]
-        for u, ends, *row in zip(self.unknowns, self.open, self.values, self.lower, self.upper, strict=True):
-            line = f"{u.key:{width}} {' '.join(f'{value:12.5g}' for value in (*row, u.start))}"
-            line += f"  at the bound: {ends}" if ends else ""
-            lines.append(line + ("  limited by the model, not the noise" if self.limited_by == "model" else ""))
-        return lines + [f"profile of {key}: 95 % from {one.in_words()}" for key, one in self.profiles.items()]
+        lower, upper = np.exp(self.band)
+        limit = "  limited by the model, not the noise" if self.limited_by == "model" else ""
+        said = [(f"  at the bound: {ends}" if ends else "") + limit for ends in self.open]
+        table = {"": self.keys, "fitted": self.values, "95 % from": lower, "to": upper, "start": self.starts, " ": said}
+        lines = aligned(table, 12, 5)
+        return lines + [
+            f"profile of {key}: 95 % from {p.lower:.5g} to {p.upper:.5g}" for key, p in self.profiles.items()
+        ]
 
     def verdict(self) -> str:
         """How far the model is off, how many starts agree, and which unknowns go together."""
@@ -894,67 +824,37 @@ class Fit(Answer):
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:
             text += f" Correlated above {CORRELATED:g}, so that profiles count, not bands: {', '.join(together)}."
-        away = np.abs(self.bounds - self.logarithms[:, None]).min(axis=1)
-        edges = [key for key, distance in zip(keys, away, strict=True) if distance < 1e-3]
-        return text + (f" At the edge of what is allowed: {', '.join(edges)}." if edges else "")
+        return text
 
     def write(self, folder: Path) -> None:
         """Write tables and picture."""
         super().write(folder)
-        notes = [self.title, made_with()]
-        if self.profiles:
-            rows = [
-                (k, *row) for k, one in self.profiles.items() for row in zip(one.values, one.increases, strict=True)
-            ]
+        notes, rows = [self.title, made_with()], [
+            (key, *row) for key, one in self.profiles.items() for row in zip(one.values, one.increases, strict=True)
+        ]
+        if rows:
             columns = dict(zip(("key", "value", "increase"), zip(*rows, strict=True), strict=True))
             Page(folder, "profiles").save_table(columns, notes)
         correlations = dict(zip(self.keys, self.correlations, strict=True))
         Page(folder, "correlations").save_table({"key": self.keys, **correlations}, notes)
 
     def figure(self) -> Figure:
-        """A panel for each protocol, and in it for each unit; each column over what was prescribed along its axis."""
-        shown: list[tuple[Any, ...]] = []
-        for table, modelled in zip(self.tables, self.modelled, strict=True):
-            units: dict[str, list[str]] = {}
-            for name in table.sd:
-                units.setdefault(self._label(table, name).partition(", ")[2], []).append(name)
-            parts, title = table.protocols, f"{Path(table.name).name} ({table.state})"
-            for number, (rows, names) in enumerate(product(parts, units.values()), start=1):
-                which = f", protocol {-(-number // len(units))} of {len(parts)}" if len(parts) > 1 else ""
-                shown.append((table, modelled, names, rows, title + which))
+        """A panel for each measured column of each protocol, over what was prescribed along its axis."""
+        shown = [
+            (table, modelled[name], name, rows, number, len(table.protocols))
+            for table, modelled in zip(self.problem.tables, self.modelled, strict=True)
+            for number, rows in enumerate(table.protocols, start=1)
+            for name in table.sd
+        ]
         figure, grid = panels(len(shown), 2.6)
-        for axes, (*panel, title) in zip(grid, shown, strict=True):
-            self._draw(axes, *panel)
-            axes.set_title(title, fontsize=8)
+        scales = self.problem.scales_of(self.logarithms)
+        for axes, (table, model, name, rows, number, protocols) in zip(grid, shown, strict=True):
+            over, which = table.over(name), f", protocol {number} of {protocols}" if protocols > 1 else ""
+            (unit_of_x, per_x), (unit, per) = (table.units.get(one, ("", 1.0)) for one in (over, name))
+            x, y = (scales.get(one, 1.0) * table.columns[one][rows] for one in (over, name))
+            axes.errorbar(x / per_x, y / per, table.sd[name] / per, fmt="o", color=COLOURS[0], label="measured")
+            axes.plot(x / per_x, model[rows] / per, color=COLOURS[1], label="fitted model")
+            axes.set_title(f"{Path(table.name).name} ({table.state}){which}", fontsize=8)
+            axes.set(xlabel=label(self.scene, over, unit_of_x), ylabel=label(self.scene, name, unit))
+            axes.legend(fontsize=7)
         return figure
-
-    def _label(self, table: Measured, name: str) -> str:
-        return label(self.scene, name, table.units.get(name, ("", 1.0))[0])
-
-    def _draw(
-        self, axes: Any, table: Measured, modelled: Mapping[str, Array], names: list[str], rows: NDArray[np.int64]
-    ) -> None:
-        scales = dict(zip(self.keys, self.values, strict=True))
-
-        def in_unit(values: Any, name: str, scale: float = 1.0) -> Array:
-            return np.asarray(scale * values / table.units.get(name, ("", 1.0))[1])
-
-        unit = self._label(table, names[0]).partition(", ")[2]
-        for name, color in zip(names, cycle(COLOURS)):
-            x, y = (
-                in_unit(table.columns[one][rows], one, scales.get(f"{SCALE}{one}", 1.0))
-                for one in (table.over(name), name)
-            )
-            axes.errorbar(
-                x,
-                y,
-                in_unit(table.sd[name], name),
-                fmt="o",
-                color=color,
-                label=label(self.scene, name).partition(", ")[0],
-            )
-            axes.plot(x, in_unit(modelled[name][rows], name), color=color)
-        over = dict.fromkeys(self._label(table, table.over(name)) for name in names)
-        axes.plot([], [], color="0.3", label="fitted model")
-        axes.set(xlabel=" and ".join(over), ylabel=self._label(table, names[0]) if len(names) == 1 else unit)
-        axes.legend(fontsize=7)

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import RemodelError
@@ -30,7 +30,9 @@ from remodel_fenicsx.system.files import write_whole
 
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
 DOTS_PER_INCH = 200
+COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
 STYLE: dict[str, Any] = {
+    "axes.prop_cycle": matplotlib.rcsetup.cycler(color=COLOURS),
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9,
@@ -46,10 +48,6 @@ STYLE: dict[str, Any] = {
     "legend.frameon": False,
     "figure.facecolor": "white",
 }
-COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
-
-
-LETTER_PLACE = (-28.0, STYLE["axes.titlepad"])  # points, from the corner of a panel
 
 
 class FigureError(RemodelError, ValueError):
@@ -112,9 +110,9 @@ class Answer(ABC):
     def table(self) -> Mapping[str, ArrayLike]:
         """Columns of NAME.csv."""
 
-    @abstractmethod
     def lines(self) -> list[str]:
         """The table for a terminal."""
+        return aligned(self.table(), 8, 5)
 
     @abstractmethod
     def verdict(self) -> str:
@@ -138,11 +136,15 @@ class Answer(ABC):
             page.save_figure(figure, made_with())
 
 
-def aligned(table: Mapping[str, ArrayLike], least: int, digits: int) -> list[str]:
-    """Columns of numbers under their names, each `least` wide or more."""
-    widths = [max(least, len(name)) for name in table]
-    rows = [list(table), *([f"{number:.{digits}g}" for number in row] for row in zip(*table.values(), strict=True))]
-    return [" ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+def aligned(table: Mapping[str, ArrayLike | Sequence[str]], least: int, digits: int) -> list[str]:
+    """Columns under their names, each `least` wide or more: numbers to the right, text to the left."""
+    columns = []
+    for name, values in table.items():
+        cells = [value if isinstance(value, str) else f"{value:.{digits}g}" for value in np.asarray(values).tolist()]
+        side = "<" if np.asarray(values).dtype.kind == "U" else ">"
+        width = max(least, *map(len, (name, *cells)))
+        columns.append([f"{cell:{side}{width}}" for cell in (name, *cells)])
+    return [" ".join(row).rstrip() for row in zip(*columns, strict=True)]
 
 
 def panels(number: int, height: float) -> tuple[Figure, list[Axes]]:
@@ -168,30 +170,18 @@ def label(scene: Scene, name: str, unit: str = "") -> str:
     return words(name) + (f", {unit}" if unit else "")
 
 
-HEAD_LINE, VERDICT_LINE, VERDICT_LETTER = 0.24, 0.155, 0.0585  # inches: lines of title and verdict, mean letter
+HEAD_LETTER, HEAD_LINE = 0.0585, 0.155  # inches: mean letter and line of a head
 TICK_LABEL = 0.14  # half of one at the end of an axis: which labels there are is settled after the layout
 
 
 def add_head(figure: Figure, title: str, verdict: str) -> None:
     """Write title and verdict over a figure of constrained layout, which becomes that much taller."""
     wide, tall = figure.get_size_inches()
-    lines = textwrap.wrap(verdict, int((wide - 0.16) / VERDICT_LETTER))
-    taken = 0.1 + HEAD_LINE + VERDICT_LINE * len(lines)
-    whole = tall + taken
-    figure.set_size_inches(wide, whole)
+    lines = [title, *textwrap.wrap(verdict, int((wide - 0.16) / HEAD_LETTER))]
+    figure.set_size_inches(wide, tall + HEAD_LINE * len(lines))
     engine: Any = figure.get_layout_engine()
-    engine.set(rect=(0.0, 0.0, 1.0, tall / whole), w_pad=TICK_LABEL)
-    common: dict[str, Any] = {"ha": "left", "va": "baseline", "parse_math": False}
-    figure.text(0.08 / wide, 1 - 0.2 / whole, title, fontsize=10, fontweight="bold", **common)
-    for number, line in enumerate(lines, start=1):
-        place = 1 - (HEAD_LINE + VERDICT_LINE * number - 0.02) / whole
-        figure.text(0.08 / wide, place, line, fontsize=8, color="0.25", **common)
-
-
-def panel_letters(*axes_of_panels: Axes) -> None:
-    """Letter the panels of a figure a, b, c, ...: bold, on the line of the titles, left of the axes."""
-    for letter, axes in zip("abcdefgh", axes_of_panels, strict=False):
-        axes.annotate(letter, (0, 1), LETTER_PLACE, "axes fraction", "offset points", fontsize=10, fontweight="bold")
+    engine.set(w_pad=TICK_LABEL)
+    figure.suptitle("\n".join(lines), x=0.08 / wide, ha="left", fontsize=8, parse_math=False)
 
 
 def _cell(value: Any) -> str:
@@ -215,17 +205,3 @@ def read_notes(folder: Path, name: str) -> dict[str, list[str]]:
         return dict(json.loads(text)["notes"]) if MARK in text else {}
     except (ValueError, KeyError, TypeError):  # was cut short, or is somebody else's
         return {}
-
-
-def read_table(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a table that `Page.save_table` wrote: numbers, or text where one of them is none."""
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(line for line in file if not line.startswith("#")))
-    return {name: _as_numbers([row[index] for row in rows[1:]]) for index, name in enumerate(rows[0])}
-
-
-def _as_numbers(values: list[str]) -> NDArray[Any]:
-    try:
-        return np.array(values, dtype=float)
-    except ValueError:
-        return np.array(values)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -73,16 +74,11 @@ class Run:
             history = recording.history
         except RecordingError:  # a last row that is not whole is done again
             return False
-        times, time = history["time"], self.scene.time
+        times = history["time"]
         if not len(times) or not same_time(float(times[-1]), self.scene.last_time):
             return False
-        is_fixed = time.tolerance is None and not time.is_equilibrium
-        rows = time.number_of_steps + 1 if is_fixed else len(times)
-        has_columns = {column.name for column in self.scene.columns()} <= set(history)
-        if not has_columns or len(times) != rows or (np.diff(times) <= 0).any():
+        if not {column.name for column in self.scene.columns()} <= set(history) or (np.diff(times) <= 0).any():
             raise RecordingError(f"{self.folder}: its history has other columns or rows than its scene asks for")
-        if self.scene.output.fields:
-            recording.fields(self.scene.last_time)  # the last ones are behind all others in the file
         return True
 
     def history(self) -> HistoryColumns:
@@ -115,7 +111,7 @@ def _same(recording: RecordedRun, wanted: Scene) -> bool:
 
 # ---------------------------------------------------------------- all of them
 class Study:
-    """Runs in one folder, and the processes that do them."""
+    """Runs in one folder, and the processes that do them, until it is closed."""
 
     # A process does one run after the other, for most of a short run is its start. It ends with the command.
 
@@ -130,16 +126,21 @@ class Study:
     ):
         self.name, self.scene, self.jobs, self.quiet = name, scene, jobs or cores(), quiet
         self.folder = Path(folder or Path("results") / f"{scene.name}-{name}")
-        self.runs = [Run(run, changed, self.folder / run) for run, changed in scenes.items()]
+        self.runs: list[Any] = [Run(run, changed, self.folder / run) for run, changed in scenes.items()]
         self.failed: dict[str, str] = {}
         self.deadline = math.inf
         self._waiting: list[Run] = []
         self._running: dict[Worker, Run] = {}
         self._idle: list[Worker] = []
 
+    def close(self) -> None:
+        """End the processes."""
+        for worker in [*self._running, *self._idle]:
+            worker.stop()
+
     def answered(self, answer: Callable[[], Found]) -> tuple[Path, Found]:
         """The folder, and what the runs say once they are done, which is written there."""
-        with RunLock(self.folder):
+        with RunLock(self.folder), closing(self):
             self.do()
             found = answer()
             found.write(self.folder)
@@ -162,21 +163,17 @@ class Study:
         self.learn()
         pausing = False
         with StopRequest() as stop, Line(f"{self.scene.name} {self.name}", self.quiet) as line:
-            try:
-                while (self._waiting or self._running) and clock.monotonic() < self.deadline:
-                    if stop.number:
-                        raise Interrupted(stop.number)
-                    if stop.pause and not pausing:
-                        pausing = True
-                        self._waiting.clear()
-                        for worker in self._running:  # each run ends with the step under way
-                            worker.process.send_signal(PAUSE)
-                    self._begin()
-                    self._collect(pausing)
-                    line.show(self._progress())
-            finally:
-                for worker in [*self._running, *self._idle]:
-                    worker.stop()
+            while (self._waiting or self._running) and clock.monotonic() < self.deadline:
+                if stop.number:
+                    raise Interrupted(stop.number)
+                if stop.pause and not pausing:
+                    pausing = True
+                    self._waiting.clear()
+                    for worker in self._running:  # each run ends with the step under way
+                        worker.process.send_signal(PAUSE)
+                self._begin()
+                self._collect(pausing)
+                line.show(self._progress())
         if pausing:
             raise Interrupted(PAUSE)
 

@@ -1,14 +1,14 @@
-"""`remodel-fenicsx trade SCENE`: what each setting of a scene costs and how far off it is, measured on the scene."""
+"""`remodel-fenicsx trade SCENE`: what each setting of a scene costs, and how far it is from the finest one."""
 
 from __future__ import annotations
 
 import logging
 import time as clock
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,8 +22,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.studies.page import COLOURS, Answer
+from remodel_fenicsx.studies.page import COLOURS, Answer, aligned
 from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, Study, TooFewRuns
 from remodel_fenicsx.system.files import make_own_folder, write_whole
 
@@ -34,133 +33,87 @@ Array = NDArray[np.float64]
 
 # ---------------------------------------------------------------- settings of a scene from coarse to fine
 SECONDS_PER_POINT = 3e-5  # of a step: a first guess, corrected by the runs
+START_SECONDS = 3.0  # of a run before its first step, roughly
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
 STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
-MESHES = ((1, 1), (2, 1), (4, 1), (8, 1), (1, 2), (2, 2), (4, 2))  # refinement, degree
-TOGETHER = ((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25))  # both finer: refinement, degree, step in the scene's
-SEEDS = 3  # where another mesh draws other cells
-COMPARED = 8  # times at which rows are compared, beside corners of ramps and the end
-STRETCH, KINEMATIC = "mean_stretch", "model.kinematics"
+MESHES = (  # refinement and step in the scene's own, degree
+    *((1, 1, 1.0), (2, 1, 1.0), (4, 1, 1.0), (8, 1, 1.0), (1, 2, 1.0), (2, 2, 1.0), (4, 2, 1.0)),
+    *((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25)),
+)
+SEEDS = 3  # of random cells
+COMPARED = 9  # times at which rows are compared, the last is the end
+KINEMATIC = "model.kinematics"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Setting:
     """One row of the table: a scene that a user could take."""
 
-    changes: Mapping[str, Any] = field(hash=False)
-    scene: Scene = field(hash=False)
-    seeds: tuple[int, ...]
-    profile: str = ""
+    name: str
+    scene: Scene
+    seeds: tuple[int, ...] = (1,)
 
     @property
-    def key(self) -> str:
-        """What it is: kinematics, mesh and steps."""
-        kinematics, refinement, degree = self.mesh
-        return f"{kinematics}-{refinement}-degree-{degree}-{self.steps_in_words.replace(' ', '-')}"
+    def step(self) -> float:
+        """The fixed step; infinite with a tolerance."""
+        return self.scene.time.step if self.scene.time.tolerance is None else np.inf
 
     @property
-    def name(self) -> str:
-        """Of its row."""
-        return f"profile-{self.profile}" if self.profile else self.key
-
-    @property
-    def step(self) -> float | None:
-        """The fixed step; None with a tolerance."""
-        return self.scene.time.step if self.scene.time.tolerance is None else None
-
-    @property
-    def mesh(self) -> tuple[str, int, int]:
-        """Kinematics, refinement and degree."""
-        return self.scene.model.kinematics, self.scene.mesh.refinement, self.scene.mesh.degree
-
-    @property
-    def kinematics(self) -> str:
-        """What a step costs goes by them."""
-        return self.scene.model.kinematics
+    def element(self) -> float:
+        """Size of the elements over their degree, the coarsest 1."""
+        return 1.0 / (self.scene.mesh.refinement * self.scene.mesh.degree**2)
 
     @property
     def expected_seconds(self) -> float:
-        """Of one of its runs, roughly."""
+        """Seconds of one run, roughly."""
         time = self.scene.time
         steps = time.number_of_steps if time.tolerance is None else DEGREES_PER_RUN / time.tolerance
         return SECONDS_PER_POINT * step_cost(self.scene, self.scene.model.kinematics) * steps
 
-    @property
-    def steps_in_words(self) -> str:
-        """How long they are, or their tolerance."""
-        return f"step {self.step:g}" if self.step is not None else f"tolerance {self.scene.time.tolerance:g}"
-
 
 def ladder(scene: Scene) -> list[Setting]:
-    """All settings that the scene allows, each once: sweeps of one factor from the cheapest kinematics, then both."""
+    """All settings that the scene allows, each once, the cheapest first."""
     cheapest = choice(scene.with_values({KINEMATIC: AUTO})).name
     # without its profile, which would choose the steps of every row; what the profile has set stays
     base = scene.with_values({KINEMATIC: cheapest, "time.tolerance": None, "profile": None})
-    remodels, step = LAWS[scene.remodeling.law].remodels, base.time.step
-
-    def finer(refinement: int, degree: int) -> dict[str, Any]:
-        return {"mesh.refinement": refinement * base.mesh.refinement, "mesh.degree": degree}
-
-    wanted: list[dict[str, Any]] = [{"time.step": factor * step} for factor in STEPS]
-    wanted += [finer(*mesh) for mesh in MESHES]
-    wanted += [finer(refinement, degree) | {"time.step": factor * step} for refinement, degree, factor in TOGETHER]
-    for tolerance in TOLERANCES if remodels else ():
-        wanted += [finer(2, 2) | {"time.tolerance": tolerance}, {"time.tolerance": tolerance}]
-    for name in dict.fromkeys((choice(scene).name, "sector", "full")):
-        if name == choice(scene).name or not (objections(scene, name) or is_for_means(scene, name)):
-            wanted.append({KINEMATIC: name})
-    first = _setting(base, {})
-    settings = [first, *_profiles(base)] if remodels else [first]
+    number = SEEDS if base.has_random_cells else 1
+    seeds = tuple(range(base.cells.seed, base.cells.seed + number))
     found: dict[str, Setting] = {}
-    for setting in [*settings, *(_setting(base, values) for values in wanted)]:
-        if setting is not None:
-            found.setdefault(setting.key, setting)
+    for profile, values in _wanted(scene, base):
+        if isinstance(base.geometry, FromFile) or KINEMATICS[values.get(KINEMATIC, cheapest)].homogeneous:
+            values = {key: value for key, value in values.items() if not key.startswith("mesh.")}
+        try:
+            changed = base.with_values(values)
+        except SceneError as error:  # a step of which a corner is no multiple, an element that a formulation has not
+            log.debug("left out: %s", error)
+            continue
+        time = changed.time
+        steps = f"step-{time.step:g}" if time.tolerance is None else f"tolerance-{time.tolerance:g}"
+        name = f"{changed.model.kinematics}-{changed.mesh.refinement}-degree-{changed.mesh.degree}-{steps}"
+        found.setdefault(name, Setting(f"profile-{profile}" if profile else name, changed, seeds))
     return sorted(found.values(), key=lambda setting: setting.expected_seconds)
 
 
-def _setting(base: Scene, values: Mapping[str, Any], profile: str = "") -> Setting | None:
-    """The base with some values; None where it does not take them."""
-    values = _known(base, values)
-    try:
-        changed = base.with_values(values)
-    except SceneError as error:  # a step of which a corner is no multiple, an element that a formulation has not
-        log.debug("left out: %s", error)
-        return None
-    has_same_cells = bool(values) and not profile and set(values) <= {"time.step", "time.tolerance", KINEMATIC}
-    has_same_cells &= not is_for_means(base, changed.model.kinematics)
-    seeds = 1 if has_same_cells or not base.has_random_cells else SEEDS
-    return Setting(values, changed, tuple(range(base.cells.seed, base.cells.seed + seeds)), profile)
-
-
-def _profiles(base: Scene) -> list[Setting | None]:
-    """Those that say something else than the base, on its kinematics unless they have one."""
-    own: dict[str, Any] = {KINEMATIC: base.model.kinematics}
-    found: dict[str, dict[str, Any]] = {}
-    for name in PROFILES:
-        profile = profile_for(name, base)
-        values = profile.settings(base.with_values(_known(base, profile.values | own)))
-        values |= own if values[KINEMATIC] == AUTO else {}
-        if values not in (own, *found.values()):
-            found[name] = values
-    return [_setting(base, values, name) for name, values in found.items()]
-
-
-def _known(base: Scene, values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Without those of a mesh that means nothing, or is given."""
-    homogeneous = KINEMATICS[values.get(KINEMATIC, base.model.kinematics)].homogeneous
-    if not isinstance(base.geometry, FromFile) and not homogeneous:
-        return values
-    return {key: value for key, value in values.items() if not key.startswith("mesh.")}
-
-
-def compared_times(scene: Scene, settings: Sequence[Setting]) -> list[float]:
-    """Times that every row has: corners of ramps, the end, and some between that are whole steps of all settings."""
-    fixed = [setting.scene.time for setting in settings if setting.step is not None]
-    longest = max(time.step for time in fixed)
-    multiples = [longest * number for number in range(1, round(scene.time.end / longest))]
-    hit = [time for time in multiples if all(one.is_hit(time) for one in fixed)]
-    return sorted({*scene.stops(), *hit[:: -(-len(hit) // COMPARED) or 1]})
+def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the name of a profile, or nothing, and the values of each setting."""
+    own, step, remodels = base.model.kinematics, base.time.step, LAWS[scene.remodeling.law].remodels
+    yield "", {}
+    for name in PROFILES if remodels else ():
+        values = profile_for(name, base).settings(base)
+        yield name, values | ({KINEMATIC: own} if values[KINEMATIC] == AUTO else {})
+    for factor in STEPS:
+        yield "", {"time.step": factor * step}
+    for refinement, degree, factor in MESHES:
+        mesh = {"mesh.refinement": refinement * base.mesh.refinement, "mesh.degree": degree}
+        yield "", mesh | {"time.step": factor * step}
+    for tolerance in TOLERANCES if remodels else ():
+        yield "", {"time.tolerance": tolerance}
+        yield "", {"time.tolerance": tolerance, "mesh.refinement": 2 * base.mesh.refinement, "mesh.degree": 2}
+    yield "", {KINEMATIC: choice(scene).name}
+    for name in ("sector", "full"):
+        if not (objections(scene, name) or is_for_means(scene, name)):
+            yield "", {KINEMATIC: name}
 
 
 def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
@@ -168,53 +121,43 @@ def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
     columns = scene.geometry.columns
     if radii := [column.name for column in columns if column.unit == "length"]:
         return "radii", radii
-    stretch = [column.name for column in columns if column.name == STRETCH]
+    stretch = [column.name for column in columns if column.name == "mean_stretch"]
     return ("stretch", stretch) if stretch else ("volume", [c.name for c in columns if c.unit == "length^3"])
 
 
-def as_run(setting: Setting, seed: int, times: list[float]) -> Scene:
+def as_run(setting: Setting, seed: int = 1) -> Scene:
     """The scene of a run of the study: only what is compared is measured."""
     columns = [*compared_lengths(setting.scene)[1], "substeps", "seconds", "processor_seconds", *PROFILE]
-    values = {"output.fields": False, "output.columns": columns, "output.times": times, "output.every": 1}
+    values = {"output.fields": False, "output.columns": columns, "output.every": 1, "output.times": []}
     return setting.scene.with_values({**values, "cells.seed": seed, "name": f"{setting.name}-{seed}"})
 
 
-# ---------------------------------------------------------------- an order of convergence, and what is left with it
-# What ever finer settings tend to is known by Richardson's extrapolation, where their results show an order.
-UNKNOWN_SHARE = 0.5  # of an error: what is left unknown may be so much of it
-NO_ERROR = 1e-6  # degrees: what solves leave is less, what elements and steps leave more
-SPREAD = 2.0  # noise of the mean over the seeds that an error must be above
-RATIOS = (1.35, 40.0)  # of differences of one halving and the next that are those of an order
-ALIGNED = 0.5  # cosine of the angle between two differences, as vectors, that shrink along one way
+# ---------------------------------------------------------------- errors against the finest
+NOISY = 2.0  # noise of the mean over the seeds that an error must be above
+FINER = 1.99  # how much finer steps and elements of the finest must be than those of a row that is trusted
 
 
-class SweepLimit(NamedTuple):
-    """What a sweep of one factor tends to."""
+@dataclass(frozen=True)
+class Result:
+    """What the runs of a setting give, (seeds, columns, times), and the seconds of one of them."""
 
-    beyond: Array
-    order: float
-    last: Array
-
-    @property
-    def trusted(self) -> bool:
-        """Whether an order shows."""
-        return bool(np.isfinite(self.order))
+    setting: Setting
+    angles: Array
+    lengths: Array
+    seconds: float
+    wall_seconds: float
 
 
-def limit(results: Sequence[Array]) -> SweepLimit:
-    """The limit of results of settings that are each half of the one before, the finest last."""
-    nothing = np.zeros_like(results[-1])
-    last = results[-1] - results[-2] if len(results) > 1 else np.full_like(nothing, np.nan)
-    if len(results) < 3:
-        return SweepLimit(nothing, np.nan, last)
-    before = results[-2] - results[-3]
-    if typical(last) == 0:
-        return SweepLimit(nothing, np.inf, last)
-    ratio = typical(before) / typical(last)
-    cosine = float(np.nansum(before * last) / max(np.nansum(before**2) ** 0.5 * np.nansum(last**2) ** 0.5, 1e-300))
-    if not RATIOS[0] < ratio < RATIOS[1] or cosine < ALIGNED:
-        return SweepLimit(nothing, np.nan, last)
-    return SweepLimit(np.asarray(last / (ratio - 1), dtype=np.float64), float(np.log2(ratio)), last)
+@dataclass(frozen=True)
+class Row:
+    """A row of the table."""
+
+    setting: Setting
+    seconds: float
+    angle_error: float
+    length_error: float
+    doubt: str
+    on_front: bool = False
 
 
 def typical(values: Array) -> float:
@@ -222,290 +165,126 @@ def typical(values: Array) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def _shown(number: float) -> float:
-    """Two digits: what is as good there is no better, as estimates and timings are not known to more."""
-    return float(f"{number:.2g}")
-
-
 def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
-    """Which of some settings no other one beats in cost and error, as they are shown."""
-    pairs = [(_shown(cost), _shown(error)) for cost, error in zip(costs, errors, strict=True)]
+    """Which of some settings no other one beats in cost and error, to two digits: timings are not known to more."""
+    pairs = [(float(f"{cost:.2g}"), float(f"{error:.2g}")) for cost, error in zip(costs, errors, strict=True)]
     return [
         np.isfinite(error) and not any((c <= cost and e < error) or (c < cost and e <= error) for c, e in pairs)
         for cost, error in pairs
     ]
 
 
-# ---------------------------------------------------------------- the errors of settings from what all of them give
-@dataclass(frozen=True)
-class Result:
-    """What a setting gives: means over its seeds."""
-
-    setting: Setting
-    angles: Array
-    lengths: Array
-    seconds: float
-    wall_seconds: float
-    noise: float
-    single: tuple[Array, Array]
+def compared(results: Sequence[Result]) -> list[Row]:
+    """Rows with errors against the finest one, the cheapest first; the error of the finest is not known."""
+    finest = min(results, key=lambda result: result.setting.step * result.setting.element)
+    rows = [_row(result, finest) for result in sorted(results, key=lambda result: result.seconds)]
+    on_front = pareto([row.seconds for row in rows], [row.angle_error for row in rows])
+    return [Row(**vars(row) | {"on_front": is_best}) for row, is_best in zip(rows, on_front, strict=True)]
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of the table."""
-
-    result: Result
-    angle_error: float
-    length_error: float
-    on_front: bool = False
-    doubt: str = ""
-
-
-class _Guess(NamedTuple):
-    """Of the exact result: what settings with fixed steps tend to."""
-
-    angles: Array
-    lengths: Array
-    unknown: float
-    notes: list[str]
-
-
-def estimated(results: Sequence[Result]) -> tuple[list[Row], list[str]]:
-    """Rows with errors against the best guess of the exact result, and what it rests on."""
-    results = _on_the_mean(results)
-    fixed = [result for result in results if result.setting.step is not None]
-    if not fixed:
-        return [Row(result, np.nan, np.nan, doubt="nothing to compare with") for result in results], []
-    guess = _guess(fixed)
-    rows = sorted((_row(result, guess) for result in results), key=lambda row: row.result.seconds)
-    on_front = pareto([row.result.seconds for row in rows], [row.angle_error for row in rows])
-    return [replace(row, on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)], guess.notes
-
-
-def _guess(fixed: Sequence[Result]) -> _Guess:
-    """What settings with fixed steps tend to."""
-    finest = min(fixed, key=_fineness)
-    angles, lengths, unknown, notes = finest.angles, finest.lengths, 0.0, []
-    sweeps = [_time_sweep(fixed)]
-    if not KINEMATICS[finest.setting.mesh[0]].homogeneous:
-        sweeps.append(_mesh_sweep(fixed))
-    for sweep in sweeps:
-        if not sweep.results:
-            notes.append(f"{sweep.factor}: fewer than two settings were run, so its error is in no estimate")
-            unknown = np.inf
-            continue
-        found, found_lengths = (limit([getattr(r, kind) for r in sweep.results]) for kind in ("angles", "lengths"))
-        # what the sweep has still before it where the finest of all stands
-        last = sweep.results[-1]
-        ahead = next((r for r in sweep.results if sweep.level(r) == sweep.level(finest)), last)
-        angles = angles + found.beyond + last.angles - ahead.angles
-        lengths = lengths + found_lengths.beyond + last.lengths - ahead.lengths
-        notes.append(_in_words(sweep, found))
-        if not found.trusted:
-            unknown = max(unknown, typical(found.last)) if np.isfinite(found.last).any() else np.inf
-    return _Guess(angles, lengths, unknown, notes)
-
-
-def _row(result: Result, guess: _Guess) -> Row:
-    error, unknown = typical(result.angles - guess.angles), guess.unknown
-    if np.isfinite(unknown):
-        error = float(np.hypot(error, unknown))
-    length = float(np.nanmax(np.abs(result.lengths / guess.lengths - 1)))
-    doubt = ""
-    if unknown > UNKNOWN_SHARE * error:
-        doubt = "no order seen" if np.isfinite(unknown) else "a factor was not varied"
-    if SPREAD * result.noise > error:
-        doubt = f"noise of random cells {result.noise:.2g}"
-    return Row(result, error, length, doubt=doubt)
-
-
-def _on_the_mean(results: Sequence[Result]) -> list[Result]:
-    """Settings of one seed moved by what the mean over the seeds is beside it, on the mesh that they share."""
-    several = {result.setting.mesh: result for result in results if len(result.setting.seeds) > 1}
-    found = []
-    for result in results:
-        other = several.get(result.setting.mesh)
-        if other is not None and len(result.setting.seeds) == 1:
-            angles = result.angles + other.angles - other.single[0]
-            lengths = result.lengths + other.lengths - other.single[1]
-            result = replace(result, angles=angles, lengths=lengths, noise=other.noise)
-        found.append(result)
-    return found
-
-
-def _fineness(result: Result) -> tuple[float, ...]:
-    """Smaller is finer: the size of elements over their degree, and the step."""
-    kinematics, refinement, degree = result.setting.mesh
-    return _step(result) / (refinement * degree**2), not KINEMATICS[kinematics].reduced
-
-
-class _Sweep(NamedTuple):
-    """Results that differ in one factor, each half of the one before, the finest last."""
-
-    factor: str
-    results: list[Result]
-    words: str
-    level: Callable[[Result], Any]
-
-
-def _time_sweep(results: Sequence[Result]) -> _Sweep:
-    """Of halved steps on one mesh, the finest that may tell an order."""
-    found = _swept(results, lambda r: (r.setting.mesh[1] * r.setting.mesh[2] ** 2, r.setting.mesh), _step)
-    meshes = [f"refinement {r.setting.mesh[1]}, degree {r.setting.mesh[2]}" for r in found]
-    words = f"steps {', '.join(f'{_step(r):g}' for r in found)} on {''.join(meshes[-1:])}"
-    return _Sweep("time", found, words, _step)
-
-
-def _mesh_sweep(results: Sequence[Result]) -> _Sweep:
-    """Of doubled refinements with one degree and step: the highest degree, the smallest step that may tell an order."""
-    found = _swept(
-        results, lambda r: (r.setting.mesh[2], -_step(r), r.setting.mesh[0]), lambda r: 1.0 / r.setting.mesh[1]
-    )
-    refinements = ", ".join(str(r.setting.mesh[1]) for r in found)
-    words = f"refinements {refinements} of degree {found[-1].setting.mesh[2] if found else 0}"
-    return _Sweep("mesh", found, words, lambda r: r.setting.mesh[1:])
-
-
-def _step(result: Result) -> float:
-    return result.setting.step or np.inf
-
-
-def _swept(results: Sequence[Result], group: Callable[[Result], Any], size: Callable[[Result], float]) -> list[Result]:
-    """The last chain of three or more sizes in one group, or of two; nothing where there is none."""
-    groups = sorted({group(result) for result in results})
-    chains = [_halved({size(r): r for r in results if group(r) == one}) for one in groups]
-    return next((chain for length in (3, 2) for chain in reversed(chains) if len(chain) >= length), [])
-
-
-def _halved(by_size: dict[float, Result]) -> list[Result]:
-    """The longest chain of sizes that are each half of the one before, the finest last."""
-
-    def chain(size: float) -> list[float]:
-        coarser = next((s for s in by_size if same_time(s, 2 * size)), None)
-        return [size] if coarser is None else [*chain(coarser), size]
-
-    return [by_size[size] for size in max(map(chain, sorted(by_size)), key=len)]
-
-
-def _in_words(sweep: _Sweep, found: SweepLimit) -> str:
-    start, last = f"{sweep.factor}: ", f"the last two differ by {typical(found.last):.2g} degrees"
-    if typical(found.last) < NO_ERROR:
-        return f"{start}no error ({sweep.words}): {last}"
-    if found.trusted:
-        return f"{start}order {found.order:.2g} ({sweep.words}); the finest is {typical(found.beyond):.2g} degrees off"
-    return f"{start}no order seen ({sweep.words}), {last}: the estimates are differences to the finest, no better"
+def _row(result: Result, finest: Result) -> Row:
+    setting, seeds = result.setting, len(result.angles)
+    if result is finest:
+        return Row(setting, result.seconds, np.nan, np.nan, "the others are compared with it")
+    apart = result.angles - finest.angles  # seed by seed: steps are compared on the same cells
+    noise = typical(np.std(apart, axis=0, ddof=1)) / seeds**0.5 if seeds > 1 else 0.0
+    error, ratio = typical(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
+    shared = ["steps"] if setting.step < FINER * finest.setting.step else []
+    if not KINEMATICS[setting.scene.model.kinematics].homogeneous and setting.element < FINER * finest.setting.element:
+        shared.append("elements")
+    doubt = f"the finest has no finer {' and '.join(shared)}" if shared else ""
+    if NOISY * noise > error:
+        doubt = f"noise of random cells {noise:.2g}"
+    return Row(setting, result.seconds, error, float(np.nanmax(np.abs(ratio - 1))), doubt)
 
 
 # ---------------------------------------------------------------- the runs
-BUDGET = 600.0  # seconds
-
-
 def trade(
     scene: Scene,
     folder: Path | str | None = None,
-    budget: float = BUDGET,
+    budget: float = 600.0,
     jobs: int | None = None,
     quiet: bool = True,
 ) -> tuple[Path, Trade]:
-    """Run a scene with a ladder of settings, and estimate the error of each."""
-    study = _TradeStudy(scene, folder, ladder(scene), budget, jobs, quiet)
+    """Run a scene with a ladder of settings, within a budget of seconds, and compare each with the finest."""
+    study = _TradeStudy(scene, folder, budget, jobs, quiet)
     return study.answered(study.answer)
+
+
+@dataclass(frozen=True)
+class _SettingRun(Run):
+    setting: Setting
 
 
 class _TradeStudy(Study):
     """Runs in the order of their cost, within a budget."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        folder: Path | str | None,
-        settings: Sequence[Setting],
-        budget: float,
-        jobs: int | None,
-        quiet: bool,
-    ):
-        self.settings, self.budget = settings, budget
-        self.times = compared_times(scene, settings)
-        of_run = {f"{setting.name}-{seed}": (setting, seed) for setting in settings for seed in setting.seeds}
-        scenes = {name: as_run(setting, seed, self.times) for name, (setting, seed) in of_run.items()}
-        super().__init__("trade", scene, folder, scenes, jobs, quiet)
-        self.deadline = clock.monotonic() + budget
-        self._setting_of = {name: setting for name, (setting, _) in of_run.items()}
-        self._results: dict[str, Result] = {}
-        self._begun: dict[str, float] = {}
-        self._start = 0.0  # seconds before the first step: mesh, kernels, the search for an unloaded body
-        self._pace: dict[str, float] = {}  # seconds over those expected, by kinematics
-
-    @property
-    def results(self) -> list[Result]:
-        """Of the settings all of whose runs have reached the end, the cheapest expected first."""
-        return [self._results[setting.name] for setting in self.settings if setting.name in self._results]
+    def __init__(self, scene: Scene, folder: Path | str | None, budget: float, *how: Any):
+        super().__init__("trade", scene, folder, {}, *how)
+        self.settings, self.budget, self.deadline = ladder(scene), budget, clock.monotonic() + budget
+        for setting in self.settings:
+            for seed in setting.seeds:
+                run = as_run(setting, seed)
+                self.runs.append(_SettingRun(run.name, run, self.folder / run.name, setting))
+        self._results: dict[Setting, Result] = {}
 
     @property
     def left(self) -> list[Setting]:
-        """Those that have neither ended nor failed."""
-        failed = {self._setting_of[name].name for name in self.failed}
-        return [one for one in self.settings if one.name not in failed and one.name not in self._results]
+        """Settings that have neither ended nor failed."""
+        failed = {run.setting for run in self.runs if run.name in self.failed}
+        return [one for one in self.settings if one not in failed and one not in self._results]
 
     def answer(self) -> Trade:
         """The table of what was run."""
-        if len(self.results) < FEWEST_RUNS:
-            reached = f"{len(self.results)} of {len(self.settings)} settings reached the end"
-            advice = (
-                f"a larger budget goes on{self._needed()}" if self.left else "the same command tries again what failed"
-            )
+        if len(self._results) < FEWEST_RUNS:
+            reached = f"{len(self._results)} of {len(self.settings)} settings reached the end"
+            advice = f"a larger budget goes on{self._needed()}" if self.left else "the same command tries again"
             raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, advice)
-        rows, notes = estimated(self.results)
-        if self.left:
-            notes = [*notes, f"left out, over the budget: {', '.join(setting.name for setting in self.left)}"]
-        return Trade(self.scene, rows, notes, self.failed)
+        names = ", ".join(setting.name for setting in self.left)
+        notes = [f"left out, over the budget: {names}"] if names else []
+        return Trade(self.scene, compared([*self._results.values()]), notes, self.failed)
 
     def fits(self, run: Run) -> bool:
         """Whether a run that begins now would end in time, by what others have taken."""
-        self._begun[run.name] = clock.monotonic()
-        return self._begun[run.name] + self._seconds(self._setting_of[run.name]) < self.deadline
+        assert isinstance(run, _SettingRun)
+        return clock.monotonic() + self._seconds(run.setting) < self.deadline
 
     def _seconds(self, setting: Setting) -> float:
-        """Of a run, by what others of its kind have taken, or else by the slowest."""
-        pace = self._pace.get(setting.kinematics, max(self._pace.values(), default=1.0))
-        return self._start + pace * setting.expected_seconds
-
-    def _needed(self) -> str:
-        """What the settings that are left take, once one has ended; nothing where the budget has it."""
-        seconds = sum(self._seconds(setting) * len(setting.seeds) for setting in self.left) / self.jobs
-        if not self._pace or seconds < self.deadline - clock.monotonic():
-            return ""
-        return f"; all settings take about {_shown(seconds / 60):g} min more (--budget)"
+        """Seconds of a run, in proportion to those that have ended, of which the dearest count most."""
+        took = sum(result.wall_seconds for result in self._results.values())
+        expected = sum(setting.expected_seconds for setting in self._results)
+        return START_SECONDS + setting.expected_seconds * (took / expected if expected else 1.0)
 
     def _progress(self) -> str:
         return super()._progress() + self._needed()
 
+    def _needed(self) -> str:
+        """What the settings that are left take, once one has ended; nothing where the budget has it."""
+        seconds = sum(self._seconds(setting) * len(setting.seeds) for setting in self.left) / self.jobs
+        if not self._results or seconds < self.deadline - clock.monotonic():
+            return ""
+        return f"; all settings take about {seconds / 60:.2g} min more (--budget)"
+
     def learn(self) -> None:
-        """Read what is new, and how long it took."""
-        for setting in (one for one in self.settings if one.name not in self._results):
-            runs = [run for run in self.runs if self._setting_of[run.name] is setting]
+        """Read what is new."""
+        for setting in self.left:
+            runs = [run for run in self.runs if run.setting is setting]
             with suppress(RecordingError):  # one that is damaged will be among those that have failed
                 if all(run.is_complete() for run in runs):
-                    result = self._results[setting.name] = read(setting, runs, self.times)
-                    self._pace[setting.kinematics] = max(result.wall_seconds / setting.expected_seconds, 0.1)
-                    took = [clock.monotonic() - self._begun[run.name] for run in runs if run.name in self._begun]
-                    self._start = max(min(took, default=0.0) - result.wall_seconds, 0.0)
+                    self._results[setting] = read(setting, [run.history() for run in runs])
 
 
-def read(setting: Setting, runs: Sequence[Run], times: Sequence[float]) -> Result:
-    """The rows at some times of the runs of a setting."""
-    angles, lengths, seconds, wall = [], [], [], []
-    for run in runs:
-        history = run.history()
-        rows = [next(r for r, time in enumerate(history["time"]) if same_time(float(time), t)) for t in times]
-        angles.append(np.array([history[name] for name in PROFILE]).T[rows])
-        lengths.append(np.array([history[name] for name in compared_lengths(setting.scene)[1]]).T[rows])
-        seconds.append(float(np.nansum(history["processor_seconds"])))
-        wall.append(float(np.nansum(history["seconds"])))
-    noise = np.std(angles, axis=0, ddof=1) / np.sqrt(len(angles)) if len(angles) > 1 else np.zeros(1)
-    single = angles[0], lengths[0]
-    means = np.mean(angles, axis=0), np.mean(lengths, axis=0)
-    return Result(setting, *means, float(np.mean(seconds)), float(np.mean(wall)), typical(noise), single)
+def read(setting: Setting, histories: Sequence[Mapping[str, Array]]) -> Result:
+    """What is compared of the runs of a setting, between rows on the straight line."""
+    times = np.linspace(0.0, setting.scene.last_time, COMPARED + 1)[1:]
+
+    def columns(names: Sequence[str]) -> Array:
+        return np.array([[np.interp(times, each["time"], each[name]) for name in names] for each in histories])
+
+    seconds, wall = (
+        float(np.mean([np.nansum(each[name]) for each in histories])) for name in ("processor_seconds", "seconds")
+    )
+    return Result(setting, columns(PROFILE), columns(compared_lengths(setting.scene)[1]), seconds, wall)
 
 
 # ---------------------------------------------------------------- the answer: words, a table, a picture, scenes
@@ -515,7 +294,7 @@ WANTED = 1.0  # degrees of error, which the verdict asks for: less than what ran
 
 @dataclass(frozen=True)
 class Trade(Answer):
-    """The table, and what it rests on."""
+    """The table."""
 
     scene: Scene
     rows: list[Row]
@@ -523,37 +302,39 @@ class Trade(Answer):
     failed: dict[str, str] = field(default_factory=dict)
 
     name = "trade"
-    caption = "Estimated errors; filled: no other setting is as good for less."
+    caption = "Errors against the finest setting; filled: no other setting is as good for less."
 
     @property
     def title(self) -> str:
         """Of the picture."""
         return f"{self.scene.name}: error and cost of its settings"
 
-    def table(self) -> dict[str, list[str] | list[float] | list[int]]:
+    def table(self) -> dict[str, list[Any]]:
         """A row for each setting."""
         rows = self.rows
         return {
-            "setting": [row.result.setting.name for row in rows],
-            "scene": [_scene_file(row) for row in rows],
+            "setting": [row.setting.name for row in rows],
+            "scene": [f"{ROWS}/{row.setting.name}.toml" for row in rows],
             "error_degrees": [row.angle_error for row in rows],
             f"error_{compared_lengths(self.scene)[0]}": [row.length_error for row in rows],
-            "cpu_seconds": [row.result.seconds for row in rows],
+            "cpu_seconds": [row.seconds for row in rows],
             "on_front": [int(row.on_front) for row in rows],
             "trusted": [int(not row.doubt) for row in rows],
             "doubt": [row.doubt for row in rows],
-            "noise": [row.result.noise for row in rows],
         }
 
     def lines(self) -> list[str]:
         """A row for each setting."""
-        lines = [f"{'':2}{'seconds':>9} {'degrees':>9} {compared_lengths(self.scene)[0] + ' %':>9}  setting"]
-        for row in self.rows:
-            numbers = f"{row.result.seconds:9.2g} {row.angle_error:9.2g} {100 * row.length_error:9.2g}"
-            doubt = f"  ({row.doubt})" if row.doubt else ""
-            lines.append(f"{'* ' if row.on_front else '  '}{numbers}  {row.result.setting.name}{doubt}")
-        about = "*: no other setting is as good for less. Errors are estimates; degrees: fibre angle, root mean square."
-        return [*lines, about]
+        rows, lengths = self.rows, f"{compared_lengths(self.scene)[0]} %"
+        numbers = {
+            "seconds": [row.seconds for row in rows],
+            "degrees": [row.angle_error for row in rows],
+            lengths: [100 * row.length_error for row in rows],
+        }
+        names = [row.setting.name + (f"  ({row.doubt})" if row.doubt else "") for row in rows]
+        about = "*: no other setting is as good for less. Errors are differences from the finest setting; degrees: "
+        stars = ["*" if row.on_front else "" for row in rows]
+        return [*aligned({"": stars, **numbers, "setting": names}, 1, 2), f"{about}fibre angle, root mean square."]
 
     def verdict(self) -> str:
         """What `WANTED` degrees cost."""
@@ -561,54 +342,36 @@ class Trade(Answer):
         good = [row for row in trusted if row.angle_error <= WANTED]
         if not trusted:
             return f"Not known: all {len(self.rows)} errors are doubted; trade.csv says why."
-        best = min(good or trusted, key=lambda row: (row.result.seconds if good else 0.0, row.angle_error))
-        cost = f"{best.result.seconds:.2g} s of the processor for an error of {best.angle_error:.2g} degrees"
-        name = best.result.setting.name
+        best = min(good or trusted, key=lambda row: (row.seconds if good else 0.0, row.angle_error))
+        cost = f"{best.seconds:.2g} s of the processor for an error of {best.angle_error:.2g} degrees"
         if not good:
-            return f"No setting is known to be within {WANTED:g} degree; the closest is {name}, {cost}."
-        return f"The cheapest setting within {WANTED:g} degree is {name}, {cost}."
+            return f"No setting is known to be within {WANTED:g} degree; the closest is {best.setting.name}, {cost}."
+        return f"The cheapest setting within {WANTED:g} degree is {best.setting.name}, {cost}."
 
     def write(self, folder: Path) -> None:
         """Write the table, the picture, and a scene of each row."""
         make_own_folder(folder / ROWS)
-        for row in self.rows:
-            header = (
-                f"{self.scene.name}: {row.angle_error:.2g} degrees and {100 * row.length_error:.2g} % off for "
-                f"{row.result.seconds:.2g} s, as estimated by remodel-fenicsx trade"
-            )
-            header += f" ({row.doubt})" if row.doubt else ""
-            write_whole(folder / _scene_file(row), row.result.setting.scene.to_toml(header).encode())
+        for row, file in zip(self.rows, self.table()["scene"], strict=True):
+            header = f"{row.setting.name} of {self.scene.name}, {row.seconds:.2g} s; ../trade.csv has its errors"
+            write_whole(folder / file, row.setting.scene.to_toml(header).encode())
         super().write(folder)
 
     def figure(self) -> Figure:
-        """Cost against error; points of the front have numbers, and beside the axes stands what they are."""
-        shown = [row for row in self.rows if row.angle_error > 0]
-        front = [row for row in shown if row.on_front]
-        kinds = dict(zip(dict.fromkeys(row.result.setting.kinematics for row in shown), COLOURS, strict=False))
+        """Cost against error; beside the axes stands what the front is, from left to right."""
+        places = [(row.seconds, row.angle_error, row) for row in self.rows if row.angle_error > 0]
+        front = [place for place in places if place[2].on_front]
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         axes = figure.subplots()
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
-        axes.plot(*_places(front), color="0.6", zorder=0, lw=0.8)
-        for kinematics, colour in kinds.items():
-            same = [row for row in shown if row.result.setting.kinematics == kinematics]
-            axes.plot(*_places(same), "o", color=colour, markerfacecolor="white", markersize=4, label=kinematics)
-            axes.plot(*_places([row for row in same if row.on_front]), "o", color=colour, markersize=5)
-        if kinds:
-            figure.legend(loc="outside lower left", ncols=3)
-            names = [row.result.setting.name for row in front]
-            names += [f"no error: {row.result.setting.name}" for row in self.rows if row.on_front and row not in front]
+        for shown, line, face in ((places, "o", "white"), (front, "o-", COLOURS[0])):
+            if shown:
+                axes.plot(*zip(*((x, y) for x, y, _ in shown), strict=True), line, color=COLOURS[0], mfc=face, lw=0.8)
+        if front:
             place: dict[str, Any] = {"loc": "outside right center", "handlelength": 0, "fontsize": 6.5}
             place |= {"title": "filled, from left to right: no\nother one is as good for less", "title_fontsize": 7.5}
-            figure.legend([Line2D([], [], linestyle="")] * len(names), names, **place)
+            names = [row.setting.name for *_, row in front]
+            figure.legend([Line2D([], [], linestyle="")] * len(front), names, **place)
         return figure
-
-
-def _scene_file(row: Row) -> str:
-    return f"{ROWS}/{row.result.setting.name}.toml"
-
-
-def _places(rows: list[Row]) -> tuple[list[float], list[float]]:
-    return [row.result.seconds for row in rows], [row.angle_error for row in rows]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SECONDS_TO_END = 30.0  # seconds
-SERVE = "serve"  # the command of a worker's process
+SERVE, PART = "serve", "fit-part"  # commands of processes: of a worker, and of what it does for a fit
 
 
 class Worker:

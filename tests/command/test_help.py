@@ -13,8 +13,9 @@ from remodel_fenicsx import cli
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 
 (SUBPARSERS,) = [action for action in cli.parser()._actions if isinstance(action, argparse._SubParsersAction)]
+OF_PROCESSES = {cli.SERVE, cli.PART}
 COMMANDS: dict[str, argparse.ArgumentParser] = {
-    name: found for name, found in SUBPARSERS.choices.items() if name != cli.SERVE
+    name: found for name, found in SUBPARSERS.choices.items() if name not in OF_PROCESSES
 }
 
 
@@ -28,7 +29,7 @@ def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> Non
     with pytest.raises(SystemExit) as end:
         cli.main(["--help"])
     text = capsys.readouterr().out
-    assert end.value.code == 0 and set(COMMANDS) == {*cli.COMMANDS} - {cli.SERVE}
+    assert end.value.code == 0 and set(COMMANDS) == {*cli.COMMANDS} - OF_PROCESSES
     assert all(re.search(rf"^    {name} ", text, re.MULTILINE) for name in COMMANDS)
     assert all(re.search(rf"^  {code} +\w", text, re.MULTILINE) for code in cli.EXIT_CODES)
 

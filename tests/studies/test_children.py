@@ -38,29 +38,17 @@ def test_one_process_does_many_commands(worker: Worker, tmp_path: Path) -> None:
     """Each with words of its own; then it is killed in one of them."""
     scene, number = tmp_path / "step-0.5.toml", worker.process.pid
     scene.write_text(pulled_cube(5000.0).to_toml())
-    said = [tmp_path / f"{name}.txt" for name in ("one", "two", "three", "four")]
+    said = [tmp_path / f"{name}.txt" for name in ("one", "two", "three")]
     assert end_of(worker, ["validate", str(tmp_path / "nothing.toml")], said[0]) == 2
     assert worker.last_words().endswith("nothing.toml: no such file; a scene is a TOML file")
     assert end_of(worker, ["no-such-command"], said[1]) == 2  # argparse ends in a way of its own
-    assert end_of(worker, ["validate", str(scene)], said[2]) == 0
-    assert worker.last_words().startswith("formulation 'displacement': lambda/mu = ")
-    assert [file.read_text().count("no such file") for file in said[:3]] == [1, 0, 0]
-    assert "a valid scene (cube" in said[2].read_text() and worker.is_alive and worker.process.pid == number
-    worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], said[3])
+    assert "no such file" not in said[1].read_text() and worker.is_alive and worker.process.pid == number
+    worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], said[2])
     assert worker.poll() is None and worker.is_at_work
     os.kill(number, signal.SIGKILL)
     wait_for_one([worker], 300.0)
     assert worker.poll() == -signal.SIGKILL and worker.last_words() == "killed by SIGKILL"
-    assert end_of(worker, ["info"], said[3]) == -signal.SIGKILL  # who is not there does nothing
-
-
-def test_what_is_at_work_is_stopped(tmp_path: Path) -> None:
-    """As by a signal: what is recorded stays."""
-    scene, worker = tmp_path / "scene.toml", Worker()
-    scene.write_text(pulled_cube(5000.0).to_toml())
-    worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], tmp_path / "said.txt")
-    worker.stop()
-    assert worker.process.returncode in (128 + signal.SIGTERM, -signal.SIGTERM)
+    assert end_of(worker, ["info"], said[2]) == -signal.SIGKILL  # who is not there does nothing
 
 
 # ---------------------------------------------------------------- the processes of a study
@@ -92,11 +80,7 @@ def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
 FIT = ARTERY.parent / "fit"
 
 
-KILLED = [("child", signal.SIGKILL, 5), ("child", signal.SIGTERM, 5), ("child", signal.SIGHUP, 5)]
-KILLED += [("parent", signal.SIGTERM, 143), ("parent", signal.SIGINT, 130)]
-
-
-@pytest.mark.parametrize(("whose", "number", "code"), KILLED)
+@pytest.mark.parametrize(("whose", "number", "code"), [("child", signal.SIGKILL, 5), ("parent", signal.SIGINT, 130)])
 def test_a_fit_whose_process_is_killed_ends(whose: str, number: signal.Signals, code: int, tmp_path: Path) -> None:
     """Who is short of memory kills a process: one line, and what was evaluated stays."""
     words = ["fit", str(FIT / "scene.toml"), str(FIT / "inflation.toml"), "--starts", "999", "--jobs", "2", "-o", "out"]

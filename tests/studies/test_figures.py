@@ -17,14 +17,13 @@ from PIL import Image
 
 import remodel_fenicsx
 from docs.making import verification
-from remodel_fenicsx.scene.scene import Scene, scene_from_dict
-from remodel_fenicsx.studies import page
+from docs.making.pages import read_table
+from remodel_fenicsx.scene.scene import Scene
 from tests.conftest import Refused
 from tests.forks import forked
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
 DOCS = PACKAGE.parent / "docs"
-TINY = {"name": "tiny", "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tendon"}, "time": {"end": 2.0}}
 
 
 def loaded(path: Path) -> Any:
@@ -86,12 +85,6 @@ def test_every_figure_of_the_paper_is_there_and_every_run_is_drawn() -> None:
     assert all(scene.name == name for name, scene in known.items())
 
 
-def test_an_older_table_is_read(tmp_path: Path) -> None:
-    """It begins with what was said of it."""
-    (tmp_path / "fig1.csv").write_text("# remodel_fenicsx figures 0.3.0: fig1\n# no simulation\nextension\n0.5\n")
-    assert page.read_table(tmp_path / "fig1.csv")["extension"].tolist() == [0.5]
-
-
 # ---------------------------------------------------------------- which recorded runs are valid
 
 
@@ -105,24 +98,6 @@ def begun_in_a_fork(scene: Scene, folder: Path, begin: Any = figures.begin) -> A
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figures, "subprocess", SimpleNamespace(Popen=ended))
         return begin(scene, folder)
-
-
-def tiny(**changes: float | str) -> Scene:
-    """Two steps of the tendon."""
-    return scene_from_dict(TINY).with_values({key.replace("__", "."): value for key, value in changes.items()})
-
-
-def test_a_failing_run_ends_the_script_with_its_code(tmp_path: Path) -> None:
-    # more than any chain can bear at once, and no part of the step is tried
-    torn = tiny(name="torn", loads__force__value=1e9, solver__maximum_halvings=0)
-    with pytest.raises(SystemExit) as end:
-        figures.run_all([torn], tmp_path, 1)
-    assert end.value.code == 3 and not figures.is_complete(torn, figures.run_folder(torn, tmp_path))
-
-
-def test_another_scene_is_another_run(tmp_path: Path) -> None:
-    folders = {figures.run_folder(scene, tmp_path) for scene in (tiny(), tiny(), tiny(remodeling__kappa=0.03))}
-    assert len(folders) == 2
 
 
 # ---------------------------------------------------------------- figures 1 and 5 against closed forms
@@ -140,14 +115,14 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", ["fig1", "fig5"])
 def test_the_numbers_are_those_of_the_page(drawn: Path, name: str) -> None:
-    found, kept = (page.read_table(folder / f"{name}.csv") for folder in (drawn, DOCS / "figures"))
+    found, kept = (read_table(folder / f"{name}.csv") for folder in (drawn, DOCS / "figures"))
     assert list(found) == list(kept)
     for column, values in kept.items():
         np.testing.assert_allclose(found[column], values, rtol=1e-6, atol=1e-6)
 
 
 def test_fig1_is_eq_2(drawn: Path) -> None:
-    table = page.read_table(drawn / "fig1.csv")
+    table = read_table(drawn / "fig1.csv")
     x = table["extension"]
     assert len(x) > 100 and x[0] == 0 and 0.9 < x[-1] < 1
     for A in (0.1, 0.4, 0.8):
@@ -175,7 +150,7 @@ def test_all_numbers_are_those_of_the_page(tmp_path: Path, monkeypatch: pytest.M
     tables = [path for name in figures.FIGURES for path in (DOCS / "figures").glob(f"{name}[.-]*csv")]
     assert len(tables) == 14
     for path in tables:
-        found, kept = (page.read_table(folder / path.name) for folder in (tmp_path, DOCS / "figures"))
+        found, kept = (read_table(folder / path.name) for folder in (tmp_path, DOCS / "figures"))
         assert list(found) == list(kept)
         for column, values in kept.items():
             if values.dtype.kind == "f":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Scene
-from remodel_fenicsx.studies.stability import stability, unseen_by
 from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
 from tests.runs import made, simulated
@@ -130,15 +128,3 @@ def test_who_is_told(scene: Scene, told: str, caplog: Any) -> None:
     assert len(lines) == bool(told), lines
     for line in lines:
         assert f"its {told} along z is about " in line and "set model.kinematics = 'full'" in line
-
-
-# ---------------------------------------------------------------- the analysis of passes
-def test_the_analysis_of_a_reduction_says_what_it_does_not_see(tmp_path: Path) -> None:
-    changes = {"material.chain_density": 2e21, "remodeling.law": "explicit", "geometry.length": 8.0, "time.end": 2.0}
-    scene = slender("radial", 0.5, **changes)
-    place, found = stability(scene, tmp_path / "radial", 1, MPI.COMM_SELF)
-    log = (place / "run.log").read_text()
-    unseen = unseen_by(found.scene)
-    assert "kinematics 'radial' sees changes that keep its symmetry only" in unseen
-    assert unseen in found.in_words()
-    assert f"time 2: a pass multiplies the worst small change by {found.columns['factor'][0]:.3g}" in log

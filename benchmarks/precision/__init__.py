@@ -1,1 +1,0 @@
-"""What benchmarks/work_precision.py measures: runs that are kept, and settings of the whole tube."""
