@@ -671,12 +671,10 @@ def _stability(options: argparse.Namespace) -> None:
 @command("info", ["info"], needs=COMPUTES)
 def _info(options: argparse.Namespace) -> None:
     """Print the versions of the program and its libraries, the solvers and the BLAS."""
-    from remodel_fenicsx.fem.jit import has_simd_logarithm
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
     from remodel_fenicsx.kernels import is_available
 
     found = versions() | {
-        "logarithms": "of several points at once" if has_simd_logarithm() else "point by point",
         "kept factors": f"in {'single' if is_available() else 'double'} precision",
         "solver methods": ", ".join(SOLVER_METHODS),
     }

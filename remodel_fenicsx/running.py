@@ -278,7 +278,7 @@ def _record(
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
             fields = stack.enter_context(agreed(comm, lambda: Fields(*parts, times)))
-            followers, kept = [*followers, fields], [*kept, fields.publish]
+            followers, kept = [*followers, fields], [*kept, fields.close]
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, kept)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
         followers += [record, _Report(scene, progress), checkpoints, pause]

@@ -10,9 +10,6 @@ import importlib.util
 import logging
 import os
 import platform
-import resource
-import shlex
-import subprocess
 import sysconfig
 import tempfile
 import time as clock
@@ -36,7 +33,7 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.system.interrupts import PAUSE, SIGNALS, Interrupted, blocked, stopping_at_once
+from remodel_fenicsx.system.interrupts import PAUSE, SIGNALS, blocked, stopping_at_once
 from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
@@ -70,10 +67,8 @@ _KINDS = {
     1: ("the residual", 1, COMPILER_FLAGS),
     2: ("the tangent", 3, TANGENT_FLAGS),
 }
-_GRACE = 0.5  # seconds: whatever ended the compiler may be about to end this process too
 
 _compiled: list[str] = []
-_waited_for: set[str] = set()
 
 
 def compiled_kernels() -> tuple[str, ...]:
@@ -93,17 +88,13 @@ def cache_folder() -> Path:
     except OSError:  # on macOS
         processor = platform.processor()
     name = f"remodel-{hashlib.sha256((platform.machine() + processor).encode()).hexdigest()[:8]}"
-    folder = base / "fenics" / name
-    with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():  # what is there is loaded and run
-            return folder
-    other = Path(tempfile.gettempdir()) / f"remodel-fenicsx-forms-{os.getuid()}"
-    other.mkdir(mode=0o700, exist_ok=True)
-    if other.is_symlink() or other.stat().st_uid != os.getuid():
-        raise PermissionError(f"{other}: belongs to another user; set TMPDIR to a folder of your own")
-    log.warning("cannot write to %s, or it belongs to another user: forms are compiled into %s", folder, other)
-    return other / name
+    for folder in (base / "fenics" / name, Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"):
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():  # what is there is run
+                return folder
+        log.warning("cannot write to %s, or it belongs to another user: forms are compiled elsewhere", folder)
+    raise PermissionError(f"{folder}: belongs to another user; set TMPDIR to a folder of your own")
 
 
 # dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder: that may be somebody
@@ -111,18 +102,6 @@ def cache_folder() -> Path:
 with chdir("/"):
     dolfinx.jit.get_options()
     ffcx.options.get_options()
-
-
-@functools.cache
-def has_simd_logarithm() -> bool:
-    """Whether kernels take logarithms of several points at once: compiler, C library and processor know how."""
-    source = "#include <math.h>\nvoid f(double *restrict y) { for (int i = 0; i < 64; i++) y[i] = log(y[i]); }\n"
-    command = [*shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC")), *COMPILER_FLAGS]
-    try:
-        done = subprocess.run([*command, "-S", "-x", "c", "-", "-o", "-"], input=source, capture_output=True, text=True)
-    except OSError:  # no compiler: cached kernels run without one
-        return False
-    return "_ZGV" in done.stdout
 
 
 def jit_options(flags: list[str] = COMPILER_FLAGS) -> dict[str, Any]:
@@ -289,41 +268,20 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 
 @contextmanager
 def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
-    """The only process that compiles this kernel; a signal stops it at once, and then nothing of the kernel stays."""
-    # SIGUSR1 waits: one sent to the whole group would kill a compiler
-    with stopping_at_once(), blocked(PAUSE), _alone(kernel):
+    """The only process that compiles this kernel; signals wait until it is there."""
+    # also for the compiler: a terminal and batch systems send them to all processes of a job
+    with stopping_at_once(), _alone(kernel), blocked(*SIGNALS, PAUSE):
         if _is_cached(kernel):  # by the run that this one has waited for
             yield
             return
         log.log(NOTICE, "compiling %s, once on this machine: about %d s", what, seconds)
-        start, before = clock.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-        handlers = logging.getLogger().handlers.copy()
-        try:
-            yield
-        except BaseException as error:
-            logging.getLogger().handlers = handlers  # FFCx has put others there, and gives them back on success only
-            _remove(kernel)
-            _raise_if_killed(error)
-            raise
-        spent = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
-        elapsed = clock.monotonic() - start
-        log.info("compiled %s in %.1f s, %.1f s of processor time in the compiler: %s", what, elapsed, spent, kernel)
+        start = clock.monotonic()
+        yield
+        log.info("compiled %s in %.1f s: %s", what, clock.monotonic() - start, kernel)
         _compiled.append(kernel)
         if os.environ.get(COMPILED):
             with open(os.environ[COMPILED], "a") as file:
                 file.write(f"{kernel}\n")
-
-
-def _raise_if_killed(error: BaseException | None) -> None:
-    """A compiler that a signal has ended is an interruption, whether the signal was for this process too or not."""
-    if not isinstance(error, Exception) or isinstance(error, Interrupted):
-        return
-    clock.sleep(_GRACE)  # Interrupted is raised here if the signal is on its way
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, subprocess.CalledProcessError) and -cause.returncode in SIGNALS:
-            raise Interrupted(-cause.returncode, on_all_ranks=False) from error
-        cause = cause.__cause__ or cause.__context__
 
 
 # ---------------------------------------------------------------- the cache
@@ -339,11 +297,6 @@ def _is_cached(kernel: str) -> bool:
     return all(path.exists() for path in _files(kernel))
 
 
-def _remove(kernel: str) -> None:
-    for path in cache_folder().glob(f"{kernel}.*"):
-        path.unlink(missing_ok=True)
-
-
 @contextmanager
 def _alone(kernel: str) -> Iterator[None]:
     """Only one process compiles a kernel, so that whatever is unfinished of it was cut off before: it is removed."""
@@ -357,7 +310,8 @@ def _alone(kernel: str) -> Iterator[None]:
             _take(lock)
             if not _is_cached(kernel) and any(path.exists() for path in _files(kernel)):
                 log.info("removing a compilation that was cut off: %s", kernel)
-                _remove(kernel)
+                for path in folder.parent.glob(f"{kernel}.*"):
+                    path.unlink(missing_ok=True)
         except OSError as error:  # some network file systems have no locks
             log.warning(
                 "%s cannot be locked (%s): several runs at a time may wait for each other", lock.name, error.strerror
@@ -371,12 +325,7 @@ def _take(lock: IO[str]) -> None:
     except BlockingIOError:
         lock.seek(0)
         process = lock.read().strip() or "unknown"
-        log.log(
-            logging.INFO if process in _waited_for else NOTICE,  # once on the terminal, not for every kernel
-            "another run is compiling the same (process %s): waiting for it",
-            process,
-        )
-        _waited_for.add(process)
+        log.log(NOTICE, "another run is compiling the same (process %s): waiting for it", process)
         fcntl.flock(lock, fcntl.LOCK_EX)
     lock.truncate(0)
     lock.write(f"{os.getpid()}\n")

@@ -689,7 +689,7 @@ def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
         return page_with(cards(ReportedRun(recording)))
     of_a_time = 4 / 3 * RATIO * (6 * len(recording.points) + 11 * len(recording.elements))  # bytes, in base64
     whole, most = WholeBody(recording), max(FEWEST_TIMES, int(1e6 * size / of_a_time))
-    body = ShownBody.of(whole, kept_times(recording.history, recording.times, most))
+    body = ShownBody.of(whole, kept_times(recording.times, most))
     return page_with(cards(ReportedRun(recording, body)))
 
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.recording import series_file
 from remodel_fenicsx.system.files import ClosedAtEnd, part_of
-from remodel_fenicsx.system.interrupts import handled
+from remodel_fenicsx.system.interrupts import blocked
 
 if TYPE_CHECKING:
     import h5py
@@ -46,18 +46,6 @@ _ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
 # of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
 # floats become smaller by a fifth only, and a step would take twice as long
 _COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
-
-
-@contextmanager
-def signals_held_back() -> Iterator[None]:
-    """Let Python's signal handlers run after the block: an exception below HDF5 would crash the process."""
-    caught: list[int] = []
-    try:
-        with handled(lambda number, _: caught.append(number), signal.valid_signals(), callable):
-            yield
-    finally:
-        for number in caught:
-            signal.raise_signal(number)
 
 
 class PatientFile(io.FileIO):
@@ -98,7 +86,7 @@ class RecordedStep(NamedTuple):
 
 
 class TransientGrid(ClosedAtEnd):
-    """A time series on one grid, written beside its place: `publish` and the end give it its name, whole."""
+    """A time series on one grid, written beside its place: `close` gives it its name, whole."""
 
     def __init__(
         self,
@@ -140,7 +128,7 @@ class TransientGrid(ClosedAtEnd):
     @contextmanager
     def _written(self) -> Iterator[h5py.File]:
         """Within, HDF5 writes; no signal comes between, whose handler might raise in `PatientFile.write`."""
-        with signals_held_back():
+        with blocked(*signal.valid_signals()):
             yield self._file
             self._file.flush()
         self._disk.check()
@@ -182,33 +170,22 @@ class TransientGrid(ClosedAtEnd):
 
     def __exit__(self, *error: object) -> None:
         if error[0] is not None:  # not whole
-            with signals_held_back():
+            with blocked(*signal.valid_signals()):
                 self._file.close()
             self._disk.close()
         self.close()
 
-    def publish(self) -> None:
-        """Give the file its name; the next step goes on in a copy."""
-        if not self._disk.closed:
-            self._give_name()
-
-    def _give_name(self) -> None:
-        try:
-            with signals_held_back():
-                self._file.close()
-            self._disk.check()
-            os.fsync(self._disk.fileno())
-            self._part.replace(self.path)
-        finally:  # what is not whole goes
-            self._disk.close()
-            self._part.unlink(missing_ok=True)
-
     def close(self) -> None:
-        """Give the file its name, if it is whole, for good; more than once does no harm."""
+        """Give the file its name, if it is whole; a next step goes on in a copy."""
         try:
             if not self._disk.closed:
-                self._give_name()
-        finally:
+                with blocked(*signal.valid_signals()):
+                    self._file.close()
+                self._disk.check()
+                os.fsync(self._disk.fileno())
+                self._part.replace(self.path)
+        finally:  # what is not whole goes
+            self._disk.close()
             self._part.unlink(missing_ok=True)
 
     @staticmethod

@@ -7,13 +7,11 @@ import math
 import os
 import sys
 import time as clock
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from logging.handlers import MemoryHandler
 from pathlib import Path
-from statistics import median_low
 from typing import Any, Self, cast
 
 from remodel_fenicsx.system import NOTICE
@@ -21,7 +19,6 @@ from remodel_fenicsx.system.files import open_own
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
-LAST_PACES = 20  # steps, whose seconds tell those of the next ones
 LINE_EVERY = 10.0  # seconds, of lines that stay
 
 
@@ -32,9 +29,7 @@ class Progress:
         self._total, self._title, self._done = total_steps, title, done
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
-        # step and clock: of the first one of a process, which compiles, too
-        self._last: tuple[float, float] | None = None
-        self._paces: deque[float] = deque(maxlen=LAST_PACES)  # seconds a step
+        self._first: tuple[float, float] | None = None  # step and clock: what it takes to compile is past
         self._pending: str | None = None  # the newest line that was not printed
         self._bar: Any = None  # rich's, on a terminal
 
@@ -96,14 +91,12 @@ class Progress:
             announce(f"{self._title}: {text}")
 
     def _time_left(self, index: float) -> str:
-        """The median of the last steps, times the steps that are left; the first one says nothing."""
-        now, last = clock.monotonic(), self._last
-        if last is None or index > last[0]:
-            self._last = index, now
-        if last is not None and index > last[0]:
-            self._paces.append((now - last[1]) / (index - last[0]))
-        remaining = self._total - index
-        return f"{duration(median_low(self._paces) * remaining)} left" if self._paces and remaining > 0 else ""
+        """The mean time of a step after the first one, times the steps that are left."""
+        now, remaining = clock.monotonic(), self._total - index
+        self._first = first, since = self._first or (index, now)
+        if index <= first or remaining <= 0:
+            return ""
+        return f"{duration((now - since) / (index - first) * remaining)} left"
 
 
 def _joined(*parts: str) -> str:
@@ -125,22 +118,14 @@ def _bar(title: str, total: int | None, done: float) -> Any:
     """Title, bar, step, state, time so far, time left on one line of stderr; what others print stands above it."""
     from rich.console import Console  # late: most runs have no terminal
     from rich.progress import BarColumn, Progress as RichProgress, TextColumn, TimeElapsedColumn
-    from rich.table import Column
-
-    class Cropped(TextColumn):
-        def render(self, task: Any) -> Any:
-            text = super().render(task)
-            text.no_wrap, text.overflow = True, "ellipsis"
-            return text
 
     named, count, state, left = (f"{{task.fields[{name}]}}" for name in ("title", "count", "state", "left"))
-    plain: dict[str, Any] = {"markup": False}
-    cropped = plain | {"table_column": Column()}
-    columns = Cropped(named, **cropped), BarColumn(24), TextColumn(count, **plain), Cropped(state, **cropped)
+    title_column, *columns = (TextColumn(text, markup=False) for text in (named, count, state))
     console = Console(stderr=True)
     console.width -= 3  # a line that reaches the edge is broken by the ^C that a terminal shows, and stands there twice
     how: dict[str, Any] = {"console": console, "refresh_per_second": 4, "redirect_stdout": sys.stdout.isatty()}
-    found = RichProgress(*columns, TimeElapsedColumn(), TextColumn(left, **plain), **how)
+    last = TimeElapsedColumn(), TextColumn(left, markup=False)
+    found = RichProgress(title_column, BarColumn(24), *columns, *last, **how)
     found.add_task("", total=total, completed=done, title=title, count="", state="starting", left="")  # type: ignore
     return found
 
