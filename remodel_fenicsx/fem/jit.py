@@ -33,7 +33,7 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.system.interrupts import PAUSE, SIGNALS, blocked, stopping_at_once
+from remodel_fenicsx.system.interrupts import held_back, stopping_at_once
 from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
@@ -88,12 +88,13 @@ def cache_folder() -> Path:
     except OSError:  # on macOS
         processor = platform.processor()
     name = f"remodel-{hashlib.sha256((platform.machine() + processor).encode()).hexdigest()[:8]}"
-    for folder in (base / "fenics" / name, Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"):
+    places = base / "fenics" / name, Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"
+    for folder in places:
         with suppress(OSError):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():  # what is there is run
                 return folder
-        log.warning("cannot write to %s, or it belongs to another user: forms are compiled elsewhere", folder)
+        log.warning("cannot write to %s, or it belongs to another user: forms are compiled below %s", *places)
     raise PermissionError(f"{folder}: belongs to another user; set TMPDIR to a folder of your own")
 
 
@@ -270,7 +271,7 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
     """The only process that compiles this kernel; signals wait until it is there."""
     # also for the compiler: a terminal and batch systems send them to all processes of a job
-    with stopping_at_once(), _alone(kernel), blocked(*SIGNALS, PAUSE):
+    with stopping_at_once(), _alone(kernel), held_back():
         if _is_cached(kernel):  # by the run that this one has waited for
             yield
             return

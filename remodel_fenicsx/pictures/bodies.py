@@ -8,7 +8,6 @@ own from xvfb-run. A VTK that can draw without (EGL) gets by without that progra
 from __future__ import annotations
 
 import io
-import itertools
 import math
 import os
 import pickle
@@ -24,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -45,7 +44,7 @@ from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lin
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.system.children import environment_of_child, last_line
-from remodel_fenicsx.system.files import TakenError, write_new
+from remodel_fenicsx.system.files import TakenError, numbered, write_new
 
 if TYPE_CHECKING:
     import pyvista
@@ -94,33 +93,6 @@ def whole_body(recording: RecordedRun) -> WholeBody:
     if not has_a_body(recording):
         raise RecordingError(f"{recording.path}: the run recorded no fields of a body (output.fields)")
     return WholeBody(recording)
-
-
-def plot(
-    recording: RecordedRun,
-    time: float,
-    name: str,
-    viewing: Viewing,
-    elements: ArrayLike | None,
-    with_chains: bool,
-    plotter: pyvista.Plotter | None,
-    options: dict[str, Any],
-) -> pyvista.Plotter:
-    """Put a body into a plotter; parameters and errors as of `Recording.plot`."""
-    whole = whole_body(recording)
-    shown = shown_elements(whole, viewing)
-    if elements is not None:
-        if np.shape(elements) != shown.shape:
-            rule = f"allowed is a mask of all {len(shown)}"
-            raise FigureError(f"elements of shape {np.shape(elements)}: {rule}", 2)
-        shown &= np.asarray(elements, dtype=bool)
-    found = grid(whole, time, shown)
-    if name not in found.cell_data:
-        there = ", ".join(found.cell_data)
-        raise RecordingError(f"{recording.path}: no field {name!r} of elements; there are {there}")
-    plotter = new_plotter() if plotter is None else plotter
-    add_body(plotter, deformed(found), name, with_chains, **options)
-    return plotter
 
 
 def new_plotter(**options: Any) -> pyvista.Plotter:
@@ -174,12 +146,9 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
 
 
 def _width(corners: Array) -> Array:
-    """Measure faces with these corners (m, k, 3): twice the way from the middle to the nearest edge."""
-    corners = corners - corners.mean(axis=1, keepdims=True)
-    edges = np.roll(corners, -1, axis=1) - corners
-    length, area = (np.linalg.norm(v, axis=2) for v in (edges, np.cross(edges, corners)))
-    is_edge = length > 1e-4 * length.max(axis=1, keepdims=True)  # of a wedge one has no length
-    return 2 * np.where(is_edge, area / np.where(is_edge, length, 1.0), np.inf).min(axis=1)
+    """Measure faces with these corners (m, k, 3): their shortest side, of which wedges have one without length."""
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    return np.where(sides > 0, sides, np.inf).min(axis=1)
 
 
 # ---------------------------------------------------------------- pictures, by a child process
@@ -431,12 +400,11 @@ def _write(recording: RecordedRun, times: Sequence[float], path: Path | None, en
         write_new(path, data)
         return path
     stem = "-".join([recording.scene.name, *dict.fromkeys(f"t{time:g}" for time in times)])
-    for number in itertools.count(1):
-        free = recording.path / f"{stem}{f'-{number}' if number > 1 else ''}{ending}"
+    for free in numbered(recording.path / f"{stem}{ending}"):
         with suppress(TakenError):
             write_new(free, data)
-            return free
-    raise AssertionError("numbers do not end")
+            break
+    return free
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
-from itertools import chain, takewhile
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,23 +68,19 @@ NO_ANGLE = 255
 
 def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]:
     """The block, and what tells the page where each array is in it."""
-    parts, table, start = [], {}, 0
+    block, table = bytearray(), {}
     for name, array in arrays.items():
         values = np.ascontiguousarray(array.values)
-        stored = values
-        if array.differences and len(values) > 1:
-            stored = values.copy()
-            stored[1:] -= values[:-1]  # modulo the range of the type
-        data = stored.astype(values.dtype.newbyteorder("<")).tobytes()
-        start += -start % 4  # typed arrays begin at multiples of their size
-        parts.append((start, data))
+        # differences are modulo the range of the type
+        stored = np.diff(values, axis=0, prepend=np.zeros_like(values[:1])) if array.differences else values
         table[name] = {
-            "type": values.dtype.name, "shape": list(values.shape), "start": start, "differences": array.differences
-        }  # fmt: skip
-        start += len(data)
-    block = bytearray(start)
-    for place, data in parts:
-        block[place : place + len(data)] = data
+            "type": values.dtype.name,
+            "shape": list(values.shape),
+            "start": len(block),
+            "differences": array.differences,
+        }
+        block += stored.astype(values.dtype.newbyteorder("<")).tobytes()
+        block += bytes(-len(block) % 4)  # typed arrays begin at multiples of their size
     # level 6 is 5 % smaller and takes as long again
     return base64.b64encode(gzip.compress(bytes(block), 3, mtime=0)).decode("ascii"), table
 
@@ -242,17 +238,14 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
 
 
 def _volumes(corners: Places) -> Places:
-    """Of hexahedra (m, 8, 3), in six tetrahedra about a diagonal, or of tetrahedra (m, 4, 3): shares of their sum."""
+    """Shares of hexahedra (m, 8, 3), by their middles, or of tetrahedra (m, 4, 3) in their sum."""
+    sides = corners[:, 1:4] - corners[:, :1]
     if corners.shape[1] == 8:
-        ring = (1, 2, 3, 7, 4, 5, 1)
-        parts = [(0, 6, ring[k], ring[k + 1]) for k in range(6)]
-    else:
-        parts = [(0, 1, 2, 3)]
-    total = np.zeros(len(corners))
-    for a, b, c, d in parts:
-        first, second, third = (corners[:, k] - corners[:, a] for k in (b, c, d))
-        total += np.abs(np.einsum("mi,mi->m", np.cross(first, second), third))
-    return total / total.sum()
+        faces = corners[:, [[1, 2, 5, 6], [0, 3, 4, 7], [2, 3, 6, 7], [0, 1, 4, 5], [4, 5, 6, 7], [0, 1, 2, 3]]]
+        middles = faces.mean(axis=2)
+        sides = middles[:, ::2] - middles[:, 1::2]
+    total = np.abs(np.linalg.det(sides))
+    return np.asarray(total / total.sum())
 
 
 # ---------------------------------------------------------------- how a run went, from its folder
@@ -396,23 +389,11 @@ def view(run: ReportedRun) -> Card | None:
         "chain": CHAIN_LOOK,
     }  # fmt: skip
     html = (ASSETS / "view.html").read_text(encoding="utf-8")
-    html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.whole.depth) - 1))
     notes, kept, all_times = body.whole.notes(body.is_deformed), len(body.times), len(run.recording.times)
     if kept < all_times:
         notes.append(f"{kept} of {all_times} recorded times are kept here, to save room.")
     html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in notes))
     return Card("view", html, data, arrays)
-
-
-def _ways_to_show(arrays: Mapping[str, Array]) -> str:
-    """The choices of what is shown, as far as it was recorded."""
-    ways = {
-        "both": ("angle and chains", {"angle", "edges"}), "coloured": ("chains in colour", {"angle", "edges"}),
-        "alone": ("chains alone", {"edges"}), "angle": ("angle", {"angle"}), "extension": ("r/L", {"extension"}),
-        "shape": ("shape alone", set()),
-    }  # fmt: skip
-    there = {name: text for name, (text, needed) in ways.items() if needed <= set(arrays)}
-    return "".join(f'<option value="{name}">{text}</option>' for name, text in there.items())
 
 
 def angles(run: ReportedRun) -> Card | None:
@@ -488,14 +469,14 @@ def curves(run: ReportedRun) -> Card | None:
     if len(history["time"]) < 2 or not run.columns:
         return None
     rows = np.unique(np.linspace(0, len(history["time"]) - 1, MOST_ROWS).round().astype(int))
-    groups: list[list[Any]] = []
+    groups = defaultdict[tuple[str, str], list[Column | UnknownColumn]](list)
     for column in run.columns:
-        alike = next((group for group in groups if _together(group[0], column)), None)
-        groups.append([column]) if alike is None else alike.append(column)
+        groups[column.unit, _family(column.name)].append(column)
     cards, data = [], []
-    for index, group in enumerate(groups):
+    for index, ((_, family), group) in enumerate(groups.items()):
         unit = run.unit(group[0])
-        title = _title([column.name for column in group])
+        title = words(group[0].name if len(group) == 1 else WHOLE.get(family, family))
+        title = title[0].upper() + title[1:]
         cards.append(section(title, f'<div class="curve" id="curve-{index}"></div>', "third", unit))
         series = [
             {"name": words(column.name), "values": [_finite(value) for value in history[column.name][rows]]}
@@ -506,22 +487,15 @@ def curves(run: ReportedRun) -> Card | None:
     return Card("curves", f'<div class="curves whole">{"".join(cards)}</div>', {"times": times, "curves": data})
 
 
-def _together(first: Any, second: Any) -> bool:
-    """Whether two columns are drawn in one frame: of one unit, their names begin alike, or are two words and end so."""
-    a, b = first.name.split("_"), second.name.split("_")
-    ends_alike = len(a) == len(b) == 2 and a[1] == b[1] and len(a[1]) > 1  # no letter of an axis
-    begins_alike = min(len(a), len(b)) > 1 and (a[:2] == b[:2] or a[:-1] == b[:-1])
-    return first.unit == second.unit and (ends_alike or begins_alike)
+WHOLE = {"max_chain": "max_chain_extension"}  # families that are no words by themselves
 
 
-def _title(names: list[str]) -> str:
-    """What names have in common."""
-    if len(names) == 1:
-        return words(names[0])[0].upper() + words(names[0])[1:]
-    parts = [name.split("_") for name in names]
-    starts = [same[0] for same in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
-    common = words("_".join(starts or parts[0][-1:]))
-    return common[0].upper() + common[1:]
+def _family(name: str) -> str:
+    """What columns that are drawn in one frame have in common: two first words, or the second of two."""
+    first, *others = name.split("_")
+    if len(others) == 1 and len(others[0]) > 1:  # no letter of an axis
+        return others[0]
+    return "_".join([first, *others[:1]]) if len(others) > 1 else first
 
 
 def _finite(value: float) -> float | None:

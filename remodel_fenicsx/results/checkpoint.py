@@ -125,20 +125,16 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
 
 def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> None:
     """Raise CheckpointError unless the checkpoint is one of this state."""
-    here, there, counts = state.functions(), checkpoint.functions, _counts(state)
-    if any(name not in there and name not in counts for name in here):
-        raise CheckpointError(f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}")
-    loads = sorted(name for name, value in checkpoint.loads.items() if value)  # earlier versions kept all, zero or not
-    own = sorted(marked({mark: case.loading.values for mark, case in state.cases().items()}))
-    if not set(loads) <= set(own):
-        raise CheckpointError(f"the checkpoint has the loads {loads}, this run has {own}")
-    for name in [name for name in here if name in there]:
-        shape = checkpoint.arrays[f"function/{name}"].shape
-        wanted = domain.number_of_elements, _places(here[name]).shape[1]
-        if shape != wanted:
-            words = f"has the shape {shape}, that of this run has {wanted}"
-            raise CheckpointError(f"the checkpoint's function {name} {words}")
-    points, elements = checkpoint.arrays["points"], checkpoint.arrays["elements"]
+    arrays, counts = checkpoint.arrays, _counts(state)
+    wanted = {n: (domain.number_of_elements, _places(one).shape[1]) for n, one in state.functions().items()}
+    begins_anew = {name: shape for name, shape in wanted.items() if name in counts}
+    found = {name: arrays[f"function/{name}"].shape for name in checkpoint.functions}
+    own = marked({mark: case.loading.values for mark, case in state.cases().items()})
+    loads = {name for name, value in checkpoint.loads.items() if value}  # earlier versions kept all, zero or not
+    if not wanted.items() <= (begins_anew | found).items() or not loads <= own.keys():
+        there, here = (f"functions {a} and loads {sorted(b)}" for a, b in ((found, loads), (wanted, own)))
+        raise CheckpointError(f"the checkpoint has the {there}; this run has the {here}")
+    points, elements = arrays["points"], arrays["elements"]
     same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
     if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):
         words = "the checkpoint has another mesh: perhaps Gmsh is of another version, run.log says which it was"

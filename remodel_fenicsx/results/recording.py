@@ -9,7 +9,7 @@ import os
 import re
 import socket
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -114,7 +114,6 @@ class RecordedRun:
 
     def __init__(self, folder: str | os.PathLike[str]):
         self.path = Path(folder)
-        self._root: h5py.Group | None = None  # of the file of the fields, while it is kept open
         if not self.path.is_dir():
             raise RecordingError(f"{self.path}: {'is a file' if self.path.exists() else 'there is no such folder'}")
         for name in (SCENE, HISTORY):
@@ -244,21 +243,11 @@ class RecordedRun:
         return found[0]
 
     @contextmanager
-    def kept_open(self) -> Iterator[None]:
-        """Within, the file of the fields is opened once, for many times that are read."""
-        with self._fields_file() as root:
-            self._root = root
-            try:
-                yield
-            finally:
-                self._root = None
-
-    @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:
         path = self.path / FIELDS
         if not path.exists():
             raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")
-        with nullcontext(self._root) if self._root else series_file(path) as root:
+        with series_file(path) as root:
             yield root
 
 

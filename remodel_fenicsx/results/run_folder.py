@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import io
-import itertools
 import math
 import os
 import time as clock
@@ -31,9 +30,9 @@ from remodel_fenicsx.results.recording import (
     SCENE,
     is_vacant,
 )
-from remodel_fenicsx.results.vtkhdf import recorded_steps
+from remodel_fenicsx.results.vtkhdf import check_series
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.system.files import ClosedAtEnd, open_own, read_regular, write_whole
+from remodel_fenicsx.system.files import ClosedAtEnd, numbered, open_own, read_regular, write_whole
 
 DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
 
@@ -49,8 +48,7 @@ def choose_folder(requested: Path | None, name: str) -> Path:
             raise FolderTaken(f"folder {requested}: is not empty; allowed is a new or an empty folder")
         return requested
     Path("results").mkdir(exist_ok=True)
-    for number in itertools.count(1):
-        folder = Path("results") / (name if number == 1 else f"{name}-{number}")
+    for folder in numbered(Path("results") / name):
         with suppress(FileExistsError):
             folder.mkdir()
             break
@@ -123,8 +121,7 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
     size_of_rows(folder / HISTORY, after)
     for name in (FIELDS, CHAIN_LINES) if fields else ():
         if os.path.lexists(folder / name):
-            for _ in recorded_steps(folder / name):
-                pass
+            check_series(folder / name)
 
 
 def forget_steps(folder: Path) -> None:

@@ -20,7 +20,6 @@ from remodel_fenicsx.system.terminal import duration
 RECENT = 20  # steps whose mean is the rate
 BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
 _LOG_LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
-SHOWN = 5  # runs of a study that have failed and are named
 
 
 def status(folder: Path) -> list[str]:
@@ -100,8 +99,7 @@ def _of_study(folder: Path, runs: list[Path]) -> list[str]:
     states = {run.name: _state(run) for run in runs}
     counted = Counter(state for state, _ in states.values())
     lines = [f"{folder}: {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"]
-    failed = [f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"]
-    return lines + failed[:SHOWN] + ([f"and {len(failed) - SHOWN} more"] if len(failed) > SHOWN else [])
+    return lines + [f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"]
 
 
 def _state(folder: Path) -> tuple[str, str]:

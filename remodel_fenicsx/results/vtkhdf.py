@@ -11,18 +11,17 @@ import errno
 import io
 import os
 import shutil
-import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.recording import series_file
 from remodel_fenicsx.system.files import ClosedAtEnd, part_of
-from remodel_fenicsx.system.interrupts import blocked
+from remodel_fenicsx.system.interrupts import held_back
 
 if TYPE_CHECKING:
     import h5py
@@ -75,16 +74,6 @@ class PatientFile(io.FileIO):
             raise self.fault
 
 
-class RecordedStep(NamedTuple):
-    """What `TransientGrid.append` takes."""
-
-    time: float
-    point_data: Fields
-    cell_data: Fields
-    points: ArrayLike | None = None
-    constant: Fields = {}
-
-
 class TransientGrid(ClosedAtEnd):
     """A time series on one grid, written beside its place: `close` gives it its name, whole."""
 
@@ -96,9 +85,8 @@ class TransientGrid(ClosedAtEnd):
         cell_type: int,
         *,
         point_dtype: DTypeLike = np.float64,
-        replaces: bool = False,
     ):
-        if os.path.lexists(path) and not replaces:
+        if os.path.lexists(path):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
         self.path, self._part = path, part_of(path)
         self._part.unlink(missing_ok=True)  # of a process that was killed
@@ -110,14 +98,20 @@ class TransientGrid(ClosedAtEnd):
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
         """With the steps of a file up to `time`, to append more."""
-        with series_file(path, WITHOUT_IT) as root:
-            points, cell_type = root["Points"][: int(root["NumberOfPoints"][0])], int(root["Types"][0])
-            cells = root["Connectivity"][:].reshape(int(root["NumberOfCells"][0]), -1)
-        grid = cls(path, points, cells, cell_type, point_dtype=points.dtype, replaces=True)
-        for step in recorded_steps(path):
-            if step.time <= time:
-                grid.append(*step)
+        grid = cls.__new__(cls)
+        grid.path, grid._part = path, part_of(path)
+        grid._part.unlink(missing_ok=True)
+        grid._reopen()
+        with grid._written() as file:
+            steps = file["VTKHDF/Steps"]
+            times = steps["Values"][: steps.attrs["NSteps"]]
+            grid.number_of_steps = int(np.searchsorted(times, time, side="right"))
+            steps.attrs.modify("NSteps", np.int64(grid.number_of_steps))
         return grid
+
+    def _reopen(self) -> None:
+        shutil.copyfile(self.path, self._part)
+        self._open("r+")
 
     def _open(self, mode: str) -> None:
         import h5py
@@ -128,7 +122,7 @@ class TransientGrid(ClosedAtEnd):
     @contextmanager
     def _written(self) -> Iterator[h5py.File]:
         """Within, HDF5 writes; no signal comes between, whose handler might raise in `PatientFile.write`."""
-        with blocked(*signal.valid_signals()):
+        with held_back():
             yield self._file
             self._file.flush()
         self._disk.check()
@@ -143,8 +137,7 @@ class TransientGrid(ClosedAtEnd):
     ) -> None:
         """Add one step; points are given at every step or at none."""
         if self._disk.closed:
-            shutil.copyfile(self.path, self._part)
-            self._open("r+")
+            self._reopen()
         step = self.number_of_steps
         kinds = (("PointData", point_data, step), ("CellData", cell_data, step), ("CellData", constant, 0))
         # offsets that stay 0 say that the mesh is the one of the first step
@@ -170,7 +163,7 @@ class TransientGrid(ClosedAtEnd):
 
     def __exit__(self, *error: object) -> None:
         if error[0] is not None:  # not whole
-            with blocked(*signal.valid_signals()):
+            with held_back():
                 self._file.close()
             self._disk.close()
         self.close()
@@ -179,7 +172,7 @@ class TransientGrid(ClosedAtEnd):
         """Give the file its name, if it is whole; a next step goes on in a copy."""
         try:
             if not self._disk.closed:
-                with blocked(*signal.valid_signals()):
+                with held_back():
                     self._file.close()
                 self._disk.check()
                 os.fsync(self._disk.fileno())
@@ -243,27 +236,24 @@ def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple
 WITHOUT_IT = "; the run goes on without this file"
 
 
-def recorded_steps(path: Path) -> Iterator[RecordedStep]:
-    """The steps of a file of `TransientGrid`; what does not belong there is an error."""
+def check_series(path: Path) -> None:
+    """Read all of a file of `TransientGrid`; what does not belong there is an error."""
     with series_file(path, WITHOUT_IT) as root:
         number = int(root["Steps"].attrs["NSteps"])
         times = root["Steps/Values"][:number]
         if len(times) != number or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise ValueError("the times of its steps do not increase")
-        for step in range(number):
-            points = {name: _recorded(root, "Point", name, step)[0] for name in root["PointData"]}
-            cells = {name: _recorded(root, "Cell", name, step) for name in root["CellData"]}
-            changing, constant = ({n: v for n, (v, stays) in cells.items() if stays is kind} for kind in (False, True))
-            place, size = int(root["Steps/PointOffsets"][step]), int(root["NumberOfPoints"][0])
-            moved = root["Points"][place : place + size] if place else None
-            yield RecordedStep(float(times[step]), points, changing, moved, constant)
-
-
-def _recorded(root: h5py.Group, kind: str, name: str, step: int) -> tuple[Array, bool]:
-    """Values of a field in a step; whether they are those of the first step."""
-    values, size = root[f"{kind}Data"][name], int(root[f"NumberOf{kind}s"][0])
-    start = int(root[f"Steps/{kind}DataOffsets"][name][step])
-    block = values[start : start + size]
-    if values.is_virtual or values.external or start not in (0, step * size) or len(block) != size:
-        raise ValueError(f"the values of {name} are not where they belong")
-    return block, start < step * size
+        _ = root["Connectivity"][:]
+        places = dict.fromkeys(root["Steps/PointOffsets"][:number])
+        sizes = {kind: int(root[f"NumberOf{kind}s"][0]) for kind in ("Point", "Cell")}
+        blocks = [("Points", root["Points"], place, sizes["Point"]) for place in places]
+        for kind, size in sizes.items():
+            for name in root[f"{kind}Data"]:
+                values = root[f"{kind}Data"][name]
+                starts = root[f"Steps/{kind}DataOffsets"][name][:number]
+                if len(starts) != number or not {*starts} <= {0, *range(0, number * size, size)}:
+                    raise ValueError(f"the values of {name} are not where they belong")
+                blocks += [(name, values, start, size) for start in dict.fromkeys(starts)]
+        for name, values, start, size in blocks:
+            if values.is_virtual or values.external or len(values[start : start + size]) != size:
+                raise ValueError(f"the values of {name} are not where they belong")

@@ -117,6 +117,21 @@ def handled(
             signal.signal(number, one)
 
 
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Within, signals wait: Python's handlers, and those of programs that are started."""
+    caught: list[int] = []
+    try:
+        with (
+            handled(lambda number, _: caught.append(number), signal.valid_signals(), callable),
+            blocked(*SIGNALS, PAUSE),
+        ):
+            yield
+    finally:
+        for number in caught:
+            signal.raise_signal(number)
+
+
 # ---------------------------------------------------------------- ranks
 
 

@@ -12,7 +12,6 @@ from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, cli, run
 from remodel_fenicsx.results.whole_body import BODY, revolve
-from remodel_fenicsx.results.vtkhdf import recorded_steps
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS
 from tests.conftest import Refused
 from tests.values import isotropic, ramped
@@ -66,8 +65,6 @@ def test_constant_fields_stand_in_the_file_once_and_belong_to_every_time(tmp_pat
     check_cylindrical(first, recording.points[recording.elements].mean(axis=1), 1e-6)
     with h5py.File(folder / "fields.vtkhdf") as file:
         assert len(file["VTKHDF/CellData/axis_c"]) == 1536 and len(file["VTKHDF/CellData/fibre_angle"]) == 3 * 1536
-    constant = [sorted(step.constant) for step in recorded_steps(folder / "fields.vtkhdf")]
-    assert constant == [[], sorted(CONSTANT_FIELDS), sorted(CONSTANT_FIELDS)]
 
 
 def test_local_axes_of_a_sector_turn_with_it(tmp_path: Path) -> None:

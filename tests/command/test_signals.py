@@ -51,36 +51,6 @@ os._exit(cli.main(sys.argv[1:]))  # what it has not written by itself is lost
     assert read_history(tmp_path / "out")["time"][-1] == 10
 
 
-STOPPED_WHILE_IT_COMPILES = """
-import os, signal, sys
-from remodel_fenicsx import cli
-from remodel_fenicsx.evolution.coupling import Staggered
-from remodel_fenicsx.solver.continuation import Blend
-from remodel_fenicsx.system.interrupts import stopping_at_once
-whole = Staggered._solved_as_expected
-def compiled(blend):
-    with stopping_at_once():
-        os.kill(os.getpid(), signal.SIGTERM)
-def in_parts(coupling, step, loads, work):
-    if coupling.state.number < 3:
-        return whole(coupling, step, loads, work)
-    coupling._solve_in_parts(4.0, dict(coupling.state.loading.values), loads, work, None)
-Blend.equilibrium = property(compiled)
-Staggered._solved_as_expected = in_parts
-sys.exit(cli.main(sys.argv[1:]))
-"""
-
-
-def test_a_step_that_is_stopped_while_it_compiles_is_taken_back_and_the_run_goes_on(tmp_path: Path) -> None:
-    """Parts of a step are compiled when the first step needs them."""
-    words = [*CUBE, "-q", "--set", "output.checkpoint=0", "-o", tmp_path]
-    stopped = forked("python", STOPPED_WHILE_IT_COMPILES, *words)
-    assert stopped.returncode == 128 + signal.SIGTERM, stopped.stderr
-    assert [*read_history(tmp_path)["time"]] == [0, 1, 2, 3]
-    assert forked("remodel-fenicsx", "run", "--resume", tmp_path, "-q").returncode == 0
-    assert "goes on from the checkpoint of time 3" in (tmp_path / "run.log").read_text()
-
-
 @pytest.mark.parametrize("number", [signal.SIGHUP, *slowly(signal.SIGINT)])
 def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.Signals, tmp_path: Path) -> None:
     """nohup ignores SIGHUP, a shell script SIGINT for its jobs in the background."""
@@ -95,11 +65,10 @@ def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.S
     assert read_history(tmp_path / "out")["time"][-1] == 10
 
 
-@pytest.mark.parametrize(("module", "number"), [
-    ("pydantic", signal.SIGINT), ("mpi4py", signal.SIGTERM), ("petsc4py.PETSc", signal.SIGINT),
-    ("remodel_fenicsx.running", signal.SIGHUP),  # PETSc is there by then, and has taken it
-    *slowly(("pydantic", signal.SIGTERM), ("dolfinx", signal.SIGTERM)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("module", "number"),
+    [("pydantic", signal.SIGINT), ("petsc4py.PETSc", signal.SIGTERM), ("remodel_fenicsx.running", signal.SIGHUP)],
+)
 def test_a_signal_among_the_imports_ends_with_a_line(module: str, number: signal.Signals, tmp_path: Path) -> None:
     program = f"""
 import os, runpy, signal, sys
@@ -133,23 +102,6 @@ sys.exit(cli.main({[*CUBE, "-o", str(tmp_path / "out")]!r}))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_rank_does_not_wait_for_a_second_signal(tmp_path: Path) -> None:
-    """mpirun gives its ranks a quarter of a second between SIGTERM and SIGKILL: all of it is for the checkpoint."""
-    program = """
-import os, signal, time
-from remodel_fenicsx.system.interrupts import StopRequest
-time.sleep = None
-with StopRequest() as stop:
-    os.kill(os.getpid(), signal.SIGTERM)
-    assert stop.number == signal.SIGTERM
-"""
-    done = forked("python", program, variables={**os.environ, "OMPI_COMM_WORLD_SIZE": "2"})
-    assert done.returncode == 0, done.stderr
-
-
-# ---------------------------------------------------------------- while it compiles
-
-
 def test_a_usage_error_is_said_by_the_first_rank_alone() -> None:
     said = []
     for rank in ("0", "1"):
@@ -170,23 +122,6 @@ def test_processes_of_srun_that_share_no_mpi_are_refused(tmp_path: Path) -> None
     assert forked("remodel-fenicsx", *words, variables=variables | {"SLURM_STEP_NUM_TASKS": "1"}).returncode == 0
 
 
-def test_a_pause_for_the_whole_group_spares_the_compiler() -> None:
-    """Batch systems send SIGUSR1 to all that a job has started."""
-    program = """
-import os, signal, subprocess
-from remodel_fenicsx.system.interrupts import PAUSE, StopRequest, blocked
-with StopRequest() as stop:
-    with blocked(PAUSE):
-        compiler = subprocess.Popen(["sleep", "0.3"])
-        os.killpg(0, signal.SIGUSR1)
-        assert compiler.wait() == 0 and not stop.pause
-    assert stop.pause and not stop.number
-os.kill(os.getpid(), signal.SIGUSR1)
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, process_group=0)
-    assert done.returncode == -signal.SIGUSR1, done.stderr
-
-
 def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: Path) -> None:
     """While Gmsh, which hears no signals, divides 204,800 triangles."""
     points, triangles = tube(around=640, along=160)
@@ -199,18 +134,4 @@ def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: 
     _, said = process.communicate(timeout=5)
     assert process.returncode == 128 + signal.SIGTERM
     assert said == "remodel-fenicsx: stopped by SIGTERM; nothing is written\n"
-    assert list(tmp_path.iterdir()) == [file]
-
-
-def test_a_limit_of_files_is_no_fault_of_a_surface(tmp_path: Path) -> None:
-    """Below the size of the surface, and below that of the mesh."""
-    points, triangles = tube()
-    file = tmp_path / "lumen.vtp"
-    pyvista.PolyData.from_regular_faces(points, triangles).save(file)
-    words = ["wall", str(file), "--thickness", "0.3", "--size", "0.3", "-o", str(tmp_path / "wall.msh")]
-    for blocks in (20, 200):
-        limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$0" "$@"', *COMMAND[:3], *words]
-        done = subprocess.run(limited, capture_output=True, text=True, timeout=100)
-        assert done.returncode == 5, done.stderr
-        assert "lumen.vtp" not in done.stderr and "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == [file]

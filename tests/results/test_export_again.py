@@ -150,20 +150,15 @@ def test_what_is_refused(first: tuple[Path, Path], tmp_path: Path) -> None:
     mesh, started = first
     file = export(started, "vtu", tmp_path / "a.vtu")
     still = {"law": "tensor", "coupling": "staggered"}
-    torn = meshio.read(file)
-    torn.cell_data["natural_gradient"][0][3] *= -1
-    meshio.write(tmp_path / "torn.vtu", torn)
     for changed, line in (
         (again(mesh, file, 1.0, natural={}), "cells.fibres = .*: has natural_gradient, content, natural_length of an"),
         (again(mesh, file, 1.0, remodeling=still, output={}), "cells.fibres = .*: has content and natural_length, wh"),
-        (again(mesh, tmp_path / "torn.vtu", 1.0), "cells.fibres = .*: natural_gradient of row 4 has no determinant ab"),
     ):
         with pytest.raises(SceneError, match=f"^{line}"), made(changed):
             pass
     for keys, line in (
         ({"cells": {"initial": "isotropic"}}, "natural.fibres = true: needs cells.fibres"),
         ({"natural": {"fibres": True, "layers": LAYERS}}, "natural.fibres = true: natural.opening_angle or layers ar"),
-        ({"mesh": {"degree": 2, "formulation": "selective-integration"}}, "natural.fibres = true: must be false un"),
     ):
         with pytest.raises(SceneError, match=f"^{line}"):
             again(mesh, file, 1.0, **keys)  # type: ignore[arg-type]

@@ -99,11 +99,11 @@ def test_a_run_under_way_is_read(tmp_path: Path) -> None:
     assert Recording(tmp_path).history["time"].shape == (0,)
     assert Recording(tmp_path).times.shape == (0,)
     with TransientGrid(tmp_path / "fields.vtkhdf", POINTS, ELEMENTS, 12) as grid:
-        grid.publish()
+        grid.close()
         assert Recording(tmp_path).times.shape == (0,)
         for count, time in enumerate(TIMES, start=1):
             write_step(grid, time)
-            grid.publish()
+            grid.close()
             history.append({"time": time, "force": 2 * time})
             recording = Recording(tmp_path)
             assert recording.times.tolist() == [*TIMES[:count]]
