@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
-from remodel_fenicsx.studies.page import FigureError
 
 if TYPE_CHECKING:
     import pyvista
@@ -166,7 +165,7 @@ class Recording(RecordedRun):
         if elements is not None:
             if np.shape(elements) != shown.shape:
                 rule = f"allowed is a mask of all {len(shown)}"
-                raise FigureError(f"elements of shape {np.shape(elements)}: {rule}", 2)
+                raise bodies.FigureError(f"elements of shape {np.shape(elements)}: {rule}", 2)
             shown &= np.asarray(elements, dtype=bool)
         found = bodies.grid(whole, self._time(time), shown)
         if name not in found.cell_data:

@@ -196,26 +196,19 @@ def library(
     if comm.rank == 0 and not _is_cached(name):
         try:
             with _compiling(name, what, seconds):
-                _build(name, declarations, source, include, libraries)
+                builder = cffi.FFI()
+                builder.cdef(declarations)
+                folders = {"include_dirs": [f"{include}"], "library_dirs": [f"{include}/../lib"]} if include else {}
+                names = ["m", *libraries]
+                builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=names, **folders)
+                if not _is_cached(name):  # else by the run that this one has waited for
+                    builder.compile(tmpdir=str(cache_folder()))
+                    (cache_folder() / f"{name}.c.cached").touch()  # as FFCx does: last the end mark
         except BaseException as error:
             failure = error
     if comm.bcast(failure is not None):
         raise failure or RuntimeError(f"the first rank could not compile {what}")
     return _loaded(name)
-
-
-def _build(
-    name: str, declarations: str, source: str, include: Path | None = None, libraries: tuple[str, ...] = ()
-) -> None:
-    """What FFCx does with its kernels: the source, the library, and last the end mark."""
-    if _is_cached(name):
-        return
-    builder = cffi.FFI()
-    builder.cdef(declarations)
-    folders = {} if include is None else {"include_dirs": [str(include)], "library_dirs": [str(include.parent / "lib")]}
-    builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=["m", *libraries], **folders)
-    builder.compile(tmpdir=str(cache_folder()))
-    (cache_folder() / f"{name}.c.cached").touch()
 
 
 @functools.cache

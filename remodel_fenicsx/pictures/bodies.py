@@ -343,7 +343,7 @@ def _nearest(recording: RecordedRun, wanted: Sequence[float] | None) -> list[flo
     recorded = whole_body(recording).recording.times
     first, last = float(recorded[0]), float(recorded[-1])
     for time in wanted or ():
-        if not (first <= time <= last or same_time(time, first) or same_time(time, last)):
+        if not first <= time <= last:
             raise FigureError(f"times {time:g}: allowed are times from {first:g} to {last:g}", 2)
     nearest = [float(recorded[np.abs(recorded - time).argmin()]) for time in wanted or (last,)]
     return list(dict.fromkeys(nearest))

@@ -85,26 +85,6 @@ def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]
     return base64.b64encode(gzip.compress(bytes(block), 3, mtime=0)).decode("ascii"), table
 
 
-def of_angles(degrees: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Angles from 0 to 90 degrees in `ANGLE_STEPS` levels; `NO_ANGLE` where there is none."""
-    steps = np.clip(np.floor(degrees * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1)
-    return np.where(np.isnan(degrees), NO_ANGLE, steps).astype(np.uint8)
-
-
-def of_places(places: NDArray[np.float32]) -> tuple[NDArray[np.uint16], list[float], float]:
-    """Coordinates (..., 3) as steps from the least of each, with these three and the length of a step."""
-    flat = places.reshape(-1, 3)
-    least = flat.min(axis=0)
-    step = float((flat.max(axis=0) - least).max() / 65535) or 1.0
-    return np.rint((places - least) / step).astype(np.uint16), [float(value) for value in least], step
-
-
-def of_vectors(vectors: NDArray[np.float32]) -> tuple[NDArray[np.int8], float]:
-    """Components as 127ths of the largest, and the length of a step."""
-    step = float(np.abs(vectors).max()) / 127 or 1.0
-    return np.rint(vectors / step).astype(np.int8), step
-
-
 # ---------------------------------------------------------------- a part of the page, and its HTML
 # All text of others goes through `escape`.
 
@@ -180,7 +160,10 @@ class ShownBody:
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """The same in few bytes, and the numbers that lead back."""
-        position, origin, step = of_places(self.series["position"])
+        moved = self.series["position"]
+        least = moved.min(axis=(0, 1))
+        step = float((moved.max(axis=(0, 1)) - least).max() / 65535) or 1.0
+        position = np.rint((moved - least) / step).astype(np.uint16)
         size = np.uint16 if len(self.whole.points) <= 65536 else np.uint32
         arrays = {
             "elements": Array(self.whole.elements.astype(size)),
@@ -189,15 +172,18 @@ class ShownBody:
             "reference": Array(self.whole.points.astype(np.float32)),
             "position": Array(position, differences=True),
         }
-        scales: dict[str, Any] = {"origin": origin, "position_step": step}
+        scales: dict[str, Any] = {"origin": least.tolist(), "position_step": step}
         if "angle" in self.series:
-            arrays["angle"] = Array(of_angles(self.series["angle"]), differences=True)
+            levels = np.clip(np.floor(self.series["angle"] * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1)
+            levels = np.where(np.isnan(levels), NO_ANGLE, levels).astype(np.uint8)
+            arrays["angle"] = Array(levels, differences=True)
         if "extension" in self.series:
             extension = np.rint(255 * self.series["extension"]).astype(np.uint8)
             arrays["extension"] = Array(extension, differences=True)
         if "edges" in self.series:
-            edges, scales["edge_step"] = of_vectors(self.series["edges"])
-            arrays["edges"] = Array(edges.reshape(*edges.shape[:2], 9), differences=True)
+            edges = self.series["edges"].reshape(*moved.shape[:1], -1, 9)
+            scales["edge_step"] = float(np.abs(edges).max()) / 127 or 1.0  # components are 127ths of the largest
+            arrays["edges"] = Array(np.rint(edges / scales["edge_step"]).astype(np.int8), differences=True)
         return arrays, scales
 
 

@@ -40,7 +40,7 @@ class Checkpoints(Watcher):
         self.folder, self.state, self.scene_text, self.every = folder, state, scene_text, every
         self._mesh = mesh_arrays(state.loading.domain)
         self._versions = versions() if state.comm.rank == 0 else {}
-        self._written_at, self._cost, self._step_seconds = clock.monotonic(), 0.0, 0.0
+        self._written_at, self._cost = clock.monotonic(), 0.0
         self._number = 0  # of the newest checkpoint; where none is, the run starts again at t = 0
 
     # ------------------------------------------------------------ as a watcher
@@ -50,7 +50,6 @@ class Checkpoints(Watcher):
 
     def committed(self, step: Step) -> None:
         """Write it, if it is its turn."""
-        self._step_seconds = max(0.5 * self._step_seconds, step.seconds)
         if step.is_last or self._is_due(step.number):
             self.write()
 
@@ -58,9 +57,7 @@ class Checkpoints(Watcher):
         """The same on all ranks."""
         if self.every is not None:
             return self.every > 0 and number % self.every == 0
-        pause = max(SHORTEST_PAUSE, self._cost / LARGEST_SHARE)
-        # what would be lost next is all since the last one, with the step that comes
-        pause = min(pause, LONGEST_LOSS - self._step_seconds - self._cost)
+        pause = min(max(SHORTEST_PAUSE, self._cost / LARGEST_SHARE), LONGEST_LOSS)
         due = clock.monotonic() - self._written_at >= pause
         return bool(self.state.comm.bcast(due, root=0))
 

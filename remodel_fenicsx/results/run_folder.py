@@ -34,14 +34,10 @@ from remodel_fenicsx.results.vtkhdf import check_series
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.files import ClosedAtEnd, numbered, open_own, read_regular, write_whole
 
-DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
-
 
 def choose_folder(requested: Path | None, name: str) -> Path:
     """The folder of a run: the one asked for, which must be new or empty, or the first free results/NAME."""
     if requested is not None:
-        if len(requested.parts) > DEEPEST:
-            raise FolderTaken(f"folder {requested}: lies in more than {DEEPEST} folders")
         if requested.exists() and not requested.is_dir():
             raise FolderTaken(f"folder {requested}: is a file; allowed is a new or an empty folder")
         if requested.is_dir() and not is_vacant(requested):

@@ -93,7 +93,7 @@ class TransientGrid(ClosedAtEnd):
         self.number_of_steps = 0
         self._open("x+")
         with self._written() as file:
-            self._make(file.create_group("VTKHDF"), np.asarray(points, point_dtype), np.asarray(cells), cell_type)
+            _begin(file.create_group("VTKHDF"), np.asarray(points, point_dtype), np.asarray(cells), cell_type)
 
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
@@ -181,26 +181,26 @@ class TransientGrid(ClosedAtEnd):
             self._disk.close()
             self._part.unlink(missing_ok=True)
 
-    @staticmethod
-    def _make(root: h5py.Group, points: Array, cells: Array, cell_type: int) -> None:
-        """Write the mesh, and no steps."""
-        root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
-        root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
-        for name, number in {"Points": len(points), "Cells": len(cells), "ConnectivityIds": cells.size}.items():
-            root[f"NumberOf{name}"] = np.array([number], dtype=np.int64)
-        _create(root, "Points", points.dtype, points.shape)
-        _write(root["Points"], 0, points)
-        kinds = np.full(len(cells), cell_type, dtype=np.uint8)
-        root.create_dataset("Connectivity", data=cells.astype(np.int64).ravel(), **_COMPRESSION)
-        root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
-        root.create_dataset("Types", data=kinds, **_COMPRESSION)
-        for group in ("PointData", "CellData", "Steps/PointDataOffsets", "Steps/CellDataOffsets"):
-            root.create_group(group)
-        _create(root, "Steps/Values", np.float64, (_STEPS_PER_CHUNK,))
-        for name in ("Steps/NumberOfParts", "Steps/PointOffsets", *_ALWAYS_0):
-            columns = (1,) if name in _OF_TOPOLOGY else ()
-            _create(root, name, np.int64, (_STEPS_PER_CHUNK, *columns))
-        root["Steps"].attrs["NSteps"] = np.int64(0)
+
+def _begin(root: h5py.Group, points: Array, cells: Array, cell_type: int) -> None:
+    """Write the mesh, and no steps."""
+    root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
+    root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
+    for name, number in {"Points": len(points), "Cells": len(cells), "ConnectivityIds": cells.size}.items():
+        root[f"NumberOf{name}"] = np.array([number], dtype=np.int64)
+    _create(root, "Points", points.dtype, points.shape)
+    _write(root["Points"], 0, points)
+    kinds = np.full(len(cells), cell_type, dtype=np.uint8)
+    root.create_dataset("Connectivity", data=cells.astype(np.int64).ravel(), **_COMPRESSION)
+    root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
+    root.create_dataset("Types", data=kinds, **_COMPRESSION)
+    for group in ("PointData", "CellData", "Steps/PointDataOffsets", "Steps/CellDataOffsets"):
+        root.create_group(group)
+    _create(root, "Steps/Values", np.float64, (_STEPS_PER_CHUNK,))
+    for name in ("Steps/NumberOfParts", "Steps/PointOffsets", *_ALWAYS_0):
+        columns = (1,) if name in _OF_TOPOLOGY else ()
+        _create(root, name, np.int64, (_STEPS_PER_CHUNK, *columns))
+    root["Steps"].attrs["NSteps"] = np.int64(0)
 
 
 def _offsets(field: str) -> str:

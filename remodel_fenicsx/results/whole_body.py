@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.reductions import Turn
-from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import NATURAL_GRADIENT
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
@@ -128,19 +127,15 @@ class WholeBody:
             self._turned = TurnedFields(points, elements, *solved, reduction.turn)
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
-        self.layer, self.depth = _layers(self._depths(shape), self.elements)
+        known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
+        depth = known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
+        self.layer, self.depth = _layers(depth, self.elements)
 
     def notes(self, is_deformed: bool) -> list[str]:
         """What is to be known of pictures of it."""
         turned = f"Solved with the kinematics {self.recording.scene.model.kinematics!r}, shown as the whole body."
         reference = "Displacements were not recorded: this is the reference body."
         return [*([turned] if self.is_turned else []), *([] if is_deformed else [reference])]
-
-    def _depths(self, shape: Shape) -> Array:
-        """Of the elements, (m,): as recorded, or by their places."""
-        recording = self.recording
-        known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
-        return known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
 
     def fields(self, time: float, names: Collection[str] | None = None) -> Fields:
         """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time."""

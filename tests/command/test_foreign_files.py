@@ -365,15 +365,12 @@ def test_a_pipe_in_a_folder_keeps_nobody_waiting(name: str, folder: Path) -> Non
 def test_a_scene_has_bounds(tmp_path: Path) -> None:
     path = tmp_path / "scene.toml"
     many = ".".join(["a"] * 200_000)
-    quoted = ".".join(['"1"'] * 5000)
     for text, words in {
         f"{many} = 1": f"a key of more than {MOST_PARTS} parts",
-        f"[{'.'.join(['1'] * 5000)}]": f"a key of more than {MOST_PARTS} parts",
-        f"x = {{ {quoted} = 1 }}": f"a key of more than {MOST_PARTS} parts",
         f"x = {'[' * 150}{']' * 150}": f"in more than {MOST_PARTS} others",
         "x = 1 #" + " " * LARGEST: "is larger than 1 MB",
     }.items():
-        path.write_text(text[: LARGEST - 1] if "larger" not in words else text)
+        path.write_text(text)
         with pytest.raises(SceneError, match=words):
             read_scene(path)
     times = ", ".join(f"{whole}.5" for whole in range(20_000))  # decimals are no keys

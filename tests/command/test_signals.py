@@ -51,6 +51,36 @@ os._exit(cli.main(sys.argv[1:]))  # what it has not written by itself is lost
     assert read_history(tmp_path / "out")["time"][-1] == 10
 
 
+STOPPED_WHILE_IT_COMPILES = """
+import os, signal, sys
+from remodel_fenicsx import cli
+from remodel_fenicsx.evolution.coupling import Staggered
+from remodel_fenicsx.solver.continuation import Blend
+from remodel_fenicsx.system.interrupts import stopping_at_once
+whole = Staggered._solved_as_expected
+def compiled(blend):
+    with stopping_at_once():
+        os.kill(os.getpid(), signal.SIGTERM)
+def in_parts(coupling, step, loads, work):
+    if coupling.state.number < 3:
+        return whole(coupling, step, loads, work)
+    coupling._solve_in_parts(4.0, dict(coupling.state.loading.values), loads, work, None)
+Blend.equilibrium = property(compiled)
+Staggered._solved_as_expected = in_parts
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+def test_a_step_that_is_stopped_while_it_compiles_is_taken_back_and_the_run_goes_on(tmp_path: Path) -> None:
+    """Parts of a step are compiled when the first step needs them."""
+    words = [*CUBE, "-q", "--set", "output.checkpoint=0", "-o", tmp_path]
+    stopped = forked("python", STOPPED_WHILE_IT_COMPILES, *words)
+    assert stopped.returncode == 128 + signal.SIGTERM, stopped.stderr
+    assert [*read_history(tmp_path)["time"]] == [0, 1, 2, 3]
+    assert forked("remodel-fenicsx", "run", "--resume", tmp_path, "-q").returncode == 0
+    assert "goes on from the checkpoint of time 3" in (tmp_path / "run.log").read_text()
+
+
 @pytest.mark.parametrize("number", [signal.SIGHUP, *slowly(signal.SIGINT)])
 def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.Signals, tmp_path: Path) -> None:
     """nohup ignores SIGHUP, a shell script SIGINT for its jobs in the background."""

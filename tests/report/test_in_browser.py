@@ -6,7 +6,6 @@ Without a browser these tests are skipped: WITH_FENICSX_ADD=browser ./with-fenic
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,12 +89,6 @@ def test_profile_and_rose_are_volume_means(browser: Browser, recorded: Recorded,
         assert sum(rose) == pytest.approx(1.0, abs=1e-9)
         counted = np.histogram(angle, bins=np.linspace(0, 90, len(ANGLE_COLOURS) + 1), weights=volume)[0]
         np.testing.assert_allclose(rose, counted, atol=1e-5)
-
-
-def test_curves_have_names_and_units_at_their_axes(browser: Browser, recorded: Recorded) -> None:
-    browser.open(recorded("layers") / REPORT)
-    values = browser.value("[...document.querySelectorAll('.curve .values')].map((e) => e.textContent).join(' ')")
-    assert re.search(r"inner radius [0-9.]+ mm", values) and re.search(r"fibre angle inner [0-9.]+°", values)
 
 
 # ---------------------------------------------------------------- controls

@@ -355,13 +355,6 @@ def test_a_report_that_fails_is_one_warning(tmp_path: Path) -> None:
     assert [one.text for one in ReportedRun(Recording(tmp_path / "run")).warnings] == ["no report.html: no room"]
 
 
-def test_a_run_that_fails_says_so_in_its_page(recorded: Recorded) -> None:
-    for name in ("failed", "one time"):
-        text = (recorded(name) / REPORT).read_text()
-        assert '<span class="badge failed">' in text
-        assert html.escape(ReportedRun(Recording(recorded(name))).state[1]) in text
-
-
 # ---------------------------------------------------------------- what is in it of others
 def test_the_bundle_is_the_one_that_is_named() -> None:
     vendor = tomllib.loads((ASSETS / "VENDOR.toml").read_text())

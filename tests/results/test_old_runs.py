@@ -31,16 +31,6 @@ def folder(tmp_path: Path) -> Path:
     return unpacked("run-0.2.0", tmp_path)
 
 
-def test_a_run_of_the_version_before_is_read_and_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recording = Recording(folder)
-    assert recording.versions["remodel_fenicsx"] == "0.2.0" and recording.scene.name == "cube"
-    np.testing.assert_array_equal(recording.times, [0.0, 1.0, 2.0, 3.0])
-    stretched = recording.points + recording.fields(3.0)["displacement"]
-    assert stretched[:, 2].max() == pytest.approx(recording.history["mean_stretch"][-1], rel=1e-6)
-    assert recording.report().stat().st_size > 100_000
-    assert cli.main(["status", str(folder)]) == 0 and "step 3 of 3" in capsys.readouterr().out
-
-
 @pytest.mark.usefixtures("drawn_by_forks")
 @pytest.mark.parametrize("kept", ["run-0.2.0", "run-0.3.0", "run-0.4.0", "layers-0.3.0", "layers-0.4.0"])
 def test_folders_of_each_release_are_whole_for_each_command(

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import errno
-import re
 import resource
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import basix
@@ -89,20 +86,6 @@ def test_reader_finds_every_step(tmp_path):
         for kind, data in (("point", point_data), ("cell", cell_data)):
             for name, values in data.items():
                 assert np.array_equal(found[f"{k} {kind} {name}"], values.astype(np.float32))
-
-
-def test_the_page_shows_what_really_steps_through_time(tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "import pyvista" in block]
-    path = tmp_path / "results" / "artery" / "fields.vtkhdf"
-    path.parent.mkdir(parents=True)
-    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
-        for k in range(3):
-            grid.append(k, {"displacement": np.full((8, 3), 0.25 * k)})
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and "rror" not in done.stderr, done.stderr
-    said = [tuple(map(float, line.split())) for line in done.stdout.splitlines()]
-    assert said == [(0.0, 0.0), (1.0, 0.25), (2.0, 0.5), (1.0, 0.25)]
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
