@@ -387,10 +387,8 @@ def write_unloaded(scene: Scene, folder: Path) -> str:
 
 
 def _in_words(scene: Scene, found: Scene) -> str:
-    numbers = found.geometry.model_dump()
-    lengths = {name: value for name, value in numbers.items() if isinstance(value, float)}
-    known = scene.geometry.model_dump()
-    words = [f"{name} {value:.6g} (loaded {known[name]:.6g})" for name, value in lengths.items()]
+    numbers, known = found.geometry.model_dump().items(), scene.geometry.model_dump()
+    words = [f"{name} {n:.6g} (loaded {known[name]:.6g})" for name, n in numbers if isinstance(n, float)]
     if words:
         return ", ".join(words)
     before, after = (one.geometry.checked(one.mesh)[0].points for one in (scene, found))  # type: ignore[attr-defined]

@@ -44,10 +44,10 @@ COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each 
 # NaN and infinity keep their meaning, which the guards rely on: no -ffast-math. Its name alone, defined for glibc's
 # headers, declares their SIMD logarithm (at most 4 ulp off): the loops over the points of an element become vectors.
 # -g0: Python's own flags have -g, and their table takes up to half of the compiler's time; the same machine code
-COMPILER_FLAGS = [
-    "-O3", "-D__FAST_MATH__", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros",
-    "-freciprocal-math", "-fassociative-math", "-w",
-]  # fmt: skip
+COMPILER_FLAGS = (
+    "-O3 -D__FAST_MATH__ -g0 -march=native -fno-math-errno -fno-trapping-math "
+    "-fno-signed-zeros -freciprocal-math -fassociative-math -w"
+).split()
 
 # Of tangents: their time is that of sums over pairs of unknowns, which -O2 makes vectors of as -O3 does if it may count
 # the turns of a loop. They run as fast (21 and 357 ms for the artery of degree 1 and 2), and the compiler takes two
@@ -59,7 +59,7 @@ TANGENT_FLAGS = ["-O2", "-ftree-vectorize", "-fvect-cost-model=dynamic", *COMPIL
 SIMD_COMPONENTS = (16, 8, 4, 3, 2, 1)
 
 # of our own C functions: no sum is taken in another order than it is written in
-LIBRARY_FLAGS = ["-std=c17", "-O3", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wextra"]
+LIBRARY_FLAGS = "-std=c17 -O3 -g0 -march=native -fno-math-errno -fno-trapping-math -Wall -Wextra".split()
 
 # By number of arguments: what a form is, the seconds that it takes (the energy here, hexahedra, one core), and flags
 _KINDS = {

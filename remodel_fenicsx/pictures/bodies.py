@@ -17,10 +17,9 @@ import sys
 import textwrap
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,8 +158,7 @@ FOOT = 150  # pixels: what stands below all bodies
 ZOOM = 0.8  # leaves room for the title
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """What the child draws: sheets of bodies, each with its title; the words below them."""
 
     sheets: Sequence[Sequence[tuple[str, pyvista.UnstructuredGrid]]]
@@ -237,8 +235,7 @@ def _drawn(job: Job, sheet: Sequence[tuple[str, Any]], bounds: Array) -> Pixels:
 CUTS = ("half", "quarter")
 
 
-@dataclass(frozen=True)
-class Viewing:
+class Viewing(NamedTuple):
     """How a body is looked at."""
 
     layers: int | None = None
@@ -286,15 +283,15 @@ def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
 # ---------------------------------------------------------------- pictures and animations as files
 
 MOST_PANELS, MOST_COLUMNS = 12, 4
-MOVIE_FRAMES, FEWEST_FRAMES, MOST_FRAMES = 60, 2, 500  # an animation of one is a picture
+FEWEST_FRAMES, MOST_FRAMES = 2, 500  # an animation of one is a picture
 FRAME_TIME, LAST_TIME = 80, 1600  # ms that a frame stands; multiples of 10, as GIF counts
 
 
 def draw_picture(
     folder: str | os.PathLike[str],
-    times: Sequence[float] | None = None,
-    viewing: Viewing | None = None,
-    path: Path | None = None,
+    times: Sequence[float] | None,
+    viewing: Viewing,
+    path: Path | None,
 ) -> Path:
     """Draw the body of a run at some of its times, beside each other."""
     _check_new(path, (".png", ".pdf"))
@@ -303,15 +300,10 @@ def draw_picture(
     if len(shown) > MOST_PANELS:
         rule = f"allowed are {MOST_PANELS} in a picture (animate shows more)"
         raise FigureError(f"times: {len(shown)} times; {rule}", 2)
-    return _draw(recording, [shown], viewing or Viewing(), path, ".png")
+    return _draw(recording, [shown], viewing, path, ".png")
 
 
-def draw_animation(
-    folder: str | os.PathLike[str],
-    frames: int = MOVIE_FRAMES,
-    viewing: Viewing | None = None,
-    path: Path | None = None,
-) -> Path:
+def draw_animation(folder: str | os.PathLike[str], frames: int, viewing: Viewing, path: Path | None) -> Path:
     """Draw the body of a run as it moves through time."""
     _check_new(path, (".gif", ".webp"))
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
@@ -323,7 +315,7 @@ def draw_animation(
         fault = "fields of one time alone are recorded, so nothing moves"
         raise FigureError(f"{recording.path}: {fault}", 2)
     times = kept_times(recorded, frames)
-    return _draw(recording, [[float(t)] for t in times], viewing or Viewing(), path, ".gif")
+    return _draw(recording, [[float(t)] for t in times], viewing, path, ".gif")
 
 
 def _check_new(path: Path | None, endings: Sequence[str]) -> None:

@@ -11,11 +11,12 @@ import re
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,22 +90,20 @@ def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]
 # All text of others goes through `escape`.
 
 
-@dataclass(frozen=True)
-class Array:
+class Array(NamedTuple):
     """Numbers that the page unpacks into a typed array."""
 
     values: NDArray[Any]
     differences: bool = False
 
 
-@dataclass(frozen=True)
-class Card:
+class Card(NamedTuple):
     """A part of the page."""
 
     name: str
     html: str
-    data: Mapping[str, Any] = field(default_factory=dict)
-    arrays: Mapping[str, Array] = field(default_factory=dict)
+    data: Mapping[str, Any] = MappingProxyType({})
+    arrays: Mapping[str, Array] = MappingProxyType({})
 
 
 def section(title: str, content: str, width: str = "half", note: str = "") -> str:
@@ -618,7 +617,7 @@ def cards(run: ReportedRun) -> list[Card]:
 
 REPORT = "report.html"
 PAGE_SIZE = 20.0  # MB that a page should have at most
-SCRIPTS = ("data.js", "body.js", "angles.js", "through_the_wall.js", "curves.js", "page.js")
+SCRIPTS = "data.js body.js angles.js through_the_wall.js curves.js page.js".split()
 STYLES = ("report.bundle.css", "page.css")
 GENERATOR_TAG = b'name="generator" content="remodel_fenicsx'  # what bears it may be made anew
 LARGEST_PAGE = 10**9  # bytes

@@ -68,12 +68,12 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 def time_of_checkpoint(folder: Path) -> float | None:
     """That of the newest; None if there is none."""
     found = read_checkpoint(folder)
-    return found and found.time
+    return None if found is None else found.time
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
     """The newest checkpoint that is whole, with a warning where one is not; None if there is none."""
-    found, faults = [], []
+    found, faults = list[Checkpoint](), list[str]()
     for path in (folder / name for name in FILES):
         try:
             if os.path.lexists(path):
@@ -85,7 +85,7 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
         raise CheckpointError(f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}")
     for fault in faults:
         log.warning("%s", fault)
-    return max(found, key=lambda one: one.number, default=None)
+    return max(found, key=lambda one: one.number) if found else None
 
 
 def read_file(path: Path) -> Checkpoint:

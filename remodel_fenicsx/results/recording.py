@@ -11,6 +11,7 @@ import socket
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -33,10 +34,10 @@ if TYPE_CHECKING:
 
 LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
 # matplotlib's RdYlBu in LEVELS equal steps: red along the first direction (0 degrees), blue across it (90)
-ANGLE_COLOURS = (
-    "#a50026", "#c21c27", "#dc3b2c", "#ed5f3c", "#f7844e", "#fcaa5f", "#fec87a", "#fee496", "#fff6b1",
-    "#f6fbd0", "#e4f4f1", "#c7e7f1", "#a8d6e8", "#87bdd9", "#69a0ca", "#4d7fb9", "#3d5ba7", "#313695",
-)  # fmt: skip
+ANGLE_COLOURS = tuple(
+    "#a50026 #c21c27 #dc3b2c #ed5f3c #f7844e #fcaa5f #fec87a #fee496 #fff6b1 #f6fbd0 "
+    "#e4f4f1 #c7e7f1 #a8d6e8 #87bdd9 #69a0ca #4d7fb9 #3d5ba7 #313695".split()
+)
 CHAIN_LOOK: dict[str, Any] = {  # as the page takes it
     "colour": (0.08, 0.08, 0.10),
     "reach": 0.39,  # half a chain's length over the shorter side of its face, both undeformed
@@ -282,14 +283,10 @@ def scene_as_run(folder: Path) -> Scene:
 
 def versions_as_run(folder: Path) -> dict[str, str]:
     """What stands on top of the scene of a run's folder, by name."""
-    path, found = folder / SCENE, dict[str, str]()
+    path = folder / SCENE
     text = read_regular(path, LARGEST_HISTORY).decode(errors="replace") if path.is_file() else ""
-    for line in text.splitlines()[1:]:
-        if not line.startswith("#"):
-            break
-        name, _, version = line[1:].strip().partition(" ")
-        found[name] = version
-    return found
+    lines = takewhile(lambda line: line.startswith("#"), text.splitlines()[1:])
+    return dict(line[1:].strip().partition(" ")[::2] for line in lines)
 
 
 def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
@@ -383,7 +380,6 @@ def _in_words(times: Array) -> str:
 # One run at a time, and others can see which.
 
 LOCK = "run.lock"
-_WRITER = re.compile(r"process \d+ on [\w.-]+( \(\d+ ranks\))?")
 
 
 class FolderTaken(RemodelError, ValueError):
@@ -442,7 +438,7 @@ def writer(folder: Path) -> tuple[str | None, bool]:
         except BlockingIOError:
             lives = True
         words = file.read(4096).decode(errors="replace").strip()
-    return words if _WRITER.fullmatch(words) else None, lives  # none: just being written, or of another kind
+    return words or None, lives  # none: just being written
 
 
 def is_vacant(folder: Path) -> bool:
