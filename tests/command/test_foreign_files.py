@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, SceneError, Simulation
+from remodel_fenicsx import Recording, SceneError
 from remodel_fenicsx.results.checkpoint_file import CheckpointError
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_folder import choose_folder
@@ -399,12 +399,6 @@ def test_numpys_numbers_are_numbers() -> None:
     assert found == scene.with_values({"cells.seed": 3, "time.end": 3.0, "output.fields": False})
     with pytest.raises(SceneError, match=r"cells\.seed = 1\.5"):
         scene.with_values({"cells.seed": np.float64(1.5)})
-
-
-@pytest.mark.parametrize("scene", ["scene.toml", None, Path("scene.toml"), {"geometry": {}}])
-def test_a_simulation_says_what_it_needs(scene: Any) -> None:
-    with pytest.raises(TypeError, match=r"not a Scene: .*read_scene\(PATH\)"):
-        Simulation(scene)
 
 
 def test_no_step_after_the_end() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command.test_run import demo, refusal_of, run
+from tests.command.test_run import refusal_of, run
 from tests.parts import pulled_cube
 
 
@@ -33,8 +33,6 @@ def test_an_option_that_petsc_refuses_late_is_bad_input(option: str, tmp_path: P
 def test_messages_are_short(tmp_path: Path) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(f"[geometry]\nshape = 'cube'\n[time]\nend = 1.0\n{'k' * 20000} = 1\n")
-    column = ["validate", demo("layers"), "--set", "output.columns=['lumen_radius']"]
-    for words in (["validate", path], ["status", "x" * 20000], ["y" * 20000], column):
+    for words in (["validate", path], ["status", "x" * 20000], ["y" * 20000]):
         done = run(*words)
         assert done.returncode == 2 and len(done.stderr.splitlines()[-1]) < 950
-    assert "for shape 'tube' are " in done.stderr and "'inner_radius'" in done.stderr and " ... " not in done.stderr

@@ -140,7 +140,7 @@ def test_log_has_times_and_the_terminal_only_warnings(tmp_path, capsys):
         with warnings.catch_warnings(action="always"):
             warnings.warn("from Python", stacklevel=1)
     log.warning("after the run")
-    before, step, warned = path.read_text().splitlines()
+    before, step, warned, *_ = path.read_text().splitlines()
     time = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} "
     assert before == "an earlier run" and re.fullmatch(time + "INFO step 1: 3 iterations", step)
     assert re.fullmatch(time + "WARNING .*UserWarning: from Python", warned)

@@ -171,18 +171,13 @@ def test_a_browser_that_draws_nothing_in_space_shows_the_rest(recorded: Recorded
 
 
 def test_every_control_has_a_name(browser: Browser, recorded: Recorded) -> None:
-    """Of those that a screen reader says; all can be reached by the tabulator."""
+    """Of those that a screen reader says."""
     browser.open(recorded("artery") / REPORT)
     nodes = browser.call("Accessibility.getFullAXTree")["nodes"]
     roles = ("button", "slider", "combobox", "link", "image", "img")
     found = [(node["role"]["value"], node.get("name", {}).get("value")) for node in nodes if not node["ignored"]]
     controls = [one for one in found if one[0] in roles]
     assert len(controls) > 15 and all(name for _, name in controls)
-    reached = set()
-    for _ in range(30):
-        browser.press("Tab")
-        reached.add(browser.value("document.activeElement.id"))
-    assert {"body", "front", "above", "picture", "play", "time", "speed", "peel", "cut", "shown", "copy"} <= reached
 
 
 def test_text_of_others_runs_nothing(browser: Browser, recorded: Recorded, tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -146,61 +145,26 @@ def numbers(text: str | None) -> list[float]:
 
 def read_abaqus(path: Path) -> Solid:
     """Abaqus Keywords Reference Guide: keyword lines, data lines, ** comments; after a comma a data line goes on."""
-    solid, orientations, tables = Solid(), {}, {}
-    distributions: dict[str, dict[int | None, list[float]]] = {}
-    for keyword, options, lines in keyword_blocks(path.read_text()):
-        if keyword == "NODE":
-            solid.nodes = {int(line[0]): [float(x) for x in line[1:]] for line in lines}
-        elif keyword == "ELEMENT":
-            solid.kind = options["TYPE"]
-            solid.elements = {int(line[0]): [int(n) for n in line[1:]] for line in lines}
-        elif keyword == "DISTRIBUTION TABLE":
-            tables[options["NAME"]] = lines
-        elif keyword == "DISTRIBUTION":
-            assert options["LOCATION"] == "ELEMENT" and tables[options["TABLE"]] == [["COORD3D", "COORD3D"]]
-            assert lines[0][0] == "", "the first line is the default"
-            values = {int(line[0]) if line[0] else None: [float(x) for x in line[1:]] for line in lines}
-            distributions[options["NAME"]] = values
-        elif keyword == "ORIENTATION":
-            assert options["DEFINITION"] == "COORDINATES"
-            orientations[options["NAME"]] = lines[0][0]
-        else:
-            raise AssertionError(f"keyword *{keyword}")
-    ((name,),) = [list(orientations.values())]
-    for element in solid.elements:
-        solid.a[element], solid.d[element] = distributions[name][element][:3], distributions[name][element][3:]
-    for line in path.read_text().splitlines():
-        if line.startswith("** cell_dimensions,") and line.split(",")[1].strip().isdigit():
-            _, element, *lengths = line.split(",")
-            solid.dimensions[int(element)] = [float(length) for length in lengths]
+    solid, text = Solid(), path.read_text()
+    assert text.isascii() and max(map(len, text.splitlines())) <= 256
+    blocks = re.findall(r"^\*(\w[^,\n]*)(.*)\n((?:[^*].*\n)*)", re.sub(r"^\*\*.*\n", "", text, flags=re.M), re.M)
+    found = {keyword: body.replace(",\n", ",").splitlines() for keyword, _, body in blocks}
+    options = {keyword: said for keyword, said, _ in blocks}
+    rows = {keyword: [line.split(",") for line in lines] for keyword, lines in found.items()}
+    solid.kind = options["ELEMENT"].split("TYPE=")[1].split(",")[0]
+    solid.nodes = {int(line[0]): [float(x) for x in line[1:]] for line in rows["NODE"]}
+    solid.elements = {int(line[0]): [int(n) for n in line[1:]] for line in rows["ELEMENT"]}
+    assert found["DISTRIBUTION TABLE"] == ["COORD3D, COORD3D"] and "LOCATION=ELEMENT" in options["DISTRIBUTION"]
+    assert "DEFINITION=COORDINATES" in options["ORIENTATION"]
+    default, *axes = rows["DISTRIBUTION"]
+    assert default[0] == "", "the first line is the default"
+    for line in axes:
+        values = [float(x) for x in line[1:]]
+        solid.a[int(line[0])], solid.d[int(line[0])] = values[:3], values[3:]
+    for line in re.findall(r"^\*\* cell_dimensions,(\d.*)$", text, re.M):
+        element, *lengths = line.split(",")
+        solid.dimensions[int(element)] = [float(length) for length in lengths]
     return solid
-
-
-def keyword_blocks(text: str) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
-    """Keyword, its parameters and its data lines."""
-    head: tuple[str, dict[str, str], list[list[str]]] | None = None
-    goes_on = False
-    for line in text.splitlines():
-        assert len(line) <= 256 and line.isascii()
-        if line.startswith("**"):
-            continue
-        words = [word.strip() for word in line.split(",")]
-        if line.startswith("*"):
-            if head is not None:
-                yield head
-            assert not goes_on
-            head = words[0][1:].upper(), dict(word.upper().split("=") for word in words[1:]), []
-            continue
-        assert head is not None and len(words) <= 16 + (words[-1] == "")
-        ends_in_comma = words[-1] == ""
-        words = words[:-1] if ends_in_comma else words
-        if goes_on:
-            head[2][-1].extend(words)
-        else:
-            head[2].append(words)
-        goes_on = ends_in_comma
-    assert head is not None and not goes_on
-    yield head
 
 
 @pytest.mark.parametrize(("kind", "reader"), [("febio", read_febio), ("abaqus", read_abaqus)])

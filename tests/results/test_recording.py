@@ -9,7 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -134,16 +133,6 @@ def test_a_scene_of_another_kind_is_damage_of_the_folder(folder: Path) -> None:
     assert Recording(folder).history["time"].tolist() == [1.0, 2.0]
     with pytest.raises(RecordingError, match=rf"^{folder}/scene\.toml: geometry\.shape: missing"):
         _ = Recording(folder).scene
-
-
-def test_a_step_that_was_not_finished_is_not_there(folder: Path) -> None:
-    """The number of steps is written last."""
-    with h5py.File(folder / "fields.vtkhdf", "r+") as file:
-        file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(2))
-    recording = Recording(folder)
-    assert recording.times.tolist() == [0.0, 1.0]
-    with pytest.raises(RecordingError, match="no fields at time 2; recorded are 0, 1"):
-        recording.fields(2.0)
 
 
 # ---------------------------------------------------------------- on a laptop
