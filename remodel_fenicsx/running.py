@@ -354,12 +354,12 @@ class _Report(Watcher):
     def committed(self, step: Step) -> None:
         """Say it."""
         log.info("%s", ", ".join(f"{name} {value:.6g}" for name, value in step.row.items()))
-        parts = step.work.substeps
-        message = f"time {step.time:g} solved in {parts} parts" if parts > 1 else None
-        loads = ", ".join(f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row)
-        done = self.time.progress(step.number, step.time)
+        if (parts := step.work.substeps) > 1:
+            self.progress.message(f"time {step.time:g} solved in {parts} parts")
+        loads = [f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row]
+        state = ", ".join([f"t = {step.time:g}", *loads, f"{step.work.newton_iterations} Newton"])
         count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.chooses else None
-        self.progress.step(done, step.time, loads, step.work.newton_iterations, message, count)
+        self.progress.step(self.time.progress(step.number, step.time), state, count)
 
 
 # ---------------------------------------------------------------- what may be looked at before any solve

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, chdir, contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
-from typing import IO, Any
+from typing import Any
 
 import cffi
 import dolfinx.fem
@@ -301,7 +301,16 @@ def _alone(kernel: str) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / kernel).open("a+") as lock:
         try:
-            _take(lock)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                lock.seek(0)
+                process = lock.read().strip() or "unknown"
+                log.log(NOTICE, "another run is compiling the same (process %s): waiting for it", process)
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            lock.truncate(0)
+            lock.write(f"{os.getpid()}\n")
+            lock.flush()
             if not _is_cached(kernel) and any(path.exists() for path in _files(kernel)):
                 log.info("removing a compilation that was cut off: %s", kernel)
                 for path in folder.parent.glob(f"{kernel}.*"):
@@ -311,16 +320,3 @@ def _alone(kernel: str) -> Iterator[None]:
                 "%s cannot be locked (%s): several runs at a time may wait for each other", lock.name, error.strerror
             )
         yield
-
-
-def _take(lock: IO[str]) -> None:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.seek(0)
-        process = lock.read().strip() or "unknown"
-        log.log(NOTICE, "another run is compiling the same (process %s): waiting for it", process)
-        fcntl.flock(lock, fcntl.LOCK_EX)
-    lock.truncate(0)
-    lock.write(f"{os.getpid()}\n")
-    lock.flush()

@@ -232,8 +232,6 @@ def _drawn(job: Job, sheet: Sequence[tuple[str, Any]], bounds: Array) -> Pixels:
 
 # ---------------------------------------------------------------- what is seen of a body, and from where
 
-CUTS = ("half", "quarter")
-
 
 class Viewing(NamedTuple):
     """How a body is looked at."""
@@ -268,14 +266,16 @@ def shown_elements(whole: WholeBody, viewing: Viewing) -> NDArray[np.bool_]:
 
 
 def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
-    centres = whole.points[whole.elements].mean(axis=1)
+    """Mark the elements that lie in front as a whole."""
+    if cut is None:
+        return np.zeros(len(whole.elements), dtype=bool)
     middle = (whole.points.min(axis=0) + whole.points.max(axis=0)) / 2
+    x, y, _ = (whole.points[whole.elements].mean(axis=1) - middle).T
     slack = 1e-6 * np.ptp(whole.points)  # an element on the border stays
-    is_front, is_right = centres[:, 1] < middle[1] - slack, centres[:, 0] > middle[0] + slack
-    found = {None: np.zeros(len(centres), bool), "half": is_front, "quarter": is_front & is_right}
+    found = {"half": y < -slack, "quarter": (y < -slack) & (x > slack)}
     if cut not in found:
-        raise FigureError(f"cut {cut}: allowed are {', '.join(CUTS)}", 2)
-    if cut is not None and not found[cut].any():
+        raise FigureError(f"cut {cut}: allowed are {', '.join(found)}", 2)
+    if not found[cut].any():
         raise FigureError(f"cut {cut}: no whole element of this body lies in that part", 2)
     return found[cut]
 

@@ -30,7 +30,6 @@ class Progress:
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
         self._first: tuple[float, float] | None = None  # step and clock: what it takes to compile is past
-        self._pending: str | None = None  # the newest line that was not printed
         self._bar: Any = None  # rich's, on a terminal
 
     def __enter__(self) -> Self:
@@ -43,30 +42,18 @@ class Progress:
         if self._bar is not None:
             with suppress(OSError):  # the terminal is gone
                 self._bar.stop()
-        elif self._pending is not None:
-            announce(self._pending)
-        self._bar, self._pending = None, None
+            self._bar = None
 
-    def step(
-        self,
-        index: float,
-        time: float,
-        load_text: str = "",
-        newton_iterations: int = 0,
-        message: str | None = None,
-        count: str | None = None,
-    ) -> None:
+    def step(self, index: float, state: str, count: str | None = None) -> None:
         """Step `index` (1 to total_steps) is done; of steps that are no whole ones, 0 to total_steps."""
         if self._silent:
             return
-        if message is not None:
-            self.message(message)
-        count = count or f"{index}/{self._total}"
-        at, newton, left = f"t = {time:g}", f"{newton_iterations} Newton", self._time_left(index)
-        if self._bar is not None:  # what stands last is lost first where the terminal is narrow
-            self._bar.update(0, completed=index, count=count, state=_joined(at, newton, load_text), left=left)
+        count, left = count or f"{index}/{self._total}", self._time_left(index)
+        if self._bar is not None:
+            self._bar.update(0, completed=index, count=count, state=state, left=left)
         else:
-            self._say(_joined(f"step {count}", at, load_text, newton, left), at_once=index >= self._total)
+            said = f"step {count}", state, left
+            self._say(", ".join(filter(None, said)), at_once=index >= self._total)
 
     def show(self, text: str) -> None:
         """Show a line; where lines stay, only now and then."""
@@ -76,11 +63,10 @@ class Progress:
             self._say(text, at_once=False)
 
     def _say(self, text: str, at_once: bool) -> None:
-        """A line that stays, if it is time for one; the last one is said at the end."""
-        self._pending = f"{self._title}: {text}"
+        """A line that stays, if it is time for one."""
         if at_once or clock.monotonic() >= self._line_is_due:
-            announce(self._pending)
-            self._line_is_due, self._pending = clock.monotonic() + self._interval, None
+            announce(f"{self._title}: {text}")
+            self._line_is_due = clock.monotonic() + self._interval
 
     def message(self, text: str) -> None:
         """Print a line above the bar, or between the plain lines."""
@@ -99,19 +85,11 @@ class Progress:
         return f"{duration((now - since) / (index - first) * remaining)} left"
 
 
-def _joined(*parts: str) -> str:
-    return ", ".join(filter(None, parts))
-
-
 class Line(Progress):
     """What several runs do, on stderr: one line that changes on a terminal, else a plain line now and then."""
 
     def __init__(self, title: str, silent: bool) -> None:
         super().__init__(0, title, -1 if silent else 0, interval=LINE_EVERY)
-
-    def __exit__(self, *error: object) -> None:
-        self._pending = None
-        super().__exit__(*error)
 
 
 def _bar(title: str, total: int | None, done: float) -> Any:

@@ -34,7 +34,7 @@ def test_the_help_of_a_command_has_examples_that_it_takes(name: str, capsys: pyt
     text = capsys.readouterr().out
     assert end.value.code == 0
     words = shlex.split(cli.COMMANDS[name].example.split(" > ")[0])
-    assert f"  remodel-fenicsx {name} " in text and cli.parser().parse_args(words).command == name
+    assert f"  remodel-fenicsx {name}" in text and cli.parser().parse_args(words).command == name
     for action in COMMANDS[name]._actions:
         assert action.help and (action.dest == "help" or action.help[0].isupper() and action.help.endswith((".", ").")))
 

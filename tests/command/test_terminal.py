@@ -24,7 +24,9 @@ from remodel_fenicsx.system.terminal import Progress, open_log
 with open_log(sys.argv[1]), Progress(8, "artery [4]", 0) as progress:
     for k in range(1, 9):
         time.sleep(0.06)
-        progress.step(k, 1.0 * k, "pressure [0.5]", 3, "two substeps" if k == 4 else None)
+        progress.step(k, f"t = {k}, pressure [0.5], 3 Newton")
+        if k == 4:
+            progress.message("two substeps")
         if k == 5:
             logging.getLogger("remodel_fenicsx.evolution.stepper").warning("careful")
         if k == int(sys.argv[2]):
@@ -63,7 +65,7 @@ def test_a_terminal_gets_a_bar(tmp_path):
     assert status == 0, text
     lines = [line.strip() for line in re.split(r"[\r\n]+", plain(text))]
     bars = [line for line in lines if "━" in line]
-    assert re.match(r"artery \[4\] ━+ 8/8 t = 8, 3 Newton, pressure \[0.5\] 0:00:0\d", bars[-1]), bars[-1]
+    assert re.match(r"artery \[4\] ━+ 8/8 t = 8, pressure \[0.5\], 3 Newton 0:00:0\d", bars[-1]), bars[-1]
     assert any(re.search(r"[2-7]/8 .* left$", line) for line in bars)
     assert "two substeps" in lines and "WARNING: careful" in lines  # lines of their own, above the bar
     assert lines[-2:] == ["the end", ""]
@@ -89,7 +91,9 @@ def test_a_pipe_gets_plain_lines_now_and_then(capsys, time_passes):
     with Progress(20, "tendon", 0, interval=5.0) as progress:
         for k in range(1, 21):
             time_passes[0] += 2.0
-            progress.step(k, 0.5 * k, "force 25", 4, "halved the step" if k == 3 else None)
+            progress.step(k, f"t = {0.5 * k:g}, force 25, 4 Newton")
+            if k == 3:
+                progress.message("halved the step")
     out, err = capsys.readouterr()
     assert out == ""
     lines = [line for line in err.splitlines() if "/20" in line]
@@ -124,7 +128,7 @@ def test_hints_are_typed_as_the_command_was_found(tmp_path, monkeypatch):
 
 def test_other_ranks_are_silent(capsys, tmp_path):
     with open_log(tmp_path / "run.log", 1) as log, Progress(2, "artery", 1) as progress:
-        progress.step(1, 1.0, "", 3, "something")
+        progress.step(1, "something")
         progress.message("something")
         log.warning("something")
     with hold_log(1, quiet=False) as held:
