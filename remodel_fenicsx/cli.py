@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
 presets, scenes = Late("remodel_fenicsx.scene.presets"), Late("remodel_fenicsx.scene.scene")  # no help needs them
 
-# what an error of Python's begins with, and the option for it
-OPTIONS = {"folder": "-o", "path": "-o", "times": "--time", "layers": "--layers", "cut": "--cut", "view": "--view"}
 EXIT_CODES = {
     0: "finished",
     BAD_INPUT: "bad input",
@@ -85,7 +83,7 @@ class Command(NamedTuple):
     """What a command takes and does; an example is what follows the program's name."""
 
     do: Do
-    examples: Sequence[str]
+    example: str
     options: Sequence[Option]
     needs: Needs
     alone: bool
@@ -94,15 +92,13 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {}  # by name, in the order of the help
 
 
-def command(
-    name: str, examples: Sequence[str], *options: Option, needs: Needs = (), alone: bool = False
-) -> Callable[[Do], Do]:
+def command(name: str, example: str, *options: Option, needs: Needs = (), alone: bool = False) -> Callable[[Do], Do]:
     """Of a function: makes it a command, whose help is its docstring."""
 
     # it gets the options, with the scene where the command takes one, and returns an exit code, or None for 0; it is
     # called where nothing that it needs is missing; where it works alone, on the first of several ranks only
     def listed(do: Do) -> Do:
-        COMMANDS[name] = Command(do, examples, options, needs, alone)
+        COMMANDS[name] = Command(do, example, options, needs, alone)
         return do
 
     return listed
@@ -124,8 +120,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--version", action="version", version=__version__, help="Print the version and end.")
     commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, each in COMMANDS.items():
-        shown, text = "\n  ".join(f"remodel-fenicsx {example}" for example in each.examples), each.do.__doc__ or ""
-        epilog = f"example{'s' if len(each.examples) > 1 else ''}:\n  {shown}"
+        text, epilog = each.do.__doc__ or "", f"example:\n  remodel-fenicsx {each.example}"
         about: dict[str, Any] = {"description": text, "epilog": epilog, "formatter_class": raw}
         if text:  # else it is for the processes of a study
             about["help"] = text.replace("%", "%%")
@@ -166,7 +161,7 @@ def _done(arguments: list[str]) -> int:
         return chosen.do(options) or 0
     except RemodelError as error:
         _complain_of(getattr(error, "failed", {}))
-        return _fail(_as_typed(error, options), error.exit_code, error.on_all_ranks)
+        return _fail(error.in_words(), error.exit_code, error.on_all_ranks)
     except OSError as error:
         text, code = f"cannot write the results: {refusal_in_words(error)}", BAD_ENVIRONMENT
         if error.errno == errno.ENAMETOOLONG:
@@ -239,13 +234,6 @@ def _fail(message: str, code: int, on_all_ranks: bool) -> int:
     return code
 
 
-def _as_typed(error: RemodelError, options: argparse.Namespace) -> str:
-    """In one line; where it begins with an argument of Python's, that is the option which was typed."""
-    line = re.sub(r"^\w+(?=[ :])", lambda name: OPTIONS.get(name[0], name[0]), error.in_words())
-    output = getattr(options, "output", None)
-    return f"-o {line}" if output is not None and line.startswith(f"{output}: ") else line
-
-
 @contextlib.contextmanager
 def _stopping(kept: str) -> Iterator[None]:
     """Within, a signal ends the command at once, which says what is kept."""
@@ -307,12 +295,7 @@ COMPUTES, DRAWS = (reason_unusable,), (reason_undrawable,)
 # ---------------------------------------------------------------- the commands
 @command(
     "run",
-    [
-        "run artery.toml -o artery",
-        "run artery.toml --set time.end=10 -o short",
-        "run --resume artery --set time.end=300",
-        "run artery.toml --max-wall-time 2h",
-    ],
+    "run artery.toml -o artery",
     option(SCENE_FILE, nargs="?"),
     option("--resume DIR  Go on with the run in DIR from its last checkpoint, in place of a new run of SCENE."),
     *CHANGES,
@@ -340,7 +323,7 @@ def _run(options: argparse.Namespace) -> None:
     _say(f"results in {folder}")
 
 
-@command("status", ["status artery"], RUN_FOLDER)
+@command("status", "status artery", RUN_FOLDER)
 def _status(options: argparse.Namespace) -> None:
     """Say where the run in DIR is, how fast it is, and whether it is alive."""
     from remodel_fenicsx.results.status import status
@@ -350,7 +333,7 @@ def _status(options: argparse.Namespace) -> None:
 
 @command(
     "report",
-    ["report artery --open", "report artery -o artery.html"],
+    "report artery --open",
     RUN_FOLDER,
     option("-o --output FILE  Write the page to this new file (default: DIR/report.html, which is made anew)."),
     option("--open  Show the page in a browser."),
@@ -371,7 +354,7 @@ def _report(options: argparse.Namespace) -> None:
 
 @command(
     "picture",
-    ["picture artery --time 0 25 150 --cut half", "picture artery --layers 3 --view above -o wall.pdf"],
+    "picture artery --time 0 25 150 --cut half",
     RUN_FOLDER,
     *VIEWING,
     _drawn_in("NAME-t150.png"),
@@ -391,7 +374,7 @@ def _picture(options: argparse.Namespace) -> None:
 
 @command(
     "animate",
-    ["animate artery -o artery.webp --frames 40"],
+    "animate artery -o artery.webp --frames 40",
     RUN_FOLDER,
     *VIEWING,
     _drawn_in("NAME-t0-t150.gif"),
@@ -410,7 +393,7 @@ def _animate(options: argparse.Namespace) -> None:
     _say(str(draw_animation(options.folder, options.frames, viewing, options.output)))
 
 
-@command("revolve", ["revolve artery"], RUN_FOLDER, needs=COMPUTES, alone=True)
+@command("revolve", "revolve artery", RUN_FOLDER, alone=True)
 def _revolve(options: argparse.Namespace) -> None:
     """Write the fields of a reduced run in DIR on the whole body, for ParaView."""
     from remodel_fenicsx.results.whole_body import revolve
@@ -420,7 +403,7 @@ def _revolve(options: argparse.Namespace) -> None:
 
 @command(
     "export",
-    ["export artery --format febio -o fibres.feb"],
+    "export artery --format febio -o fibres.feb",
     RUN_FOLDER,
     option(
         "--format NAME  Write vtu (ParaView, meshio), febio (.feb), abaqus (.inp, CalculiX too) or csv.",
@@ -440,7 +423,7 @@ def _export(options: argparse.Namespace) -> None:
 
 @command(
     "new",
-    ["new kuhl-holzapfel-2007 --shape tube > mine.toml"],
+    "new kuhl-holzapfel-2007 --shape tube > mine.toml",
     option("preset PRESET  The model: kuhl-holzapfel-2007, consistent or sun-2002."),
     option("--shape SHAPE  The body: cube, tendon, sheet or tube (default: tube).", default="tube"),
 )
@@ -452,10 +435,7 @@ def _new(options: argparse.Namespace) -> None:
 
 @command(
     "wall",
-    [
-        "wall lumen.stl --thickness 0.6 --size 0.9 -o vessel.msh",
-        "wall lumen.ply --layers media=0.6 adventitia=0.4 --size 0.5 -o vessel.msh",
-    ],
+    "wall lumen.stl --thickness 0.6 --size 0.9 -o vessel.msh",
     option("surface FILE  The surface of the lumen, open at its ends: STL, PLY, VTP or OBJ.", type=Path),
     option(
         "--thickness VALUE  Thickness of the wall in the unit of the surface, or the name of an array at its points."
@@ -481,7 +461,7 @@ def _wall(options: argparse.Namespace) -> None:
     _say("\n".join(lines))
 
 
-@command("validate", ["validate artery.toml", "validate artery.toml --profile fast"], *SCENE_AND_CHANGES)
+@command("validate", "validate artery.toml", *SCENE_AND_CHANGES)
 def _validate(options: argparse.Namespace) -> None:
     """Check a scene without running it, and show what it means."""
     from remodel_fenicsx.body.reductions import explained
@@ -512,7 +492,7 @@ def _unseen_files(scene: Scene) -> str:
 
 @command(
     "axes",
-    ["axes artery.toml -o artery-axes.vtu"],
+    "axes artery.toml -o artery-axes.vtu",
     *SCENE_AND_CHANGES,
     option("-o --output FILE  Write to this new file (default: NAME-axes.vtu)."),
     needs=COMPUTES,
@@ -528,7 +508,7 @@ def _axes(options: argparse.Namespace) -> None:
 
 @command(
     "unload",
-    ["unload scanned.toml -o unloaded"],
+    "unload scanned.toml -o unloaded",
     *SCENE_AND_CHANGES,
     option("-o --output FOLDER  Put its scene and mesh into this new folder (default: NAME-unloaded)."),
     needs=COMPUTES,
@@ -546,7 +526,7 @@ def _unload(options: argparse.Namespace) -> None:
 
 @command(
     "schema",
-    ["schema -o scene.schema.json"],
+    "schema -o scene.schema.json",
     option("-o --output FILE  Write it to this new file (default: print it)."),
     alone=True,
 )
@@ -572,11 +552,7 @@ def _answer(study: Callable[..., tuple[Path, Any]], *wishes: Any) -> int:
 
 @command(
     "sweep",
-    [
-        "sweep mine.toml loads.pressure.value=2:6:5",
-        "sweep mine.toml loads.pressure.value=2:6:5 remodeling.kappa=0.02,0.05",
-        "sweep mine.toml loads.pressure.value=2:6 material.lame_mu=10:40 --latin 20",
-    ],
+    "sweep mine.toml loads.pressure.value=2:6:5",
     *SCENE_AND_CHANGES,
     option(
         "axes KEY=a:b:n  Vary a key: KEY=a:b:n takes n numbers from a to b, KEY=a,b,... these. Keys are combined.",
@@ -600,7 +576,7 @@ def _sweep(options: argparse.Namespace) -> int:
 
 @command(
     "ensemble",
-    ["ensemble artery.toml --seeds 32 -o seeds"],
+    "ensemble artery.toml --seeds 32 -o seeds",
     *SCENE_AND_CHANGES,
     option("--seeds N  Use this many seeds (default: 32; at least 2).", default=32),
     *_study("ensemble"),
@@ -615,7 +591,7 @@ def _ensemble(options: argparse.Namespace) -> int:
 
 @command(
     "trade",
-    ["trade artery.toml --budget 10min"],
+    "trade artery.toml --budget 10min",
     *SCENE_AND_CHANGES,
     option(
         "--budget TIME  Begin no run that would end after this wall time (default: 10min). Cheap runs come first.",
@@ -633,7 +609,7 @@ def _trade(options: argparse.Namespace) -> int:
 
 @command(
     "fit",
-    ["fit tube.toml inflation.toml -o fitted"],
+    "fit tube.toml inflation.toml -o fitted",
     *SCENE_AND_CHANGES,
     option("data DATA  A TOML file with the unknowns and the tables of measurements; docs/fit.md explains it."),
     option("--no-likelihood-profiles  Leave out the likelihood profiles of unknowns that depend on each other."),
@@ -653,7 +629,7 @@ def _fit(options: argparse.Namespace) -> int:
 
 @command(
     "stability",
-    ["stability artery.toml --times 5 -o stable"],
+    "stability artery.toml --times 5 -o stable",
     *SCENE_AND_CHANGES,
     option("-o --output DIR  Put the results into this new or empty folder (default: results/NAME-stability)."),
     option("--times N  Look at N times of the run (default: 10).", default=10),
@@ -668,15 +644,13 @@ def _stability(options: argparse.Namespace) -> None:
     _say(f"{found.in_words()}\nresults in {place}")
 
 
-@command("info", ["info"], needs=COMPUTES)
+@command("info", "info", needs=COMPUTES)
 def _info(options: argparse.Namespace) -> None:
     """Print the versions of the program and its libraries, the solvers and the BLAS."""
-    from remodel_fenicsx.fem.jit import has_simd_logarithm
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
     from remodel_fenicsx.kernels import is_available
 
     found = versions() | {
-        "logarithms": "of several points at once" if has_simd_logarithm() else "point by point",
         "kept factors": f"in {'single' if is_available() else 'double'} precision",
         "solver methods": ", ".join(SOLVER_METHODS),
     }
@@ -684,14 +658,14 @@ def _info(options: argparse.Namespace) -> None:
         _say(f"{name:16} {version}")
 
 
-@command(PART, [], option("file_of_part FILE  The task, which its answer replaces."), needs=COMPUTES)
+@command(PART, "", option("file_of_part FILE  The task, which its answer replaces."), needs=COMPUTES)
 def _part(options: argparse.Namespace) -> None:
     from remodel_fenicsx.studies.fit import do_part
 
     do_part(options.file_of_part)
 
 
-@command(SERVE, [])
+@command(SERVE, "")
 def _serve(options: argparse.Namespace) -> int:
     return serve(main)
 

@@ -8,6 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 
 if TYPE_CHECKING:
@@ -156,9 +158,22 @@ class Recording(RecordedRun):
         ImportError
             If there is no PyVista.
         """
-        from remodel_fenicsx.pictures.bodies import Viewing, plot
+        from remodel_fenicsx.pictures import bodies
 
-        return plot(self, self._time(time), name, Viewing(layers, cut), elements, chains, plotter, options)
+        whole = bodies.whole_body(self)
+        shown = bodies.shown_elements(whole, bodies.Viewing(layers, cut))
+        if elements is not None:
+            if np.shape(elements) != shown.shape:
+                rule = f"allowed is a mask of all {len(shown)}"
+                raise bodies.FigureError(f"elements of shape {np.shape(elements)}: {rule}", 2)
+            shown &= np.asarray(elements, dtype=bool)
+        found = bodies.grid(whole, self._time(time), shown)
+        if name not in found.cell_data:
+            there = ", ".join(found.cell_data)
+            raise RecordingError(f"{self.path}: no field {name!r} of elements; there are {there}")
+        plotter = plotter or bodies.new_plotter()
+        bodies.add_body(plotter, bodies.deformed(found), name, chains, **options)
+        return plotter
 
     def screenshot(
         self, path: str | os.PathLike[str] | None = None, times: Sequence[float] | None = None, *,

@@ -279,7 +279,7 @@ def _record(
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
             fields = stack.enter_context(agreed(comm, lambda: Fields(*parts, times)))
-            followers, kept = [*followers, fields], [*kept, fields.publish]
+            followers, kept = [*followers, fields], [*kept, fields.close]
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, kept)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
         followers += [record, _Report(scene, progress), checkpoints, pause]
@@ -355,12 +355,12 @@ class _Report(Watcher):
     def committed(self, step: Step) -> None:
         """Say it."""
         log.info("%s", ", ".join(f"{name} {value:.6g}" for name, value in step.row.items()))
-        parts = step.work.substeps
-        message = f"time {step.time:g} solved in {parts} parts" if parts > 1 else None
-        loads = ", ".join(f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row)
-        done = self.time.progress(step.number, step.time)
+        if (parts := step.work.substeps) > 1:
+            self.progress.message(f"time {step.time:g} solved in {parts} parts")
+        loads = [f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row]
+        state = ", ".join([f"t = {step.time:g}", *loads, f"{step.work.newton_iterations} Newton"])
         count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.chooses else None
-        self.progress.step(done, step.time, loads, step.work.newton_iterations, message, count)
+        self.progress.step(self.time.progress(step.number, step.time), state, count)
 
 
 # ---------------------------------------------------------------- what may be looked at before any solve
@@ -388,10 +388,8 @@ def write_unloaded(scene: Scene, folder: Path) -> str:
 
 
 def _in_words(scene: Scene, found: Scene) -> str:
-    numbers = found.geometry.model_dump()
-    lengths = {name: value for name, value in numbers.items() if isinstance(value, float)}
-    known = scene.geometry.model_dump()
-    words = [f"{name} {value:.6g} (loaded {known[name]:.6g})" for name, value in lengths.items()]
+    numbers, known = found.geometry.model_dump().items(), scene.geometry.model_dump()
+    words = [f"{name} {n:.6g} (loaded {known[name]:.6g})" for name, n in numbers if isinstance(n, float)]
     if words:
         return ", ".join(words)
     before, after = (one.geometry.checked(one.mesh)[0].points for one in (scene, found))  # type: ignore[attr-defined]

@@ -10,9 +10,6 @@ import importlib.util
 import logging
 import os
 import platform
-import resource
-import shlex
-import subprocess
 import sysconfig
 import tempfile
 import time as clock
@@ -20,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, chdir, contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
-from typing import IO, Any
+from typing import Any
 
 import cffi
 import dolfinx.fem
@@ -36,7 +33,7 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.system.interrupts import PAUSE, SIGNALS, Interrupted, blocked, stopping_at_once
+from remodel_fenicsx.system.interrupts import held_back, stopping_at_once
 from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
@@ -47,10 +44,10 @@ COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each 
 # NaN and infinity keep their meaning, which the guards rely on: no -ffast-math. Its name alone, defined for glibc's
 # headers, declares their SIMD logarithm (at most 4 ulp off): the loops over the points of an element become vectors.
 # -g0: Python's own flags have -g, and their table takes up to half of the compiler's time; the same machine code
-COMPILER_FLAGS = [
-    "-O3", "-D__FAST_MATH__", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros",
-    "-freciprocal-math", "-fassociative-math", "-w",
-]  # fmt: skip
+COMPILER_FLAGS = (
+    "-O3 -D__FAST_MATH__ -g0 -march=native -fno-math-errno -fno-trapping-math "
+    "-fno-signed-zeros -freciprocal-math -fassociative-math -w"
+).split()
 
 # Of tangents: their time is that of sums over pairs of unknowns, which -O2 makes vectors of as -O3 does if it may count
 # the turns of a loop. They run as fast (21 and 357 ms for the artery of degree 1 and 2), and the compiler takes two
@@ -62,7 +59,7 @@ TANGENT_FLAGS = ["-O2", "-ftree-vectorize", "-fvect-cost-model=dynamic", *COMPIL
 SIMD_COMPONENTS = (16, 8, 4, 3, 2, 1)
 
 # of our own C functions: no sum is taken in another order than it is written in
-LIBRARY_FLAGS = ["-std=c17", "-O3", "-g0", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wextra"]
+LIBRARY_FLAGS = "-std=c17 -O3 -g0 -march=native -fno-math-errno -fno-trapping-math -Wall -Wextra".split()
 
 # By number of arguments: what a form is, the seconds that it takes (the energy here, hexahedra, one core), and flags
 _KINDS = {
@@ -70,10 +67,8 @@ _KINDS = {
     1: ("the residual", 1, COMPILER_FLAGS),
     2: ("the tangent", 3, TANGENT_FLAGS),
 }
-_GRACE = 0.5  # seconds: whatever ended the compiler may be about to end this process too
 
 _compiled: list[str] = []
-_waited_for: set[str] = set()
 
 
 def compiled_kernels() -> tuple[str, ...]:
@@ -93,17 +88,14 @@ def cache_folder() -> Path:
     except OSError:  # on macOS
         processor = platform.processor()
     name = f"remodel-{hashlib.sha256((platform.machine() + processor).encode()).hexdigest()[:8]}"
-    folder = base / "fenics" / name
-    with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():  # what is there is loaded and run
-            return folder
-    other = Path(tempfile.gettempdir()) / f"remodel-fenicsx-forms-{os.getuid()}"
-    other.mkdir(mode=0o700, exist_ok=True)
-    if other.is_symlink() or other.stat().st_uid != os.getuid():
-        raise PermissionError(f"{other}: belongs to another user; set TMPDIR to a folder of your own")
-    log.warning("cannot write to %s, or it belongs to another user: forms are compiled into %s", folder, other)
-    return other / name
+    places = base / "fenics" / name, Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"
+    for folder in places:
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():  # what is there is run
+                return folder
+        log.warning("cannot write to %s, or it belongs to another user: forms are compiled below %s", *places)
+    raise PermissionError(f"{folder}: belongs to another user; set TMPDIR to a folder of your own")
 
 
 # dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder: that may be somebody
@@ -111,18 +103,6 @@ def cache_folder() -> Path:
 with chdir("/"):
     dolfinx.jit.get_options()
     ffcx.options.get_options()
-
-
-@functools.cache
-def has_simd_logarithm() -> bool:
-    """Whether kernels take logarithms of several points at once: compiler, C library and processor know how."""
-    source = "#include <math.h>\nvoid f(double *restrict y) { for (int i = 0; i < 64; i++) y[i] = log(y[i]); }\n"
-    command = [*shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC")), *COMPILER_FLAGS]
-    try:
-        done = subprocess.run([*command, "-S", "-x", "c", "-", "-o", "-"], input=source, capture_output=True, text=True)
-    except OSError:  # no compiler: cached kernels run without one
-        return False
-    return "_ZGV" in done.stdout
 
 
 def jit_options(flags: list[str] = COMPILER_FLAGS) -> dict[str, Any]:
@@ -216,26 +196,19 @@ def library(
     if comm.rank == 0 and not _is_cached(name):
         try:
             with _compiling(name, what, seconds):
-                _build(name, declarations, source, include, libraries)
+                builder = cffi.FFI()
+                builder.cdef(declarations)
+                folders = {"include_dirs": [f"{include}"], "library_dirs": [f"{include}/../lib"]} if include else {}
+                names = ["m", *libraries]
+                builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=names, **folders)
+                if not _is_cached(name):  # else by the run that this one has waited for
+                    builder.compile(tmpdir=str(cache_folder()))
+                    (cache_folder() / f"{name}.c.cached").touch()  # as FFCx does: last the end mark
         except BaseException as error:
             failure = error
     if comm.bcast(failure is not None):
         raise failure or RuntimeError(f"the first rank could not compile {what}")
     return _loaded(name)
-
-
-def _build(
-    name: str, declarations: str, source: str, include: Path | None = None, libraries: tuple[str, ...] = ()
-) -> None:
-    """What FFCx does with its kernels: the source, the library, and last the end mark."""
-    if _is_cached(name):
-        return
-    builder = cffi.FFI()
-    builder.cdef(declarations)
-    folders = {} if include is None else {"include_dirs": [str(include)], "library_dirs": [str(include.parent / "lib")]}
-    builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=["m", *libraries], **folders)
-    builder.compile(tmpdir=str(cache_folder()))
-    (cache_folder() / f"{name}.c.cached").touch()
 
 
 @functools.cache
@@ -289,41 +262,20 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 
 @contextmanager
 def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
-    """The only process that compiles this kernel; a signal stops it at once, and then nothing of the kernel stays."""
-    # SIGUSR1 waits: one sent to the whole group would kill a compiler
-    with stopping_at_once(), blocked(PAUSE), _alone(kernel):
+    """The only process that compiles this kernel; signals wait until it is there."""
+    # also for the compiler: a terminal and batch systems send them to all processes of a job
+    with stopping_at_once(), _alone(kernel), held_back():
         if _is_cached(kernel):  # by the run that this one has waited for
             yield
             return
         log.log(NOTICE, "compiling %s, once on this machine: about %d s", what, seconds)
-        start, before = clock.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-        handlers = logging.getLogger().handlers.copy()
-        try:
-            yield
-        except BaseException as error:
-            logging.getLogger().handlers = handlers  # FFCx has put others there, and gives them back on success only
-            _remove(kernel)
-            _raise_if_killed(error)
-            raise
-        spent = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
-        elapsed = clock.monotonic() - start
-        log.info("compiled %s in %.1f s, %.1f s of processor time in the compiler: %s", what, elapsed, spent, kernel)
+        start = clock.monotonic()
+        yield
+        log.info("compiled %s in %.1f s: %s", what, clock.monotonic() - start, kernel)
         _compiled.append(kernel)
         if os.environ.get(COMPILED):
             with open(os.environ[COMPILED], "a") as file:
                 file.write(f"{kernel}\n")
-
-
-def _raise_if_killed(error: BaseException | None) -> None:
-    """A compiler that a signal has ended is an interruption, whether the signal was for this process too or not."""
-    if not isinstance(error, Exception) or isinstance(error, Interrupted):
-        return
-    clock.sleep(_GRACE)  # Interrupted is raised here if the signal is on its way
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, subprocess.CalledProcessError) and -cause.returncode in SIGNALS:
-            raise Interrupted(-cause.returncode, on_all_ranks=False) from error
-        cause = cause.__cause__ or cause.__context__
 
 
 # ---------------------------------------------------------------- the cache
@@ -339,11 +291,6 @@ def _is_cached(kernel: str) -> bool:
     return all(path.exists() for path in _files(kernel))
 
 
-def _remove(kernel: str) -> None:
-    for path in cache_folder().glob(f"{kernel}.*"):
-        path.unlink(missing_ok=True)
-
-
 @contextmanager
 def _alone(kernel: str) -> Iterator[None]:
     """Only one process compiles a kernel, so that whatever is unfinished of it was cut off before: it is removed."""
@@ -354,30 +301,22 @@ def _alone(kernel: str) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / kernel).open("a+") as lock:
         try:
-            _take(lock)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                lock.seek(0)
+                process = lock.read().strip() or "unknown"
+                log.log(NOTICE, "another run is compiling the same (process %s): waiting for it", process)
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            lock.truncate(0)
+            lock.write(f"{os.getpid()}\n")
+            lock.flush()
             if not _is_cached(kernel) and any(path.exists() for path in _files(kernel)):
                 log.info("removing a compilation that was cut off: %s", kernel)
-                _remove(kernel)
+                for path in folder.parent.glob(f"{kernel}.*"):
+                    path.unlink(missing_ok=True)
         except OSError as error:  # some network file systems have no locks
             log.warning(
                 "%s cannot be locked (%s): several runs at a time may wait for each other", lock.name, error.strerror
             )
         yield
-
-
-def _take(lock: IO[str]) -> None:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.seek(0)
-        process = lock.read().strip() or "unknown"
-        log.log(
-            logging.INFO if process in _waited_for else NOTICE,  # once on the terminal, not for every kernel
-            "another run is compiling the same (process %s): waiting for it",
-            process,
-        )
-        _waited_for.add(process)
-        fcntl.flock(lock, fcntl.LOCK_EX)
-    lock.truncate(0)
-    lock.write(f"{os.getpid()}\n")
-    lock.flush()

@@ -11,11 +11,12 @@ import re
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
-from itertools import chain, takewhile
+from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,67 +69,41 @@ NO_ANGLE = 255
 
 def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]:
     """The block, and what tells the page where each array is in it."""
-    parts, table, start = [], {}, 0
+    block, table = bytearray(), {}
     for name, array in arrays.items():
         values = np.ascontiguousarray(array.values)
-        stored = values
-        if array.differences and len(values) > 1:
-            stored = values.copy()
-            stored[1:] -= values[:-1]  # modulo the range of the type
-        data = stored.astype(values.dtype.newbyteorder("<")).tobytes()
-        start += -start % 4  # typed arrays begin at multiples of their size
-        parts.append((start, data))
+        # differences are modulo the range of the type
+        stored = np.diff(values, axis=0, prepend=np.zeros_like(values[:1])) if array.differences else values
         table[name] = {
-            "type": values.dtype.name, "shape": list(values.shape), "start": start, "differences": array.differences
-        }  # fmt: skip
-        start += len(data)
-    block = bytearray(start)
-    for place, data in parts:
-        block[place : place + len(data)] = data
+            "type": values.dtype.name,
+            "shape": list(values.shape),
+            "start": len(block),
+            "differences": array.differences,
+        }
+        block += stored.astype(values.dtype.newbyteorder("<")).tobytes()
+        block += bytes(-len(block) % 4)  # typed arrays begin at multiples of their size
     # level 6 is 5 % smaller and takes as long again
     return base64.b64encode(gzip.compress(bytes(block), 3, mtime=0)).decode("ascii"), table
-
-
-def of_angles(degrees: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Angles from 0 to 90 degrees in `ANGLE_STEPS` levels; `NO_ANGLE` where there is none."""
-    steps = np.clip(np.floor(degrees * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1)
-    return np.where(np.isnan(degrees), NO_ANGLE, steps).astype(np.uint8)
-
-
-def of_places(places: NDArray[np.float32]) -> tuple[NDArray[np.uint16], list[float], float]:
-    """Coordinates (..., 3) as steps from the least of each, with these three and the length of a step."""
-    flat = places.reshape(-1, 3)
-    least = flat.min(axis=0)
-    step = float((flat.max(axis=0) - least).max() / 65535) or 1.0
-    return np.rint((places - least) / step).astype(np.uint16), [float(value) for value in least], step
-
-
-def of_vectors(vectors: NDArray[np.float32]) -> tuple[NDArray[np.int8], float]:
-    """Components as 127ths of the largest, and the length of a step."""
-    step = float(np.abs(vectors).max()) / 127 or 1.0
-    return np.rint(vectors / step).astype(np.int8), step
 
 
 # ---------------------------------------------------------------- a part of the page, and its HTML
 # All text of others goes through `escape`.
 
 
-@dataclass(frozen=True)
-class Array:
+class Array(NamedTuple):
     """Numbers that the page unpacks into a typed array."""
 
     values: NDArray[Any]
     differences: bool = False
 
 
-@dataclass(frozen=True)
-class Card:
+class Card(NamedTuple):
     """A part of the page."""
 
     name: str
     html: str
-    data: Mapping[str, Any] = field(default_factory=dict)
-    arrays: Mapping[str, Array] = field(default_factory=dict)
+    data: Mapping[str, Any] = MappingProxyType({})
+    arrays: Mapping[str, Array] = MappingProxyType({})
 
 
 def section(title: str, content: str, width: str = "half", note: str = "") -> str:
@@ -184,7 +159,10 @@ class ShownBody:
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """The same in few bytes, and the numbers that lead back."""
-        position, origin, step = of_places(self.series["position"])
+        moved = self.series["position"]
+        least = moved.min(axis=(0, 1))
+        step = float((moved.max(axis=(0, 1)) - least).max() / 65535) or 1.0
+        position = np.rint((moved - least) / step).astype(np.uint16)
         size = np.uint16 if len(self.whole.points) <= 65536 else np.uint32
         arrays = {
             "elements": Array(self.whole.elements.astype(size)),
@@ -193,15 +171,18 @@ class ShownBody:
             "reference": Array(self.whole.points.astype(np.float32)),
             "position": Array(position, differences=True),
         }
-        scales: dict[str, Any] = {"origin": origin, "position_step": step}
+        scales: dict[str, Any] = {"origin": least.tolist(), "position_step": step}
         if "angle" in self.series:
-            arrays["angle"] = Array(of_angles(self.series["angle"]), differences=True)
+            levels = np.clip(np.floor(self.series["angle"] * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1)
+            levels = np.where(np.isnan(levels), NO_ANGLE, levels).astype(np.uint8)
+            arrays["angle"] = Array(levels, differences=True)
         if "extension" in self.series:
             extension = np.rint(255 * self.series["extension"]).astype(np.uint8)
             arrays["extension"] = Array(extension, differences=True)
         if "edges" in self.series:
-            edges, scales["edge_step"] = of_vectors(self.series["edges"])
-            arrays["edges"] = Array(edges.reshape(*edges.shape[:2], 9), differences=True)
+            edges = self.series["edges"].reshape(*moved.shape[:1], -1, 9)
+            scales["edge_step"] = float(np.abs(edges).max()) / 127 or 1.0  # components are 127ths of the largest
+            arrays["edges"] = Array(np.rint(edges / scales["edge_step"]).astype(np.int8), differences=True)
         return arrays, scales
 
 
@@ -242,17 +223,14 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
 
 
 def _volumes(corners: Places) -> Places:
-    """Of hexahedra (m, 8, 3), in six tetrahedra about a diagonal, or of tetrahedra (m, 4, 3): shares of their sum."""
+    """Shares of hexahedra (m, 8, 3), by their middles, or of tetrahedra (m, 4, 3) in their sum."""
+    sides = corners[:, 1:4] - corners[:, :1]
     if corners.shape[1] == 8:
-        ring = (1, 2, 3, 7, 4, 5, 1)
-        parts = [(0, 6, ring[k], ring[k + 1]) for k in range(6)]
-    else:
-        parts = [(0, 1, 2, 3)]
-    total = np.zeros(len(corners))
-    for a, b, c, d in parts:
-        first, second, third = (corners[:, k] - corners[:, a] for k in (b, c, d))
-        total += np.abs(np.einsum("mi,mi->m", np.cross(first, second), third))
-    return total / total.sum()
+        faces = corners[:, [[1, 2, 5, 6], [0, 3, 4, 7], [2, 3, 6, 7], [0, 1, 4, 5], [4, 5, 6, 7], [0, 1, 2, 3]]]
+        middles = faces.mean(axis=2)
+        sides = middles[:, ::2] - middles[:, 1::2]
+    total = np.abs(np.linalg.det(sides))
+    return np.asarray(total / total.sum())
 
 
 # ---------------------------------------------------------------- how a run went, from its folder
@@ -396,23 +374,11 @@ def view(run: ReportedRun) -> Card | None:
         "chain": CHAIN_LOOK,
     }  # fmt: skip
     html = (ASSETS / "view.html").read_text(encoding="utf-8")
-    html = html.replace("@OPTIONS@", _ways_to_show(arrays)).replace("@LAST_LAYER@", str(len(body.whole.depth) - 1))
     notes, kept, all_times = body.whole.notes(body.is_deformed), len(body.times), len(run.recording.times)
     if kept < all_times:
         notes.append(f"{kept} of {all_times} recorded times are kept here, to save room.")
     html = html.replace("@NOTES@", "".join(f'<p class="note">{escape(note)}</p>' for note in notes))
     return Card("view", html, data, arrays)
-
-
-def _ways_to_show(arrays: Mapping[str, Array]) -> str:
-    """The choices of what is shown, as far as it was recorded."""
-    ways = {
-        "both": ("angle and chains", {"angle", "edges"}), "coloured": ("chains in colour", {"angle", "edges"}),
-        "alone": ("chains alone", {"edges"}), "angle": ("angle", {"angle"}), "extension": ("r/L", {"extension"}),
-        "shape": ("shape alone", set()),
-    }  # fmt: skip
-    there = {name: text for name, (text, needed) in ways.items() if needed <= set(arrays)}
-    return "".join(f'<option value="{name}">{text}</option>' for name, text in there.items())
 
 
 def angles(run: ReportedRun) -> Card | None:
@@ -488,14 +454,14 @@ def curves(run: ReportedRun) -> Card | None:
     if len(history["time"]) < 2 or not run.columns:
         return None
     rows = np.unique(np.linspace(0, len(history["time"]) - 1, MOST_ROWS).round().astype(int))
-    groups: list[list[Any]] = []
+    groups = defaultdict[tuple[str, str], list[Column | UnknownColumn]](list)
     for column in run.columns:
-        alike = next((group for group in groups if _together(group[0], column)), None)
-        groups.append([column]) if alike is None else alike.append(column)
+        groups[column.unit, _family(column.name)].append(column)
     cards, data = [], []
-    for index, group in enumerate(groups):
+    for index, ((_, family), group) in enumerate(groups.items()):
         unit = run.unit(group[0])
-        title = _title([column.name for column in group])
+        title = words(group[0].name if len(group) == 1 else WHOLE.get(family, family))
+        title = title[0].upper() + title[1:]
         cards.append(section(title, f'<div class="curve" id="curve-{index}"></div>', "third", unit))
         series = [
             {"name": words(column.name), "values": [_finite(value) for value in history[column.name][rows]]}
@@ -506,22 +472,15 @@ def curves(run: ReportedRun) -> Card | None:
     return Card("curves", f'<div class="curves whole">{"".join(cards)}</div>', {"times": times, "curves": data})
 
 
-def _together(first: Any, second: Any) -> bool:
-    """Whether two columns are drawn in one frame: of one unit, their names begin alike, or are two words and end so."""
-    a, b = first.name.split("_"), second.name.split("_")
-    ends_alike = len(a) == len(b) == 2 and a[1] == b[1] and len(a[1]) > 1  # no letter of an axis
-    begins_alike = min(len(a), len(b)) > 1 and (a[:2] == b[:2] or a[:-1] == b[:-1])
-    return first.unit == second.unit and (ends_alike or begins_alike)
+WHOLE = {"max_chain": "max_chain_extension"}  # families that are no words by themselves
 
 
-def _title(names: list[str]) -> str:
-    """What names have in common."""
-    if len(names) == 1:
-        return words(names[0])[0].upper() + words(names[0])[1:]
-    parts = [name.split("_") for name in names]
-    starts = [same[0] for same in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
-    common = words("_".join(starts or parts[0][-1:]))
-    return common[0].upper() + common[1:]
+def _family(name: str) -> str:
+    """What columns that are drawn in one frame have in common: two first words, or the second of two."""
+    first, *others = name.split("_")
+    if len(others) == 1 and len(others[0]) > 1:  # no letter of an axis
+        return others[0]
+    return "_".join([first, *others[:1]]) if len(others) > 1 else first
 
 
 def _finite(value: float) -> float | None:
@@ -658,7 +617,7 @@ def cards(run: ReportedRun) -> list[Card]:
 
 REPORT = "report.html"
 PAGE_SIZE = 20.0  # MB that a page should have at most
-SCRIPTS = ("data.js", "body.js", "angles.js", "through_the_wall.js", "curves.js", "page.js")
+SCRIPTS = "data.js body.js angles.js through_the_wall.js curves.js page.js".split()
 STYLES = ("report.bundle.css", "page.css")
 GENERATOR_TAG = b'name="generator" content="remodel_fenicsx'  # what bears it may be made anew
 LARGEST_PAGE = 10**9  # bytes
@@ -689,7 +648,7 @@ def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
         return page_with(cards(ReportedRun(recording)))
     of_a_time = 4 / 3 * RATIO * (6 * len(recording.points) + 11 * len(recording.elements))  # bytes, in base64
     whole, most = WholeBody(recording), max(FEWEST_TIMES, int(1e6 * size / of_a_time))
-    body = ShownBody.of(whole, kept_times(recording.history, recording.times, most))
+    body = ShownBody.of(whole, kept_times(recording.times, most))
     return page_with(cards(ReportedRun(recording, body)))
 
 

@@ -40,7 +40,7 @@ class Checkpoints(Watcher):
         self.folder, self.state, self.scene_text, self.every = folder, state, scene_text, every
         self._mesh = mesh_arrays(state.loading.domain)
         self._versions = versions() if state.comm.rank == 0 else {}
-        self._written_at, self._cost, self._step_seconds = clock.monotonic(), 0.0, 0.0
+        self._written_at, self._cost = clock.monotonic(), 0.0
         self._number = 0  # of the newest checkpoint; where none is, the run starts again at t = 0
 
     # ------------------------------------------------------------ as a watcher
@@ -50,7 +50,6 @@ class Checkpoints(Watcher):
 
     def committed(self, step: Step) -> None:
         """Write it, if it is its turn."""
-        self._step_seconds = max(0.5 * self._step_seconds, step.seconds)
         if step.is_last or self._is_due(step.number):
             self.write()
 
@@ -58,9 +57,7 @@ class Checkpoints(Watcher):
         """The same on all ranks."""
         if self.every is not None:
             return self.every > 0 and number % self.every == 0
-        pause = max(SHORTEST_PAUSE, self._cost / LARGEST_SHARE)
-        # what would be lost next is all since the last one, with the step that comes
-        pause = min(pause, LONGEST_LOSS - self._step_seconds - self._cost)
+        pause = min(max(SHORTEST_PAUSE, self._cost / LARGEST_SHARE), LONGEST_LOSS)
         due = clock.monotonic() - self._written_at >= pause
         return bool(self.state.comm.bcast(due, root=0))
 
@@ -125,20 +122,16 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
 
 def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> None:
     """Raise CheckpointError unless the checkpoint is one of this state."""
-    here, there, counts = state.functions(), checkpoint.functions, _counts(state)
-    if any(name not in there and name not in counts for name in here):
-        raise CheckpointError(f"the checkpoint has the functions {', '.join(there)}, this run has {', '.join(here)}")
-    loads = sorted(name for name, value in checkpoint.loads.items() if value)  # earlier versions kept all, zero or not
-    own = sorted(marked({mark: case.loading.values for mark, case in state.each_case().items()}))
-    if not set(loads) <= set(own):
-        raise CheckpointError(f"the checkpoint has the loads {loads}, this run has {own}")
-    for name in [name for name in here if name in there]:
-        shape = checkpoint.arrays[f"function/{name}"].shape
-        wanted = domain.number_of_elements, _places(here[name]).shape[1]
-        if shape != wanted:
-            words = f"has the shape {shape}, that of this run has {wanted}"
-            raise CheckpointError(f"the checkpoint's function {name} {words}")
-    points, elements = checkpoint.arrays["points"], checkpoint.arrays["elements"]
+    arrays, counts = checkpoint.arrays, _counts(state)
+    wanted = {n: (domain.number_of_elements, _places(one).shape[1]) for n, one in state.functions().items()}
+    begins_anew = {name: shape for name, shape in wanted.items() if name in counts}
+    found = {name: arrays[f"function/{name}"].shape for name in checkpoint.functions}
+    own = marked({mark: case.loading.values for mark, case in state.each_case().items()})
+    loads = {name for name, value in checkpoint.loads.items() if value}  # earlier versions kept all, zero or not
+    if not wanted.items() <= (begins_anew | found).items() or not loads <= own.keys():
+        there, here = (f"functions {a} and loads {sorted(b)}" for a, b in ((found, loads), (wanted, own)))
+        raise CheckpointError(f"the checkpoint has the {there}; this run has the {here}")
+    points, elements = arrays["points"], arrays["elements"]
     same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
     if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):
         words = "the checkpoint has another mesh: perhaps Gmsh is of another version, run.log says which it was"

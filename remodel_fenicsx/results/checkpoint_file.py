@@ -60,54 +60,36 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     text = np.frombuffer(checkpoint.model_dump_json().encode(), dtype=np.uint8)
     whole = io.BytesIO()
     np.savez(whole, **{_HEADER: text}, **checkpoint.arrays)  # type: ignore[arg-type]
-    newest = [path.name for path, _ in _heads(folder)[0][:1]]
-    write_whole(folder / next(name for name in FILES if name not in newest), whole.getvalue())
+    # over the one that was written earlier
+    older = min((folder / name for name in FILES), key=lambda path: path.stat().st_mtime_ns if path.exists() else 0)
+    write_whole(older, whole.getvalue())
 
 
 def time_of_checkpoint(folder: Path) -> float | None:
     """That of the newest; None if there is none."""
-    heads, faults = _heads(folder)
-    if faults and not heads:
-        raise _refusal(folder, faults)
-    return heads[0][1].time if heads else None
+    found = read_checkpoint(folder)
+    return None if found is None else found.time
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
     """The newest checkpoint that is whole, with a warning where one is not; None if there is none."""
-    heads, faults = _heads(folder)
-    for path, _ in heads:
-        try:
-            found = read_file(path)
-        except CheckpointError as error:
-            faults.append(str(error))
-        else:
-            for fault in faults:
-                log.warning("%s", fault)
-            return found
-    if faults:
-        raise _refusal(folder, faults)
-    return None
-
-
-def _heads(folder: Path) -> tuple[list[tuple[Path, Checkpoint]], list[str]]:
-    """Files with what stands in their headers, the newest first; and what is wrong with others."""
-    heads, faults = [], []
+    found, faults = list[Checkpoint](), list[str]()
     for path in (folder / name for name in FILES):
         try:
             if os.path.lexists(path):
-                heads.append((path, read_file(path, with_arrays=False)))
+                found.append(read_file(path))
         except CheckpointError as error:
             faults.append(str(error))
-    return sorted(heads, key=lambda head: -head[1].number), faults
+    if faults and not found:
+        remedy = "without its files checkpoint* the run starts again at t = 0"
+        raise CheckpointError(f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}")
+    for fault in faults:
+        log.warning("%s", fault)
+    return max(found, key=lambda one: one.number) if found else None
 
 
-def _refusal(folder: Path, faults: list[str]) -> CheckpointError:
-    remedy = "without its files checkpoint* the run starts again at t = 0"
-    return CheckpointError(f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}")
-
-
-def read_file(path: Path, with_arrays: bool = True) -> Checkpoint:
-    """A checkpoint, or its header alone."""
+def read_file(path: Path) -> Checkpoint:
+    """Read a checkpoint."""
     check_regular(path)
     try:
         with np.load(path, allow_pickle=False) as file, zipfile.ZipFile(path) as archive:
@@ -118,10 +100,9 @@ def read_file(path: Path, with_arrays: bool = True) -> Checkpoint:
             if json.loads(header)["format"] > CHECKPOINT_FORMAT:
                 raise CheckpointError(f"{path}: was written by a newer version")
             checkpoint = Checkpoint.model_validate_json(header)
-            if with_arrays:
-                checkpoint.arrays |= {name: file[name] for name in file.files if name != _HEADER}
-                for name in ("points", "elements", *(f"function/{function}" for function in checkpoint.functions)):
-                    _check_table(checkpoint.arrays[name])
+            checkpoint.arrays |= {name: file[name] for name in file.files if name != _HEADER}
+            for name in ("points", "elements", *(f"function/{function}" for function in checkpoint.functions)):
+                _check_table(checkpoint.arrays[name])
     except CheckpointError:
         raise
     except _FAULTS as error:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from remodel_fenicsx.body.mesh_faces import FACETS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
@@ -61,8 +60,7 @@ Array = NDArray[np.float64]
 TENSOR_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")  # of a tensor, row by row
 
 
-@dataclass(frozen=True)
-class ElementNames:
+class ElementNames(NamedTuple):
     """What other programs call an element, and how many of its nodes, in VTK's order, FEBio and Abaqus take."""
 
     vtk: int
@@ -115,10 +113,11 @@ def export(folder: Path | str, kind: str, path: Path | None = None, time: float 
     if fibres.others and kind not in WITH_OTHERS:
         kinds = " and ".join(WITH_OTHERS)
         log.warning("%s has no place for %s; %s files have them", kind, ", ".join(fibres.others), kinds)
-    if (share := uneven(fibres)) > LEAST_SAID:
+    share = unevenness(fibres.elements, fibres.tensors)
+    if fibres.elements.shape[1] > 4 and share > LEAST_SAID:
         log.warning(
-            "each element has the mean of its points: neighbours differ by up to %.1f %% of tr A, and "
-            "a run that begins with them is off by up to about half of that at their faces",
+            "each element has the mean of its points: at nodes they differ by up to %.1f %% of tr A, "
+            "and a run that begins with them is off by up to about as much there",
             100 * share,
         )
     path = Path(folder) / f"fibres{ending}" if path is None else path
@@ -126,20 +125,13 @@ def export(folder: Path | str, kind: str, path: Path | None = None, time: float 
     return path
 
 
-def uneven(fibres: Fibres) -> float:
-    """Largest change of A between elements that share a facet, over tr A; 0 of elements with one point."""
-    nodes = fibres.elements.shape[1]
-    if nodes == 4:
-        return 0.0
-    local = np.array(FACETS["tetrahedron" if nodes == 10 else "hexahedron"])
-    facets = np.sort(fibres.elements[:, local].reshape(-1, local.shape[1]), axis=1)
-    _, number = np.unique(facets, axis=0, return_inverse=True)
-    order = np.argsort(number.reshape(-1))
-    one, other = order[:-1], order[1:]
-    beside = number.reshape(-1)[one] == number.reshape(-1)[other]
-    tensors = fibres.tensors / np.trace(fibres.tensors, axis1=1, axis2=2)[:, None, None]
-    steps = tensors[one[beside] // len(local)] - tensors[other[beside] // len(local)]
-    return float(np.linalg.norm(steps, axis=(1, 2)).max(initial=0.0))
+def unevenness(elements: NDArray[np.int64], tensors: Array) -> float:
+    """Largest change of A (elements, 3, 3), over tr A, from an element to the mean of all at one of its nodes."""
+    shares = (tensors / np.trace(tensors, axis1=1, axis2=2)[:, None, None]).reshape(-1, 9)
+    sums = np.zeros((elements.max() + 1, 10))
+    np.add.at(sums, elements, np.insert(shares, 9, 1.0, axis=1)[:, None])
+    at_nodes = sums[elements, :9] / sums[elements, 9:]
+    return float(np.linalg.norm(at_nodes - shares[:, None], axis=2).max())
 
 
 def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:
@@ -174,59 +166,83 @@ def _vtu(path: Path, fibres: Fibres) -> None:
 
 
 def _csv(path: Path, fibres: Fibres) -> None:
-    names = [
-        "element",
-        *"xyz",
-        *(f"structure_tensor_{c}" for c in TENSOR_COMPONENTS),
-        *(f"cell_dimension_{i}" for i in (1, 2, 3)),
-    ]
+    names = ["element", *"xyz", *(f"structure_tensor_{c}" for c in TENSOR_COMPONENTS)]
+    names += [f"cell_dimension_{i}" for i in (1, 2, 3)]
     names += [f"{name}_{c}" for name in AXIS_FIELDS for c in "xyz"]
     centres = fibres.points[fibres.elements].mean(axis=1)
-    count = len(centres)
-    columns = [centres, fibres.tensors.reshape(count, 9), fibres.dimensions, fibres.axes.reshape(count, 9)]
-    _write(path, [",".join(names), *_rows("{number},{values}", np.hstack(columns))])
+    rows = _rows("{0},{1},{2},{3},{4}", centres, fibres.tensors, fibres.dimensions, fibres.axes)
+    _write(path, f"{','.join(names)}\n{rows}\n")
+
+
+FEBIO = """<?xml version="1.0" encoding="UTF-8"?>
+<febio_spec version="4.0">
+<Mesh>
+<Nodes name="nodes">
+{nodes}
+</Nodes>
+<Elements type="{kind}" name="body">
+{elements}
+</Elements>
+</Mesh>
+<MeshData>
+<ElementData type="mat_axis" elem_set="body">
+{axes}
+</ElementData>
+{maps}
+</MeshData>
+</febio_spec>
+"""
+FEBIO_MAP = """<ElementData name="{name}" data_type="{kind}" elem_set="body">
+{values}
+</ElementData>"""
 
 
 def _febio(path: Path, fibres: Fibres) -> None:
-    nodes, elements = np.unique(fibres.reduced), fibres.reduced
-    axes = fibres.axes[:, :2].reshape(-1, 6)
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<febio_spec version="4.0">', "<Mesh>", '<Nodes name="nodes">']
-    lines += _rows('<node id="{number}">{values}</node>', fibres.points[nodes], nodes + 1)
-    lines += ["</Nodes>", f'<Elements type="{fibres.names.febio}" name="body">']
-    lines += _rows('<elem id="{number}">{values}</elem>', elements + 1)
-    lines += ["</Elements>", "</Mesh>", "<MeshData>", '<ElementData type="mat_axis" elem_set="body">']
-    for number, (a, d) in enumerate(zip(_joined(axes[:, :3]), _joined(axes[:, 3:]), strict=True), start=1):
-        lines.append(f'<elem lid="{number}"><a>{a}</a><d>{d}</d></elem>')
-    lines.append("</ElementData>")
+    nodes, axes = np.unique(fibres.reduced), fibres.axes
     maps = {f"cell_dimension_{i + 1}": fibres.dimensions[:, i] for i in range(3)} | dict(fibres.others)
-    for name, values in maps.items():
-        kind = "mat3" if name == NATURAL_GRADIENT else "scalar"
-        lines.append(f'<ElementData name="{name}" data_type="{kind}" elem_set="body">')
-        lines += _rows('<elem lid="{number}">{values}</elem>', values.reshape(len(values), -1))
-        lines.append("</ElementData>")
-    _write(path, [*lines, "</MeshData>", "</febio_spec>"])
+    kinds = {NATURAL_GRADIENT: "mat3"}
+    shown = [
+        FEBIO_MAP.format(name=name, kind=kinds.get(name, "scalar"), values=_rows('<elem lid="{0}">{1}</elem>', values))
+        for name, values in maps.items()
+    ]
+    text = FEBIO.format(
+        kind=fibres.names.febio,
+        nodes=_rows('<node id="{1}">{2}</node>', nodes + 1, fibres.points[nodes]),
+        elements=_rows('<elem id="{0}">{1}</elem>', fibres.reduced + 1),
+        axes=_rows('<elem lid="{0}"><a>{1}</a><d>{2}</d></elem>', axes[:, 0], axes[:, 1]),
+        maps="\n".join(shown),
+    )
+    _write(path, text)
+
+
+ABAQUS = """** mean cells of a run of remodel_fenicsx: local directions 1, 2 and 3 are the axes, longest first
+*NODE
+{nodes}
+*ELEMENT, TYPE={kind}, ELSET=BODY
+{elements}
+*DISTRIBUTION TABLE, NAME=CELL_AXES_TABLE
+COORD3D, COORD3D
+*DISTRIBUTION, NAME=CELL_AXES, LOCATION=ELEMENT, TABLE=CELL_AXES_TABLE
+,1.,0.,0.,0.,1.,0.
+{axes}
+*ORIENTATION, NAME=CELLS, DEFINITION=COORDINATES
+CELL_AXES
+** cell_dimensions, element, l1, l2, l3
+{dimensions}
+"""
 
 
 def _abaqus(path: Path, fibres: Fibres) -> None:
-    nodes, elements = np.unique(fibres.reduced), fibres.reduced
-    lines = [
-        "** mean cells of a run of remodel_fenicsx: local directions 1, 2 and 3 are the axes, longest first",
-        "*NODE",
-    ]
-    lines += _rows("{number},{values}", fibres.points[nodes], nodes + 1)
-    lines.append(f"*ELEMENT, TYPE={fibres.names.abaqus}, ELSET=BODY")
-    for row in _rows("{number},{values}", elements + 1):
-        words = row.split(",")  # sixteen in a line at most
-        lines += [",".join(words)] if len(words) <= 16 else [",".join(words[:16]) + ",", ",".join(words[16:])]
-    lines += ["*DISTRIBUTION TABLE, NAME=CELL_AXES_TABLE", "COORD3D, COORD3D"]
-    lines += ["*DISTRIBUTION, NAME=CELL_AXES, LOCATION=ELEMENT, TABLE=CELL_AXES_TABLE", ",1.,0.,0.,0.,1.,0."]
-    lines += _rows("{number},{values}", fibres.axes[:, :2].reshape(-1, 6))
-    lines += [
-        "*ORIENTATION, NAME=CELLS, DEFINITION=COORDINATES",
-        "CELL_AXES",
-        "** cell_dimensions, element, l1, l2, l3",
-    ]
-    _write(path, [*lines, *_rows("** cell_dimensions,{number},{values}", fibres.dimensions)])
+    nodes, numbers = np.unique(fibres.reduced), fibres.reduced + 1
+    text = ABAQUS.format(
+        kind=fibres.names.abaqus,
+        nodes=_rows("{1},{2}", nodes + 1, fibres.points[nodes]),
+        # sixteen numbers in a line at most
+        elements=_rows("{0},{1},\n{2}", numbers[:, :15], numbers[:, 15:]),
+        axes=_rows("{0},{1}", fibres.axes[:, :2]),
+        dimensions=_rows("** cell_dimensions,{0},{1}", fibres.dimensions),
+    )
+    _write(path, text.replace(",\n\n", "\n"))
 
 
 WITH_OTHERS = ("vtu", "febio")
@@ -239,16 +255,11 @@ FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
 }
 
 
-def _rows(pattern: str, values: NDArray[Any], numbers: Iterable[int] | None = None) -> list[str]:
-    """A line for each row of values (n, columns)."""
-    numbers = range(1, len(values) + 1) if numbers is None else numbers
-    return [pattern.format(number=n, values=row) for n, row in zip(numbers, _joined(values), strict=True)]
+def _rows(pattern: str, *parts: NDArray[Any]) -> str:
+    """A line for each row of the parts (n, ...); numbers have commas between and are read back to the last bit."""
+    texts = [[",".join(map(repr, row.ravel().tolist())) for row in part] for part in parts]
+    return "\n".join(pattern.format(n, *row) for n, row in enumerate(zip(*texts, strict=True), start=1))
 
 
-def _joined(values: NDArray[Any]) -> list[str]:
-    """Each row as numbers with commas between; they are read back to the last bit."""
-    return [",".join(map(repr, row.tolist())) for row in values]
-
-
-def _write(path: Path, lines: Sequence[str]) -> None:
-    write_new(path, ("\n".join(lines) + "\n").encode("ascii"))
+def _write(path: Path, text: str) -> None:
+    write_new(path, text.encode("ascii"))

@@ -173,7 +173,7 @@ class Fields(Watcher, ClosedAtEnd):
     def started(self, step: Step) -> None:
         """Write the start."""
         self.append(step.time)
-        self.publish()
+        self.close()
 
     def solved(self, step: Step) -> None:
         """Note the solved state, if it is its turn."""
@@ -211,17 +211,13 @@ class Fields(Watcher, ClosedAtEnd):
             )
             self._chains = append_chains(grid, time, self._centres, self._scale, middle, fields)
 
-    def publish(self) -> None:
+    def close(self) -> None:
         """Let readers see all that is written so far, and a run go on with it that is killed from here on."""
         for grid in (self._grid, self._chains):
             if grid is not None:
-                grid.publish()
-
-    def close(self) -> None:
-        """Close the files."""
-        for grid in (self._grid, self._chains):
-            if grid is not None:
                 grid.close()
+
+    publish = close
 
 
 def _continued(path: Path, after: float | None) -> TransientGrid | None:

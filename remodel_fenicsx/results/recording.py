@@ -9,8 +9,9 @@ import os
 import re
 import socket
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -33,10 +34,10 @@ if TYPE_CHECKING:
 
 LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
 # matplotlib's RdYlBu in LEVELS equal steps: red along the first direction (0 degrees), blue across it (90)
-ANGLE_COLOURS = (
-    "#a50026", "#c21c27", "#dc3b2c", "#ed5f3c", "#f7844e", "#fcaa5f", "#fec87a", "#fee496", "#fff6b1",
-    "#f6fbd0", "#e4f4f1", "#c7e7f1", "#a8d6e8", "#87bdd9", "#69a0ca", "#4d7fb9", "#3d5ba7", "#313695",
-)  # fmt: skip
+ANGLE_COLOURS = tuple(
+    "#a50026 #c21c27 #dc3b2c #ed5f3c #f7844e #fcaa5f #fec87a #fee496 #fff6b1 #f6fbd0 "
+    "#e4f4f1 #c7e7f1 #a8d6e8 #87bdd9 #69a0ca #4d7fb9 #3d5ba7 #313695".split()
+)
 CHAIN_LOOK: dict[str, Any] = {  # as the page takes it
     "colour": (0.08, 0.08, 0.10),
     "reach": 0.39,  # half a chain's length over the shorter side of its face, both undeformed
@@ -54,19 +55,9 @@ VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}  # where the ey
 Numbers = NDArray[np.float64]
 
 
-def kept_times(history: HistoryColumns, times: Numbers, most: int) -> Numbers:
-    """So many of the recorded times, the first and the last among them: spaced evenly, half in time, half in change."""
-    if len(times) <= most:
-        return times
-    rows = np.stack([np.interp(times, history["time"], column) for column in history.values()])
-    rows = np.where(np.isfinite(rows), rows, 0.0)
-    change = np.abs(np.diff(rows, axis=1)) / np.maximum(np.ptp(rows, axis=1), np.finfo(float).tiny)[:, None]
-    share = [np.concatenate([[0.0], np.cumsum(part)]) for part in (np.diff(times), change.sum(axis=0))]
-    place = np.sum([part / (part[-1] or 1.0) for part in share], axis=0)
-    wanted = np.linspace(0.0, float(place[-1]), most)
-    chosen, number = np.abs(place[:, None] - wanted).argmin(axis=0), np.arange(most)
-    later = np.maximum.accumulate(chosen - number) + number  # none twice
-    return times[np.minimum(later, len(times) - most + number)]
+def kept_times(times: Numbers, most: int) -> Numbers:
+    """Keep so many of the recorded times, spaced evenly; the first and the last among them."""
+    return times[np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))]
 
 
 Array = NDArray[np.float64]
@@ -124,7 +115,6 @@ class RecordedRun:
 
     def __init__(self, folder: str | os.PathLike[str]):
         self.path = Path(folder)
-        self._root: h5py.Group | None = None  # of the file of the fields, while it is kept open
         if not self.path.is_dir():
             raise RecordingError(f"{self.path}: {'is a file' if self.path.exists() else 'there is no such folder'}")
         for name in (SCENE, HISTORY):
@@ -254,21 +244,11 @@ class RecordedRun:
         return found[0]
 
     @contextmanager
-    def kept_open(self) -> Iterator[None]:
-        """Within, the file of the fields is opened once, for many times that are read."""
-        with self._fields_file() as root:
-            self._root = root
-            try:
-                yield
-            finally:
-                self._root = None
-
-    @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:
         path = self.path / FIELDS
         if not path.exists():
             raise RecordingError(f"{self.path}: the run recorded no fields, there is no {FIELDS}")
-        with nullcontext(self._root) if self._root else series_file(path) as root:
+        with series_file(path) as root:
             yield root
 
 
@@ -303,14 +283,10 @@ def scene_as_run(folder: Path) -> Scene:
 
 def versions_as_run(folder: Path) -> dict[str, str]:
     """What stands on top of the scene of a run's folder, by name."""
-    path, found = folder / SCENE, dict[str, str]()
+    path = folder / SCENE
     text = read_regular(path, LARGEST_HISTORY).decode(errors="replace") if path.is_file() else ""
-    for line in text.splitlines()[1:]:
-        if not line.startswith("#"):
-            break
-        name, _, version = line[1:].strip().partition(" ")
-        found[name] = version
-    return found
+    lines = takewhile(lambda line: line.startswith("#"), text.splitlines()[1:])
+    return dict(line[1:].strip().partition(" ")[::2] for line in lines)
 
 
 def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
@@ -404,7 +380,6 @@ def _in_words(times: Array) -> str:
 # One run at a time, and others can see which.
 
 LOCK = "run.lock"
-_WRITER = re.compile(r"process \d+ on [\w.-]+( \(\d+ ranks\))?")
 
 
 class FolderTaken(RemodelError, ValueError):
@@ -463,7 +438,7 @@ def writer(folder: Path) -> tuple[str | None, bool]:
         except BlockingIOError:
             lives = True
         words = file.read(4096).decode(errors="replace").strip()
-    return words if _WRITER.fullmatch(words) else None, lives  # none: just being written, or of another kind
+    return words or None, lives  # none: just being written
 
 
 def is_vacant(folder: Path) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import io
-import itertools
 import math
 import os
 import time as clock
@@ -31,26 +30,21 @@ from remodel_fenicsx.results.recording import (
     SCENE,
     is_vacant,
 )
-from remodel_fenicsx.results.vtkhdf import recorded_steps
+from remodel_fenicsx.results.vtkhdf import check_series
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.system.files import ClosedAtEnd, open_own, read_regular, write_whole
-
-DEEPEST = 100  # folders in folders: Python makes them by a function that calls itself
+from remodel_fenicsx.system.files import ClosedAtEnd, numbered, open_own, read_regular, write_whole
 
 
 def choose_folder(requested: Path | None, name: str) -> Path:
     """The folder of a run: the one asked for, which must be new or empty, or the first free results/NAME."""
     if requested is not None:
-        if len(requested.parts) > DEEPEST:
-            raise FolderTaken(f"folder {requested}: lies in more than {DEEPEST} folders")
         if requested.exists() and not requested.is_dir():
             raise FolderTaken(f"folder {requested}: is a file; allowed is a new or an empty folder")
         if requested.is_dir() and not is_vacant(requested):
             raise FolderTaken(f"folder {requested}: is not empty; allowed is a new or an empty folder")
         return requested
     Path("results").mkdir(exist_ok=True)
-    for number in itertools.count(1):
-        folder = Path("results") / (name if number == 1 else f"{name}-{number}")
+    for folder in numbered(Path("results") / name):
         with suppress(FileExistsError):
             folder.mkdir()
             break
@@ -123,8 +117,7 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
     size_of_rows(folder / HISTORY, after)
     for name in (FIELDS, CHAIN_LINES) if fields else ():
         if os.path.lexists(folder / name):
-            for _ in recorded_steps(folder / name):
-                pass
+            check_series(folder / name)
 
 
 def forget_steps(folder: Path) -> None:

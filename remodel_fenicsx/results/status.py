@@ -19,8 +19,7 @@ from remodel_fenicsx.system.terminal import duration
 
 RECENT = 20  # steps whose mean is the rate
 BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
-_LOG_LINE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*)")
-SHOWN = 5  # runs of a study that have failed and are named
+_ENTRY = re.compile(r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*?)\n?(?=^\d{4}-\d\d-|\Z)", re.M | re.S)
 
 
 def status(folder: Path) -> list[str]:
@@ -66,15 +65,8 @@ def status(folder: Path) -> list[str]:
 
 def log_entries(folder: Path) -> list[tuple[str, str, str]]:
     """Stamp, level and text of each entry of run.log, which may have several lines."""
-    entries: list[tuple[str, str, str]] = []
     text = read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace") if (folder / LOG).exists() else ""
-    for line in text.splitlines():
-        found = _LOG_LINE.fullmatch(line)
-        if found:
-            entries.append((found[1], found[2], found[3]))
-        elif entries:
-            entries[-1] = (*entries[-1][:2], f"{entries[-1][2]}\n{line}")
-    return entries
+    return _ENTRY.findall(text)
 
 
 def state_of(recording: RecordedRun) -> tuple[str, str]:
@@ -100,8 +92,7 @@ def _of_study(folder: Path, runs: list[Path]) -> list[str]:
     states = {run.name: _state(run) for run in runs}
     counted = Counter(state for state, _ in states.values())
     lines = [f"{folder}: {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"]
-    failed = [f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"]
-    return lines + failed[:SHOWN] + ([f"and {len(failed) - SHOWN} more"] if len(failed) > SHOWN else [])
+    return lines + [f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"]
 
 
 def _state(folder: Path) -> tuple[str, str]:

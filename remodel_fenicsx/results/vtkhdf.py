@@ -11,18 +11,17 @@ import errno
 import io
 import os
 import shutil
-import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.recording import series_file
 from remodel_fenicsx.system.files import ClosedAtEnd, part_of
-from remodel_fenicsx.system.interrupts import handled
+from remodel_fenicsx.system.interrupts import held_back
 
 if TYPE_CHECKING:
     import h5py
@@ -46,18 +45,6 @@ _ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
 # of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
 # floats become smaller by a fifth only, and a step would take twice as long
 _COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
-
-
-@contextmanager
-def signals_held_back() -> Iterator[None]:
-    """Let Python's signal handlers run after the block: an exception below HDF5 would crash the process."""
-    caught: list[int] = []
-    try:
-        with handled(lambda number, _: caught.append(number), signal.valid_signals(), callable):
-            yield
-    finally:
-        for number in caught:
-            signal.raise_signal(number)
 
 
 class PatientFile(io.FileIO):
@@ -87,18 +74,8 @@ class PatientFile(io.FileIO):
             raise self.fault
 
 
-class RecordedStep(NamedTuple):
-    """What `TransientGrid.append` takes."""
-
-    time: float
-    point_data: Fields
-    cell_data: Fields
-    points: ArrayLike | None = None
-    constant: Fields = {}
-
-
 class TransientGrid(ClosedAtEnd):
-    """A time series on one grid, written beside its place: `publish` and the end give it its name, whole."""
+    """A time series on one grid, written beside its place: `close` gives it its name, whole."""
 
     def __init__(
         self,
@@ -108,28 +85,33 @@ class TransientGrid(ClosedAtEnd):
         cell_type: int,
         *,
         point_dtype: DTypeLike = np.float64,
-        replaces: bool = False,
     ):
-        if os.path.lexists(path) and not replaces:
+        if os.path.lexists(path):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
         self.path, self._part = path, part_of(path)
         self._part.unlink(missing_ok=True)  # of a process that was killed
         self.number_of_steps = 0
         self._open("x+")
         with self._written() as file:
-            self._make(file.create_group("VTKHDF"), np.asarray(points, point_dtype), np.asarray(cells), cell_type)
+            _begin(file.create_group("VTKHDF"), np.asarray(points, point_dtype), np.asarray(cells), cell_type)
 
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
         """With the steps of a file up to `time`, to append more."""
-        with series_file(path, WITHOUT_IT) as root:
-            points, cell_type = root["Points"][: int(root["NumberOfPoints"][0])], int(root["Types"][0])
-            cells = root["Connectivity"][:].reshape(int(root["NumberOfCells"][0]), -1)
-        grid = cls(path, points, cells, cell_type, point_dtype=points.dtype, replaces=True)
-        for step in recorded_steps(path):
-            if step.time <= time:
-                grid.append(*step)
+        grid = cls.__new__(cls)
+        grid.path, grid._part = path, part_of(path)
+        grid._part.unlink(missing_ok=True)
+        grid._reopen()
+        with grid._written() as file:
+            steps = file["VTKHDF/Steps"]
+            times = steps["Values"][: steps.attrs["NSteps"]]
+            grid.number_of_steps = int(np.searchsorted(times, time, side="right"))
+            steps.attrs.modify("NSteps", np.int64(grid.number_of_steps))
         return grid
+
+    def _reopen(self) -> None:
+        shutil.copyfile(self.path, self._part)
+        self._open("r+")
 
     def _open(self, mode: str) -> None:
         import h5py
@@ -140,7 +122,7 @@ class TransientGrid(ClosedAtEnd):
     @contextmanager
     def _written(self) -> Iterator[h5py.File]:
         """Within, HDF5 writes; no signal comes between, whose handler might raise in `PatientFile.write`."""
-        with signals_held_back():
+        with held_back():
             yield self._file
             self._file.flush()
         self._disk.check()
@@ -155,8 +137,7 @@ class TransientGrid(ClosedAtEnd):
     ) -> None:
         """Add one step; points are given at every step or at none."""
         if self._disk.closed:
-            shutil.copyfile(self.path, self._part)
-            self._open("r+")
+            self._reopen()
         step = self.number_of_steps
         kinds = (("PointData", point_data, step), ("CellData", cell_data, step), ("CellData", constant, 0))
         # offsets that stay 0 say that the mesh is the one of the first step
@@ -182,55 +163,44 @@ class TransientGrid(ClosedAtEnd):
 
     def __exit__(self, *error: object) -> None:
         if error[0] is not None:  # not whole
-            with signals_held_back():
+            with held_back():
                 self._file.close()
             self._disk.close()
         self.close()
 
-    def publish(self) -> None:
-        """Give the file its name; the next step goes on in a copy."""
-        if not self._disk.closed:
-            self._give_name()
-
-    def _give_name(self) -> None:
+    def close(self) -> None:
+        """Give the file its name, if it is whole; a next step goes on in a copy."""
         try:
-            with signals_held_back():
-                self._file.close()
-            self._disk.check()
-            os.fsync(self._disk.fileno())
-            self._part.replace(self.path)
+            if not self._disk.closed:
+                with held_back():
+                    self._file.close()
+                self._disk.check()
+                os.fsync(self._disk.fileno())
+                self._part.replace(self.path)
         finally:  # what is not whole goes
             self._disk.close()
             self._part.unlink(missing_ok=True)
 
-    def close(self) -> None:
-        """Give the file its name, if it is whole, for good; more than once does no harm."""
-        try:
-            if not self._disk.closed:
-                self._give_name()
-        finally:
-            self._part.unlink(missing_ok=True)
 
-    @staticmethod
-    def _make(root: h5py.Group, points: Array, cells: Array, cell_type: int) -> None:
-        """Write the mesh, and no steps."""
-        root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
-        root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
-        for name, number in {"Points": len(points), "Cells": len(cells), "ConnectivityIds": cells.size}.items():
-            root[f"NumberOf{name}"] = np.array([number], dtype=np.int64)
-        _create(root, "Points", points.dtype, points.shape)
-        _write(root["Points"], 0, points)
-        kinds = np.full(len(cells), cell_type, dtype=np.uint8)
-        root.create_dataset("Connectivity", data=cells.astype(np.int64).ravel(), **_COMPRESSION)
-        root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
-        root.create_dataset("Types", data=kinds, **_COMPRESSION)
-        for group in ("PointData", "CellData", "Steps/PointDataOffsets", "Steps/CellDataOffsets"):
-            root.create_group(group)
-        _create(root, "Steps/Values", np.float64, (_STEPS_PER_CHUNK,))
-        for name in ("Steps/NumberOfParts", "Steps/PointOffsets", *_ALWAYS_0):
-            columns = (1,) if name in _OF_TOPOLOGY else ()
-            _create(root, name, np.int64, (_STEPS_PER_CHUNK, *columns))
-        root["Steps"].attrs["NSteps"] = np.int64(0)
+def _begin(root: h5py.Group, points: Array, cells: Array, cell_type: int) -> None:
+    """Write the mesh, and no steps."""
+    root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
+    root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
+    for name, number in {"Points": len(points), "Cells": len(cells), "ConnectivityIds": cells.size}.items():
+        root[f"NumberOf{name}"] = np.array([number], dtype=np.int64)
+    _create(root, "Points", points.dtype, points.shape)
+    _write(root["Points"], 0, points)
+    kinds = np.full(len(cells), cell_type, dtype=np.uint8)
+    root.create_dataset("Connectivity", data=cells.astype(np.int64).ravel(), **_COMPRESSION)
+    root.create_dataset("Offsets", data=cells.shape[1] * np.arange(len(cells) + 1), **_COMPRESSION)
+    root.create_dataset("Types", data=kinds, **_COMPRESSION)
+    for group in ("PointData", "CellData", "Steps/PointDataOffsets", "Steps/CellDataOffsets"):
+        root.create_group(group)
+    _create(root, "Steps/Values", np.float64, (_STEPS_PER_CHUNK,))
+    for name in ("Steps/NumberOfParts", "Steps/PointOffsets", *_ALWAYS_0):
+        columns = (1,) if name in _OF_TOPOLOGY else ()
+        _create(root, name, np.int64, (_STEPS_PER_CHUNK, *columns))
+    root["Steps"].attrs["NSteps"] = np.int64(0)
 
 
 def _offsets(field: str) -> str:
@@ -266,27 +236,24 @@ def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple
 WITHOUT_IT = "; the run goes on without this file"
 
 
-def recorded_steps(path: Path) -> Iterator[RecordedStep]:
-    """The steps of a file of `TransientGrid`; what does not belong there is an error."""
+def check_series(path: Path) -> None:
+    """Read all of a file of `TransientGrid`; what does not belong there is an error."""
     with series_file(path, WITHOUT_IT) as root:
         number = int(root["Steps"].attrs["NSteps"])
         times = root["Steps/Values"][:number]
         if len(times) != number or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise ValueError("the times of its steps do not increase")
-        for step in range(number):
-            points = {name: _recorded(root, "Point", name, step)[0] for name in root["PointData"]}
-            cells = {name: _recorded(root, "Cell", name, step) for name in root["CellData"]}
-            changing, constant = ({n: v for n, (v, stays) in cells.items() if stays is kind} for kind in (False, True))
-            place, size = int(root["Steps/PointOffsets"][step]), int(root["NumberOfPoints"][0])
-            moved = root["Points"][place : place + size] if place else None
-            yield RecordedStep(float(times[step]), points, changing, moved, constant)
-
-
-def _recorded(root: h5py.Group, kind: str, name: str, step: int) -> tuple[Array, bool]:
-    """Values of a field in a step; whether they are those of the first step."""
-    values, size = root[f"{kind}Data"][name], int(root[f"NumberOf{kind}s"][0])
-    start = int(root[f"Steps/{kind}DataOffsets"][name][step])
-    block = values[start : start + size]
-    if values.is_virtual or values.external or start not in (0, step * size) or len(block) != size:
-        raise ValueError(f"the values of {name} are not where they belong")
-    return block, start < step * size
+        _ = root["Connectivity"][:]
+        places = dict.fromkeys(root["Steps/PointOffsets"][:number])
+        sizes = {kind: int(root[f"NumberOf{kind}s"][0]) for kind in ("Point", "Cell")}
+        blocks = [("Points", root["Points"], place, sizes["Point"]) for place in places]
+        for kind, size in sizes.items():
+            for name in root[f"{kind}Data"]:
+                values = root[f"{kind}Data"][name]
+                starts = root[f"Steps/{kind}DataOffsets"][name][:number]
+                if len(starts) != number or not {*starts} <= {0, *range(0, number * size, size)}:
+                    raise ValueError(f"the values of {name} are not where they belong")
+                blocks += [(name, values, start, size) for start in dict.fromkeys(starts)]
+        for name, values, start, size in blocks:
+            if values.is_virtual or values.external or len(values[start : start + size]) != size:
+                raise ValueError(f"the values of {name} are not where they belong")

@@ -1,7 +1,4 @@
-"""The body of a run as it is shown: what is recorded, of reductions turned into the whole body. It needs no dolfinx.
-
-`revolve` alone does: it writes the fields of a reduced run on the mesh of the whole body that its scene asks for.
-"""
+"""The body of a run as it is shown: what is recorded, of reductions turned into the whole body. It needs no dolfinx."""
 
 from __future__ import annotations
 
@@ -10,15 +7,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.reductions import Turn
-from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import NATURAL_GRADIENT
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
-from remodel_fenicsx.results.vtkhdf import LINE, TransientGrid, vtk_cells
+from remodel_fenicsx.results.vtkhdf import CELL_TYPES, LINE, TransientGrid
 
 spatial = Late("scipy.spatial")  # most runs show no reduction
 Array = NDArray[np.float64]
@@ -76,34 +72,28 @@ AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
 OF_CHAINS = ("cell_dimensions", *AXIS_FIELDS, "deformation_gradient", "fibre_angle")
 
 
-def chain_lines(
-    centres: ArrayLike, lengths: ArrayLike, axes: ArrayLike, scale: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tuple[Array, NDArray[np.int64]]:
     """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2)."""
-    middle = np.asarray(centres, dtype=np.float64)
-    edges = np.asarray(lengths, dtype=np.float64)[:, :, None] * np.asarray(axes, dtype=np.float64)
     signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
-    half = scale * (signs @ edges)
-    ends = middle[:, None, None, :] + np.stack([half, -half], axis=2)
-    return ends.reshape(-1, 3), np.arange(8 * len(middle)).reshape(-1, 2)
+    half = scale * signs @ (lengths[:, :, None] * axes)
+    ends = centres[:, None, None, :] + np.stack([half, -half], axis=2)
+    return ends.reshape(-1, 3), np.arange(8 * len(centres)).reshape(-1, 2)
 
 
-def chain_displacement(
-    points: ArrayLike, centres: ArrayLike, displacement: ArrayLike, deformation_gradient: ArrayLike
-) -> NDArray[np.float64]:
+def chain_displacement(points: Array, centres: Array, displacement: Array, deformation_gradient: Array) -> Array:
     """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre)."""
-    ends = np.asarray(points, dtype=np.float64).reshape(-1, 8, 3) - np.asarray(centres)[:, None, :]
-    gradient = np.asarray(deformation_gradient) - np.eye(3)
-    return (np.asarray(displacement)[:, None, :] + ends @ np.swapaxes(gradient, 1, 2)).reshape(-1, 3)
+    ends = points.reshape(-1, 8, 3) - centres[:, None, :]
+    gradient = deformation_gradient - np.eye(3)
+    return (displacement[:, None, :] + ends @ np.swapaxes(gradient, 1, 2)).reshape(-1, 3)
 
 
 def append_chains(
     grid: TransientGrid | Path,
     time: float,
-    centres: NDArray[np.float64],
+    centres: Array,
     scale: float,
-    displacement: NDArray[np.float64],
-    fields: Mapping[str, NDArray[np.float64]],
+    displacement: Array,
+    fields: Mapping[str, Array],
 ) -> TransientGrid:
     """Add a step to a file of chain lines; it is made at its first step, where `grid` is still its path."""
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
@@ -137,19 +127,15 @@ class WholeBody:
             self._turned = TurnedFields(points, elements, *solved, reduction.turn)
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
-        self.layer, self.depth = _layers(self._depths(shape), self.elements)
+        known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
+        depth = known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
+        self.layer, self.depth = _layers(depth, self.elements)
 
     def notes(self, is_deformed: bool) -> list[str]:
         """What is to be known of pictures of it."""
         turned = f"Solved with the kinematics {self.recording.scene.model.kinematics!r}, shown as the whole body."
         reference = "Displacements were not recorded: this is the reference body."
         return [*([turned] if self.is_turned else []), *([] if is_deformed else [reference])]
-
-    def _depths(self, shape: Shape) -> Array:
-        """Of the elements, (m,): as recorded, or by their places."""
-        recording = self.recording
-        known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
-        return known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
 
     def fields(self, time: float, names: Collection[str] | None = None) -> Fields:
         """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time."""
@@ -193,44 +179,29 @@ BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"
 
 
 def revolve(folder: Path | str) -> list[Path]:
-    """Write the recorded fields of a reduced run on the mesh of the whole body that its scene asks for. One process."""
+    """Write the recorded fields of a reduced run on the mesh of the whole body."""
     recording = RecordedRun(folder)
     name = recording.scene.model.kinematics
-    if name not in KINEMATICS or not KINEMATICS[name].reduced:
+    if not KINEMATICS[name].reduced:
         raise RecordingError(f"{recording.path}: its kinematics are {name!r}: the fields are those of the body already")
     paths = [recording.path / file for file in (BODY, BODY_CHAINS)]
     for path in paths:
         if path.exists():
             raise RecordingError(f"{path}: is there already; nothing is overwritten")
-    if not len(recording.times):
+    if not has_a_body(recording):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
-    image = _Image(recording, recording.scene.geometry.reductions[name].turn)
+    whole = WholeBody(recording)
+    centres = whole.points[whole.elements].mean(axis=1)
+    scale = 0.4 * float(np.prod(np.ptp(whole.points, axis=0)) / len(centres)) ** (1 / 3)
+    kind = CELL_TYPES["hexahedron" if whole.elements.shape[1] == 8 else "tetrahedron"][0]
     with ExitStack() as stack:  # the body is closed last: where it is, all are
-        grid = stack.enter_context(TransientGrid(paths[0], image.points, image.cells, image.cell_type))
+        grid = stack.enter_context(TransientGrid(paths[0], whole.points, whole.elements, kind))
         chains: TransientGrid | None = None
         for time in recording.times:
-            displacement, fields = image(recording.fields(float(time)))
+            displacement, fields = whole.fields(float(time))
             grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
             if displacement is not None and set(OF_CHAINS) <= set(fields):
-                middle = displacement[image.elements].mean(axis=1)
-                new = append_chains(chains or paths[1], float(time), image.centres, image.scale, middle, fields)
+                middle = displacement[whole.elements].mean(axis=1)
+                new = append_chains(chains or paths[1], float(time), centres, scale, middle, fields)
                 chains = chains or stack.enter_context(new)
     return [path for path in paths if path.exists()]
-
-
-class _Image(TurnedFields):
-    """The body's mesh, and the fields on it."""
-
-    def __init__(self, recording: RecordedRun, turn: Turn):
-        from mpi4py import MPI  # late, as dolfinx: who shows a body needs neither
-
-        scene = recording.scene
-        domain = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
-        points, elements = domain.gather_mesh()
-        assert points is not None and elements is not None
-        super().__init__(points, elements, recording.points, recording.elements, turn)
-        self.points, self.elements = points, elements
-        kind = domain.mesh.topology.cell_name()
-        self.cell_type, self.cells = vtk_cells(kind, domain.mesh.geometry.cmap.degree, elements)
-        extents = np.ptp(points, axis=0)
-        self.scale = 0.4 * float(np.prod(extents) / len(elements)) ** (1 / 3)

@@ -23,7 +23,7 @@ from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
 KERNELS = "REMODEL_FENICSX_KERNELS"  # what computes at points: C, or numpy for a debugger
-NEEDED = ("basix", "dolfinx", "gmsh", "h5py", "mpi4py", "petsc4py", "pint", "rich", "ufl")
+NEEDED = "basix dolfinx gmsh h5py mpi4py petsc4py pint rich ufl".split()
 
 
 class UnusableEnvironment(RemodelError):  # noqa: N818

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import itertools
 import os
 import re
 import shlex
@@ -87,6 +88,13 @@ def check_no_link(path: Path) -> None:
     """Raise ForeignFileError if a link stands in the place of a folder or of nothing yet."""
     if path.is_symlink():
         raise ForeignFileError(errno.ELOOP, LINK, str(path))
+
+
+def numbered(path: Path) -> Iterator[Path]:
+    """Names of something new: this one, and others where it is taken."""
+    yield path
+    for number in itertools.count(2):
+        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def part_of(path: Path) -> Path:

@@ -117,6 +117,21 @@ def handled(
             signal.signal(number, one)
 
 
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Within, signals wait: Python's handlers, and those of programs that are started."""
+    caught: list[int] = []
+    try:
+        with (
+            handled(lambda number, _: caught.append(number), signal.valid_signals(), callable),
+            blocked(*SIGNALS, PAUSE),
+        ):
+            yield
+    finally:
+        for number in caught:
+            signal.raise_signal(number)
+
+
 # ---------------------------------------------------------------- ranks
 
 
@@ -203,7 +218,6 @@ class StopRequest:
                 clock.sleep(_ONE_SIGNAL)
             signal.signal(number, signal.SIG_DFL)
             if self.raises:
-                _end_descendants(os.getpid(), number)
                 raise Interrupted(number, on_all_ranks=False)
 
     def __exit__(self, *error: object) -> None:
@@ -216,28 +230,15 @@ _requests: list[StopRequest] = []  # those that are waiting for signals; the las
 
 @contextmanager
 def stopping_at_once() -> Iterator[None]:
-    """Within, a request to stop is an exception at once; programs that were started (a compiler) are ended first."""
+    """Within, a request to stop is an exception at once."""
     if not _requests:
         yield
         return
     request = _requests[-1]
-    before, request.raises = request.raises, True
-    try:
-        if not request.number:
-            yield
-    except Exception as error:
-        if isinstance(error, Interrupted) or not request.number:
-            raise
-    finally:
-        request.raises = before
     if request.number:
         raise Interrupted(request.number, on_all_ranks=False)
-
-
-def _end_descendants(process: int, number: int) -> None:
-    """A signal for this process alone would leave gcc's own children working for nobody (Linux; elsewhere it does)."""
-    with suppress(OSError):  # it has ended, or this is no Linux
-        for child in map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split()):
-            _end_descendants(child, number)
-            with suppress(ProcessLookupError):
-                os.kill(child, number)
+    before, request.raises = request.raises, True
+    try:
+        yield
+    finally:
+        request.raises = before

@@ -7,13 +7,11 @@ import math
 import os
 import sys
 import time as clock
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from logging.handlers import MemoryHandler
 from pathlib import Path
-from statistics import median_low
 from typing import Any, Self, cast
 
 from remodel_fenicsx.system import NOTICE
@@ -21,7 +19,6 @@ from remodel_fenicsx.system.files import open_own
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
-LAST_PACES = 20  # steps, whose seconds tell those of the next ones
 LINE_EVERY = 10.0  # seconds, of lines that stay
 
 
@@ -32,10 +29,7 @@ class Progress:
         self._total, self._title, self._done = total_steps, title, done
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
-        # step and clock: of the first one of a process, which compiles, too
-        self._last: tuple[float, float] | None = None
-        self._paces: deque[float] = deque(maxlen=LAST_PACES)  # seconds a step
-        self._pending: str | None = None  # the newest line that was not printed
+        self._first: tuple[float, float] | None = None  # step and clock: what it takes to compile is past
         self._bar: Any = None  # rich's, on a terminal
 
     def __enter__(self) -> Self:
@@ -48,30 +42,18 @@ class Progress:
         if self._bar is not None:
             with suppress(OSError):  # the terminal is gone
                 self._bar.stop()
-        elif self._pending is not None:
-            announce(self._pending)
-        self._bar, self._pending = None, None
+            self._bar = None
 
-    def step(
-        self,
-        index: float,
-        time: float,
-        load_text: str = "",
-        newton_iterations: int = 0,
-        message: str | None = None,
-        count: str | None = None,
-    ) -> None:
+    def step(self, index: float, state: str, count: str | None = None) -> None:
         """Step `index` (1 to total_steps) is done; of steps that are no whole ones, 0 to total_steps."""
         if self._silent:
             return
-        if message is not None:
-            self.message(message)
-        count = count or f"{index}/{self._total}"
-        at, newton, left = f"t = {time:g}", f"{newton_iterations} Newton", self._time_left(index)
-        if self._bar is not None:  # what stands last is lost first where the terminal is narrow
-            self._bar.update(0, completed=index, count=count, state=_joined(at, newton, load_text), left=left)
+        count, left = count or f"{index}/{self._total}", self._time_left(index)
+        if self._bar is not None:
+            self._bar.update(0, completed=index, count=count, state=state, left=left)
         else:
-            self._say(_joined(f"step {count}", at, load_text, newton, left), at_once=index >= self._total)
+            said = f"step {count}", state, left
+            self._say(", ".join(filter(None, said)), at_once=index >= self._total)
 
     def show(self, text: str) -> None:
         """Show a line; where lines stay, only now and then."""
@@ -81,11 +63,10 @@ class Progress:
             self._say(text, at_once=False)
 
     def _say(self, text: str, at_once: bool) -> None:
-        """A line that stays, if it is time for one; the last one is said at the end."""
-        self._pending = f"{self._title}: {text}"
+        """A line that stays, if it is time for one."""
         if at_once or clock.monotonic() >= self._line_is_due:
-            announce(self._pending)
-            self._line_is_due, self._pending = clock.monotonic() + self._interval, None
+            announce(f"{self._title}: {text}")
+            self._line_is_due = clock.monotonic() + self._interval
 
     def message(self, text: str) -> None:
         """Print a line above the bar, or between the plain lines."""
@@ -96,18 +77,12 @@ class Progress:
             announce(f"{self._title}: {text}")
 
     def _time_left(self, index: float) -> str:
-        """The median of the last steps, times the steps that are left; the first one says nothing."""
-        now, last = clock.monotonic(), self._last
-        if last is None or index > last[0]:
-            self._last = index, now
-        if last is not None and index > last[0]:
-            self._paces.append((now - last[1]) / (index - last[0]))
-        remaining = self._total - index
-        return f"{duration(median_low(self._paces) * remaining)} left" if self._paces and remaining > 0 else ""
-
-
-def _joined(*parts: str) -> str:
-    return ", ".join(filter(None, parts))
+        """The mean time of a step after the first one, times the steps that are left."""
+        now, remaining = clock.monotonic(), self._total - index
+        self._first = first, since = self._first or (index, now)
+        if index <= first or remaining <= 0:
+            return ""
+        return f"{duration((now - since) / (index - first) * remaining)} left"
 
 
 class Line(Progress):
@@ -116,31 +91,19 @@ class Line(Progress):
     def __init__(self, title: str, silent: bool) -> None:
         super().__init__(0, title, -1 if silent else 0, interval=LINE_EVERY)
 
-    def __exit__(self, *error: object) -> None:
-        self._pending = None
-        super().__exit__(*error)
-
 
 def _bar(title: str, total: int | None, done: float) -> Any:
     """Title, bar, step, state, time so far, time left on one line of stderr; what others print stands above it."""
     from rich.console import Console  # late: most runs have no terminal
     from rich.progress import BarColumn, Progress as RichProgress, TextColumn, TimeElapsedColumn
-    from rich.table import Column
-
-    class Cropped(TextColumn):
-        def render(self, task: Any) -> Any:
-            text = super().render(task)
-            text.no_wrap, text.overflow = True, "ellipsis"
-            return text
 
     named, count, state, left = (f"{{task.fields[{name}]}}" for name in ("title", "count", "state", "left"))
-    plain: dict[str, Any] = {"markup": False}
-    cropped = plain | {"table_column": Column()}
-    columns = Cropped(named, **cropped), BarColumn(24), TextColumn(count, **plain), Cropped(state, **cropped)
+    title_column, *columns = (TextColumn(text, markup=False) for text in (named, count, state))
     console = Console(stderr=True)
     console.width -= 3  # a line that reaches the edge is broken by the ^C that a terminal shows, and stands there twice
     how: dict[str, Any] = {"console": console, "refresh_per_second": 4, "redirect_stdout": sys.stdout.isatty()}
-    found = RichProgress(*columns, TimeElapsedColumn(), TextColumn(left, **plain), **how)
+    last = TimeElapsedColumn(), TextColumn(left, markup=False)
+    found = RichProgress(title_column, BarColumn(24), *columns, *last, **how)
     found.add_task("", total=total, completed=done, title=title, count="", state="starting", left="")  # type: ignore
     return found
 

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,10 +80,7 @@ def cache(compiled: Path, tmp_path: Path) -> Path:
 def test_only_what_is_really_compiled_is_said_and_counted(tmp_path: Path) -> None:
     count = tmp_path / "count"
     first, again = (compile_and_use(tmp_path, REMODEL_FENICSX_COMPILED=str(count)) for _ in range(2))
-    assert (first.returncode, again.returncode) == (0, 0), first.stderr[-2000:]
-    assert first.stderr.count("compiling the moment, once on this machine: about 1 s") == 1
-    assert first.stderr.count("compiled the moment in ") == 1
-    assert "compil" not in again.stderr
+    assert "compiling the moment, once on this machine" in first.stderr and "compil" not in again.stderr
     assert (first.stdout, again.stdout) == ("1\n", "0\n")
     assert count.read_text() == one_file(tmp_path, "libffcx_forms_*.c").stem + "\n"
 
@@ -124,26 +120,21 @@ def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: 
     assert "removing" not in compile_and_use(cache, ranks).stderr
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
-def test_a_cache_of_another_user_is_not_loaded(cache: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("theirs", [False, True])
+def test_a_cache_that_is_not_ones_own_is_replaced_with_a_warning(theirs: bool, cache: Path, tmp_path: Path) -> None:
     """What is there is run."""
-    (tmp_path / "temporary").mkdir()
-    for folder in (cache / "fenics").iterdir():
-        try:
-            os.chown(folder, 12345, 12345)
-        except OSError:
-            pytest.skip("this root has one user alone")
-    done = compile_and_use(cache, TMPDIR=str(tmp_path / "temporary"))
-    assert done.returncode == 0 and "belongs to another user" in done.stderr, done.stderr[-2000:]
-
-
-def test_a_cache_that_cannot_be_written_is_replaced_with_a_warning(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    temporary = tmp_path / "temporary"
+    temporary, place = tmp_path / "temporary", tmp_path / "file" / "cache"
     temporary.mkdir()
-    done = compile_and_use(tmp_path / "file" / "cache", TMPDIR=str(temporary))
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stderr.count("cannot write to") == 1 and str(temporary) in done.stderr
+    (tmp_path / "file").touch()
+    if theirs:
+        place = cache
+        for folder in (cache / "fenics").iterdir():
+            try:
+                os.chown(folder, 12345, 12345)
+            except OSError:
+                pytest.skip("only root can give a folder away")
+    done = compile_and_use(place, TMPDIR=str(temporary))
+    assert done.returncode == 0 and done.stderr.count("cannot write to") == 1, done.stderr[-2000:]
     assert list(temporary.rglob("libffcx_forms_*.so"))
 
 
@@ -188,30 +179,17 @@ with StopRequest():
 
 
 @pytest.mark.parametrize(
-    ("target", "number"),
-    [
-        ("group", signal.SIGINT),
-        ("process and group", signal.SIGTERM),
-        ("compiler", signal.SIGTERM),
-        ("process", signal.SIGTERM),
-        *slowly(("group", signal.SIGTERM), ("group", signal.SIGHUP)),
-    ],
+    ("group", "number"), [(True, signal.SIGINT), (False, signal.SIGTERM), *slowly((True, signal.SIGHUP))]
 )
-def test_a_signal_ends_the_compiler_and_leaves_nothing(target: str, number: signal.Signals, tmp_path: Path) -> None:
-    """A terminal sends it to the group, timeout to the process and then to its group, some to all, one by one."""
+def test_a_signal_waits_for_the_compiler(group: bool, number: signal.Signals, tmp_path: Path) -> None:
+    """A terminal sends it to all processes; what is there afterwards is whole."""
     command, environment = program(tmp_path, IN_A_RUN)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True, start_new_session=True)
-    compiler = wait_for_compiler(process)
-    if target != "group":
-        os.kill(compiler if target == "compiler" else process.pid, number)
-        time.sleep(0.01)
-    if "group" in target:
-        os.killpg(process.pid, number)
+    wait_for_compiler(process)
+    (os.killpg if group else os.kill)(process.pid, number)
     errors = process.communicate(timeout=200)[1]
-    assert (process.returncode, errors) == (128 + number, "")
-    if target != "compiler":  # whoever ends gcc alone leaves gcc's own children to themselves
-        assert all_end(process.pid)
-    assert {path.parent.name for path in tmp_path.rglob("*") if path.is_file()} == {"locks"}
+    assert (process.returncode, errors) == (128 + number, "") and all_end(process.pid)
+    assert one_file(tmp_path, "libffcx_*.so").exists() and one_file(tmp_path, "libffcx_*.c.cached").exists()
 
 
 LOGARITHMS = """

