@@ -28,8 +28,7 @@ from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.scene.scene import in_region
-from remodel_fenicsx.schema.settings import Cells, Properties, Turnover
+from remodel_fenicsx.schema.settings import Cells, Properties, Turnover, in_region
 from remodel_fenicsx.state import Snapshot, State, UnitCells, by_region
 from remodel_fenicsx.system.files import typed
 from remodel_fenicsx.system.interrupts import take_back_signals
@@ -484,7 +483,7 @@ def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
 def _with_one_matrix(
     tissues: Mapping[str, Tissue], properties: Mapping[str, Properties], matrices: Sequence[str]
 ) -> dict[str, Tissue]:
-    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # `Properties.check_with` asks
+    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # `rules.tissue_of_regions` asks
     defaults = {name: number.default for name, number in mixture.parameters.items()}
     found = {}
     for name, tissue in tissues.items():

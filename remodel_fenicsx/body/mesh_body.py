@@ -374,8 +374,10 @@ class FileBody(WithRegions, FromFile):
         for name in supports:
             if name not in domain.faces:
                 raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
+        from remodel_fenicsx.body.mesh_domain import check_supports
+
         chosen = self.supports_of(supports)
-        mesh_faces.check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
+        check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
         moved = {"outlet": "elongation"} if "elongation" in loads else {}
         for name, (face, load) in faces_of(loads).items():
             key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
@@ -399,6 +401,8 @@ class FileBody(WithRegions, FromFile):
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
         """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective."""
+        from remodel_fenicsx.body.mesh_domain import GUIDE, add_support
+
         domain: Any = loading.domain
         self.check_faces(domain, supports, loads)
         length = domain.length()
@@ -411,8 +415,8 @@ class FileBody(WithRegions, FromFile):
         if "elongation" in loads:
             ways["outlet"] = "elongation", length
         for name, support in self.supports_of(supports).items():
-            stiffness = mesh_faces.GUIDE * modulus / domain.thickness
-            mesh_faces.add_support(loading, name, support, stiffness, ways.get(name))
+            stiffness = GUIDE * modulus / domain.thickness
+            add_support(loading, name, support, stiffness, ways.get(name))
         for name, on in on_faces.items():
             if on.kind == "pressure":
                 loading.add_follower_pressure(name, on.face)

@@ -20,7 +20,6 @@ from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.schema.settings import LARGEST_MESH
-from remodel_fenicsx.schema.tables import fault
 
 
 # ---------------------------------------------------------------- whole bodies for pictures
@@ -271,14 +270,14 @@ def elements(scene: Any, name: str) -> int:
     return scene.geometry.number_of_elements * scene.mesh.refinement**3
 
 
-def check_number(scene: Any) -> None:
-    """Refuse a body, or the part that stands for it, of too many elements: raise a `fault` that names the key."""
+def too_many_elements(scene: Any) -> str:
+    """What is allowed where a body, or the part that stands for it, has too many elements; nothing elsewhere."""
     name, refinement = choice(scene).name, scene.mesh.refinement
-    if (number := elements(scene, name)) > LARGEST_MESH:
-        dimension = {"interval": 1, "quadrilateral": 2}.get(KINEMATICS[name].element(scene.mesh.element), 3)
-        largest = math.floor(math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension))
-        rule = f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
-        raise fault(rule, "mesh.refinement", refinement)
+    if (number := elements(scene, name)) <= LARGEST_MESH:
+        return ""
+    dimension = {"interval": 1, "quadrilateral": 2}.get(KINEMATICS[name].element(scene.mesh.element), 3)
+    largest = math.floor(math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension))
+    return f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
 
 
 def step_cost(scene: Any, name: str) -> float:

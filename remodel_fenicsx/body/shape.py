@@ -27,9 +27,8 @@ from remodel_fenicsx.schema.settings import (
     Region,
     Support,
     faces_of,
-    in_region,
 )
-from remodel_fenicsx.schema.tables import fault, refuse, with_key
+from remodel_fenicsx.schema.tables import fault, with_key
 from remodel_fenicsx.schema.units import FORCE, Dimension, LengthUnit
 
 if TYPE_CHECKING:
@@ -395,6 +394,8 @@ class LoadKind:
         Magnitude from which on a value is hardly meant, and what may have been.
     instead_of
         Name of another load that a scene may have in its place, not beside it.
+    of_one_strain
+        Whether it is a strain of the whole body, for kinematics whose strain is the same everywhere.
 
     Examples
     --------
@@ -426,6 +427,7 @@ class LoadKind:
     area: Callable[[Any], float] | None = None
     doubtful: tuple[float, str] | None = None
     instead_of: str = ""
+    of_one_strain: bool = False
 
     def column_name(self, name: str) -> str:
         """Of its column, for the load of this name."""
@@ -552,17 +554,6 @@ class Shape(_Is):  # type: ignore[misc]
 
     shape: str = Field(description="Which body it is.")
     length_unit: LengthUnit = None
-
-    @classmethod
-    def is_a(cls, kind: str) -> bool:
-        """Whether a class of this name, `WithRegions` say, is among its own: tables of settings cannot import them.
-
-        Parameters
-        ----------
-        kind
-            Its name.
-        """
-        return any(base.__name__ == kind for base in cls.__mro__)
 
     @property
     def is_loaded(self) -> bool:
@@ -792,30 +783,6 @@ class Shape(_Is):  # type: ignore[misc]
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
         """Values that a scene as run has in place of its own, by dotted key, and files beside it by name."""
         return {}, {}
-
-    def check_with(self, scene: Any, key: str) -> None:
-        """Mesh and regions that the shape can have; where it is the loaded one, whether the unloaded can be found."""
-        self.check_size(scene.mesh)
-        for name in scene.loads:
-            if (other := scene.load_kinds[name].instead_of) in scene.loads:
-                raise fault(f"not allowed beside loads.{other}: either", f"loads.{name}", scene.loads[name].value)
-        if isinstance(self, WithRegions):
-            self.check_regions(scene.regions, scene.mesh)
-        if not self.is_loaded:
-            return
-        measured = [f"{in_region(name)}cells.fibres" for name in scene.measured_cells]
-        reasons = {
-            f"allowed for the shapes {scene.shapes_that(lambda kind: kind.is_a('Unloads'))}": not isinstance(
-                self, Unloads
-            ),
-            "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius": (
-                scene.supports.ends == "clamped"
-            ),
-            f"not allowed with {', '.join(measured)}: its rows belong to places, which unloading moves": measured,
-            "not allowed with [[cases]]: the loaded body belongs to one set of loads; remodel-fenicsx unload SCENE, "
-            "with those alone, writes the scene of the unloaded one, to which [[cases]] may be added": scene.cases,
-        }
-        refuse(f"{key}.is", "loaded", reasons)
 
     def check_size(self, mesh: Mesh) -> None:
         """Refuse a mesh that the shape cannot have, whatever its size: raise a `fault` that names the key."""

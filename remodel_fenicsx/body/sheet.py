@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from remodel_fenicsx.body.cube import Box
-from remodel_fenicsx.body.reductions import choice
 from remodel_fenicsx.body.shape import Column, LoadKind, cauchy_columns
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.schema.tables import fault
 from remodel_fenicsx.schema.units import FORCE, LENGTH
 
 SIDES = "xy"
@@ -100,6 +97,7 @@ class Sheet(Box):
             lambda shape, loading, name: loading.add_prescribed_shear(name),
             "shear F_xy of the sheet, by which places move along x with y; F_yx is 0",
             reductions=("point",),
+            of_one_strain=True,
         ),
     }
     columns: ClassVar[tuple[Column, ...]] = (
@@ -138,14 +136,6 @@ class Sheet(Box):
     def sides(self) -> dict[str, float]:
         """Along x, y and z, by their keys."""
         return {"length_x": self.length_x, "length_y": self.length_y, "thickness": self.thickness}
-
-    def check_with(self, scene: Any, key: str) -> None:
-        """What all bodies ask, and that the strain is the same everywhere where shear is prescribed."""
-        super().check_with(scene, key)
-        if "shear" in scene.loads and not KINEMATICS[(made := choice(scene)).name].homogeneous:
-            reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
-            rule = f"needs the same strain everywhere, model.kinematics = 'point': {reasons}"
-            raise fault(rule, "loads.shear.value", scene.loads["shear"].value)
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
         """To x."""

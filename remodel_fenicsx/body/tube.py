@@ -379,7 +379,7 @@ class Tube(RoundWall):
     ) -> None:
         """Springs of what surrounds it."""
         for face, support in supports.items():
-            from remodel_fenicsx.body.mesh_faces import add_support, warn_of_twist  # which few tubes need
+            from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # which few tubes need
 
             add_support(loading, face, support, modulus, None)
             if loading.kinematics.moves_rigidly:

@@ -13,13 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.reductions import choice
 from remodel_fenicsx.body.shape import Column, Shape, Unloads, WithRegions
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.schema.settings import Natural, Region, in_region
+from remodel_fenicsx.schema.settings import Natural, Region
 from remodel_fenicsx.schema.tables import fault, shown
 
 if TYPE_CHECKING:
@@ -308,16 +306,3 @@ class RoundWall(Walled, WithRegions, Unloads):
     def fills(self, regions: Collection[str]) -> bool:
         """The outermost ends at the outer radius."""
         return bool(regions)
-
-    def check_with(self, scene: Any, key: str) -> None:
-        """What all bodies ask, and that directions of a matrix turn with the wall."""
-        super().check_with(scene, key)
-        if not KINEMATICS[choice(scene).name].three_dimensional:
-            return
-        for name, properties in scene.properties().items():
-            if not properties.tissue.is_round():
-                rule = (
-                    "has directions along x, y and z, which follow the wall in the kinematics 'radial' and "
-                    "'axisymmetric' alone: the radius, the circumference and the length"
-                )
-                raise fault(rule, f"{in_region(name)}material.matrix", properties.material.matrix)

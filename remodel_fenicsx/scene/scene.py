@@ -11,7 +11,6 @@ import logging
 import math
 import os
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -19,8 +18,8 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
-from remodel_fenicsx.body.reductions import AUTO, check_number, choice, objections
-from remodel_fenicsx.body.shape import Column, FromFile, columns_of, columns_on_request
+from remodel_fenicsx.body.reductions import AUTO, choice
+from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
@@ -28,7 +27,7 @@ from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue, neo_hookean
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene import presets
+from remodel_fenicsx.scene import presets, rules
 from remodel_fenicsx.schema.settings import (
     AS_GIVEN,
     COUPLINGS,
@@ -52,7 +51,6 @@ from remodel_fenicsx.schema.settings import (
     Time,
     NO_PRESTRETCH,
     faces_of,
-    in_region,
 )
 from remodel_fenicsx.schema.conventions import convention_doubt
 from remodel_fenicsx.schema.tables import (
@@ -65,7 +63,6 @@ from remodel_fenicsx.schema.tables import (
     allowed,
     fault,
     is_number,
-    named,
     quoted,
     shown,
 )
@@ -317,35 +314,8 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
-        for key, table in self._tables():
-            table.check_with(self, key)
-        if not isinstance(self.geometry, FromFile):
-            check_number(self)
-        for name, count in Counter(column.name for column in self.columns()).items():
-            if count > 1:
-                raise fault("there are two columns of this name; parts of your own need other names", name, None)
+        rules.check(self)
         return self
-
-    def _tables(self) -> Iterator[tuple[str, Table | Properties]]:
-        """All of them with their keys; regions first, and last the one whose rules are of scenes that fit together."""
-        for name in sorted(type(self).model_fields, key=lambda name: (name == "model", name != "regions")):
-            value = getattr(self, name)
-            if isinstance(value, Table):
-                yield name, value
-            elif isinstance(value, dict):
-                yield from ((f"{name}.{quoted(inner)}", table) for inner, table in value.items())
-            elif isinstance(value, tuple):
-                yield from ((f"{name}[{index}]", table) for index, table in enumerate(value))
-            if name == "regions":
-                yield from ((in_region(inner), properties) for inner, properties in self.properties().items())
-
-    def shapes_that(self, fit: Callable[[type[Shape]], bool]) -> str:
-        """The names of the shapes that can something, for an error."""
-        return named(SHAPES, fit)
-
-    def objections(self, kinematics: str) -> list[str]:
-        """Why these kinematics would be wrong for it."""
-        return objections(self, kinematics)
 
     @property
     def _stiffness_ratio(self) -> float:
