@@ -11,6 +11,7 @@ import logging
 import math
 import os
 import re
+from functools import partial
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -67,7 +68,16 @@ from remodel_fenicsx.schema.tables import (
     shown,
 )
 from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, toml_text
-from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
+from remodel_fenicsx.schema.units import (
+    FORCE,
+    LENGTH_UNIT,
+    LENGTH_UNITS,
+    LARGEST_NUMBER,
+    STRESS,
+    STRESS_UNIT,
+    TOO_LARGE,
+    scene_units,
+)
 from remodel_fenicsx.system.interrupts import is_first_rank
 
 log = logging.getLogger(__name__)
@@ -197,7 +207,6 @@ FORMAT = 2  # of recorded scenes: raised where a reader of the one before would 
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
 COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
-LARGEST_NUMBER = 1e60  # products of four are no overflow
 MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
 SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
 FORGOTTEN_AFTER = (
@@ -303,9 +312,9 @@ class Scene(Table):
 
         def made(settings: Mapping[str, Any]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
-            values = _in_own_units(values, SHAPES[shape])
             _check_sizes(values, "")
-            return handler(presets.with_own_numbers(values))
+            with scene_units(_units(values, SHAPES[shape])):
+                return handler(_with_numbers_of_loads(values, SHAPES[shape]))
 
         if profile is None:
             return made({})
@@ -314,6 +323,10 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
+        whole = presets.with_own_numbers(self, Scene.whole)
+        over = partial(Region.over, others=whole.whole())
+        regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
+        self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
         rules.check(self)
         return self
 
@@ -388,9 +401,13 @@ class Scene(Table):
             found.append(self.model_copy(update={"loads": loads, "cases": ()}))
         return found or [self]
 
+    def whole(self) -> Properties:
+        """What holds where no region says otherwise."""
+        return Properties(self.material, self.cells, self.remodeling.kappa)
+
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
-        body = Properties(self.material, self.cells, self.remodeling.kappa)
+        body = self.whole()
         found = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
         if self.regions and isinstance(self.geometry, RoundWall):
             del found[""]
@@ -654,7 +671,7 @@ def _check_sizes(value: Any, key: str) -> None:
         for name, inner in value.items():
             _check_sizes(inner, f"{key}.{name}" if key else str(name))
     elif is_number(value) and abs(value) > LARGEST_NUMBER:
-        raise fault(f"too large a number; must be at most {LARGEST_NUMBER:g}", key, value)
+        raise fault(TOO_LARGE, key, value)
 
 
 def _check_name(key: str, name: Any, names: Iterable[str]) -> None:
@@ -672,8 +689,8 @@ def _known_shape(geometry: Any) -> str:
     return str(geometry["shape"])
 
 
-def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, Any]:
-    """The values, those of preset and shape among them, with numbers in the scene's units in place of "5 mm"."""
+def _units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, str | None]:
+    """The units that a scene chooses, by their keys."""
     units: dict[str, str | None] = {}
     for key, table, known in ((STRESS_UNIT, Material, tuple(STRESS_UNITS)), (LENGTH_UNIT, shape, LENGTH_UNITS)):
         table_name, name = key.split(".")
@@ -681,15 +698,20 @@ def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, An
         units[key] = chosen.get(name, field.default) if isinstance(chosen, Mapping) else field.default
         if units[key] not in (*known, None):
             raise fault(allowed(field), key, units[key])
-    result = {**values, "geometry": in_units(values["geometry"], shape, units, "geometry")}
-    if isinstance(loads := result.get("loads"), Mapping):
-        kinds = shape.loads_on(faces_of(loads))
-        result["loads"] = {
-            name: in_units(entry, Load, units, f"loads.{name}", {"value": kinds[name].dimension})
-            for name, entry in loads.items()
-        }
-    found: dict[str, Any] = in_units(result, Scene, units)
-    return found
+    return units
+
+
+def _with_numbers_of_loads(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, Any]:
+    """The values with numbers in place of units of loads, whose dimensions the shape knows."""
+    loads = values.get("loads")
+    if not isinstance(loads, Mapping):
+        return dict(values)
+    found = dict(loads)
+    for name, kind in shape.loads_on(faces_of(loads)).items():
+        load = loads.get(name)
+        if isinstance(load, Mapping) and "value" in load and kind.dimension is not None:
+            found[name] = {**load, "value": kind.dimension.number(load["value"], f"loads.{quoted(name)}.value")}
+    return {**values, "loads": found}
 
 
 def _check_load_names(shape: str, loads: Any) -> None:
