@@ -454,9 +454,9 @@ def _new(options: argparse.Namespace) -> None:
     "wall",
     [
         "wall lumen.stl --thickness 0.6 --size 0.9 -o vessel.msh",
-        "wall lumen.ply --layers media=0.6 adventitia=0.4 --size 0.5 -o vessel.msh",
+        "wall lumen.vtp --layers media=0.6 adventitia=0.4 --size 0.5 -o vessel.msh",
     ],
-    option("surface FILE  The surface of the lumen, open at its ends: STL, PLY, VTP or OBJ.", type=Path),
+    option("surface FILE  The surface of the lumen, open at its ends: STL, VTP or OBJ.", type=Path),
     option(
         "--thickness VALUE  Thickness of the wall in the unit of the surface, or the name of an array at its points."
     ),

@@ -99,6 +99,8 @@ def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
 
 def by_gmsh(file: str) -> dict[str, Any]:
     """In the child process: points and triangles of a size, of those in a file."""
+    from remodel_fenicsx.body.gmsh_file import of_gmsh
+
     with np.load(file) as read, gmsh_model("wall") as gmsh:
         count, corners = len(read["points"]), read["triangles"].ravel() + 1
         gmsh.model.addDiscreteEntity(2, 1)
@@ -109,11 +111,9 @@ def by_gmsh(file: str) -> dict[str, Any]:
         for option in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
             gmsh.option.setNumber(option, float(read["size"]))
         gmsh.model.mesh.generate(2)
-        numbers, places, _ = gmsh.model.mesh.getNodes()
-        used, triangles = np.unique(gmsh.model.mesh.getElementsByType(2)[1], return_inverse=True)
-    order = np.argsort(numbers)
-    points = places.reshape(-1, 3)[order[np.searchsorted(numbers[order], used)]]
-    return {"points": points, "triangles": triangles.reshape(-1, 3)}
+        points, blocks = of_gmsh()
+    used, triangles = np.unique(next(b.nodes for b in blocks if b.kind == "triangle"), return_inverse=True)
+    return {"points": points[used], "triangles": triangles.reshape(-1, 3)}
 
 
 def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:

@@ -19,10 +19,9 @@ from pydantic.config import JsonDict
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gmsh_model
 from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
-    ENDINGS,
+    READERS,
     TAGS,
     Array,
-    Block,
     MeshFile,
     assembled,
     distinct,
@@ -82,7 +81,7 @@ def _faces(value: Any) -> Any:
 def _files(value: Any) -> list[str]:
     """Paths of a mesh and of its surfaces, of one or a list; nothing where they are none."""
     files = list(value) if isinstance(value, (list, tuple)) else [value]
-    kinds = [ENDINGS, *[SURFACES] * len(files[1:])]
+    kinds = [READERS, *[SURFACES] * len(files[1:])]
     return files if files and all(map(_ends_with, files, kinds)) else []
 
 
@@ -93,7 +92,7 @@ def _ends_with(file: Any, endings: Collection[str]) -> bool:
 def _file(value: Any) -> Any:
     files = _files(value)
     if not files:
-        mesh, surfaces = ", ".join(ENDINGS), ", ".join(SURFACES)
+        mesh, surfaces = ", ".join(READERS), ", ".join(SURFACES)
         raise fault(
             f"must be the path of a mesh ({mesh}), relative to the scene's folder; in a list, what follows the mesh "
             f"must be paths of its surfaces ({surfaces})"
@@ -137,7 +136,7 @@ class FileBody(WithRegions, FromFile):
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
         description=(
             "The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`, `.stl`, "
-            "`.ply`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."
+            "`.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."
         ),
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"},
     )
@@ -591,26 +590,24 @@ class Solid(FileBody):
 
 
 # ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh
-# Gmsh's number of elements and facets of degree 1; meshio's names of those of degree 1 and 2
-SPLIT: dict[str, dict[int, tuple[Any, ...]]] = {
-    "tetrahedron": {3: (4, "tetra", "tetra10"), 2: (2, "triangle", "triangle6")},
-    "hexahedron": {3: (5, "hexahedron", "hexahedron27"), 2: (3, "quad", "quad9")},
-}
+# Gmsh's numbers of elements and facets of degree 1
+SPLIT = {"tetrahedron": {3: 4, 2: 2}, "hexahedron": {3: 5, 2: 3}}
 
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     """A mesh of plane elements, split into halves along each edge, as often as asked for."""
+    from remodel_fenicsx.body.gmsh_file import of_gmsh
+
     with gmsh_model("file") as gmsh:
-        mesh, parts = gmsh.model.mesh, {3: (file.cells, file.cell_groups), 2: (file.facets, file.facet_groups)}
-        entities = {
-            d: {n: gmsh.model.addDiscreteEntity(d) for n in distinct(groups)} for d, (_, groups) in parts.items()
-        }
-        first = next(iter(entities[3].values()))
-        mesh.addNodes(3, first, np.arange(1, len(file.points) + 1), file.points.reshape(-1))
-        for dimension, (rows, groups) in parts.items():
-            for number, entity in entities[dimension].items():
-                nodes = 1 + rows[groups == number].reshape(-1)
-                mesh.addElementsByType(entity, SPLIT[file.kind][dimension][0], [], nodes)
+        model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
+        for dimension, rows, groups in ((3, file.cells, file.cell_groups), (2, file.facets, file.facet_groups)):
+            for group in distinct(groups):
+                entity = model.addDiscreteEntity(dimension)
+                mesh.addNodes(dimension, entity, number, file.points.reshape(-1))
+                number = []
+                mesh.addElementsByType(entity, SPLIT[file.kind][dimension], [], 1 + rows[groups == group].reshape(-1))
+                if group:
+                    model.addPhysicalGroup(dimension, [entity], group)
         for _ in range(refinement.bit_length() - 1):
             mesh.refine()
         if degree == 2:
@@ -618,13 +615,5 @@ def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
             gmsh.option.setNumber("Mesh.SecondOrderLinear", 1)
             mesh.setOrder(2)
             gmsh.option.setNumber("Mesh.SecondOrderLinear", before)
-        tags, places, _ = mesh.getNodes()
-        order = np.argsort(tags)
-        blocks = []
-        for dimension, by_number in entities.items():
-            for number, entity in by_number.items():
-                for elements, nodes in zip(*mesh.getElements(dimension, entity)[1:], strict=True):
-                    rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(elements), -1)
-                    blocks.append(Block(SPLIT[file.kind][dimension][degree], np.full(len(elements), number), rows))
-    points = np.asarray(places, dtype=np.float64).reshape(-1, 3)[order]
+        points, blocks = of_gmsh()
     return assembled(points, blocks, file.names, file.data)

@@ -33,23 +33,31 @@ Body = tuple[Array, Corners]
 ROUND, LONG = 16, 12  # elements around and along, the paper's of its artery
 
 
+def _swept(levels: Array, elements: Corners) -> Body:
+    """Elements of one more dimension between the same mesh at places (levels, nodes, 3)."""
+    near = np.arange(len(levels) - 1)[:, None, None] * levels.shape[1] + elements
+    far = near + levels.shape[1]
+    found = np.concatenate([near, far[..., ::-1] if elements.shape[1] == 2 else far], axis=-1)
+    return _shared(levels.reshape(-1, 3), found.reshape(-1, 2 * elements.shape[1]))
+
+
+def _between(low: Array, high: Array) -> Array:
+    """Places of a mesh at `LONG` + 1 levels, (levels, nodes, 3)."""
+    share = np.linspace(0.0, 1.0, LONG + 1)[:, None, None]
+    return (1.0 - share) * low + share * high
+
+
 def extended(points: Array, lines: Corners, length: float) -> Body:
     """Quadrilaterals of lines across z, from z = 0 to the length."""
-    levels = np.linspace(0.0, length, LONG + 1)
-    found = np.tile(points, (LONG + 1, 1))
-    found[:, 2] = np.repeat(levels, len(points))
-    first = np.arange(LONG)[:, None, None] * len(points) + lines
-    return found, np.concatenate([first, first[..., ::-1] + len(points)], axis=-1).reshape(-1, 4)
+    low = points * [1.0, 1.0, 0.0]
+    return _swept(_between(low, low + [0.0, 0.0, length]), lines)
 
 
 def revolved(points: Array, quadrilaterals: Corners) -> Body:
-    """Hexahedra around the z axis of quadrilaterals in the half-plane y = 0."""
-    angles = 2 * np.pi * np.arange(ROUND) / ROUND
-    radii, z = points[:, 0], np.tile(points[:, 2], ROUND)
-    found = np.stack([np.outer(np.cos(angles), radii).ravel(), np.outer(np.sin(angles), radii).ravel(), z], axis=1)
-    start = np.arange(ROUND)[:, None, None] * len(points)
-    here, next_one = start + quadrilaterals, np.roll(start, -1, axis=0) + quadrilaterals
-    return found, _oriented(found, np.concatenate([here, next_one], axis=-1).reshape(-1, 8))
+    """Hexahedra around the z axis of quadrilaterals in the half-plane y = 0, x before z."""
+    angles = -2 * np.pi * np.arange(ROUND + 1)[:, None] / ROUND  # the volumes of VTK's hexahedra are positive
+    radii, z = points[:, 0], np.broadcast_to(points[:, 2], (ROUND + 1, len(points)))
+    return _swept(np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1), quadrilaterals)
 
 
 def mirrored_twice(points: Array, elements: Corners) -> Body:
@@ -84,11 +92,8 @@ def _oriented(points: Array, elements: Corners) -> Corners:
 
 def divided_along(points: Array, hexahedra: Corners) -> Body:
     """One layer of hexahedra from a bottom to a top face across z, in `LONG` layers."""
-    low, high = points[hexahedra[:, :4]], points[hexahedra[:, 4:]]
-    share = np.linspace(0.0, 1.0, LONG + 1)[:, None, None, None]
-    levels = (1.0 - share) * low + share * high  # (levels, elements, 4, 3)
-    nodes = np.arange((LONG + 1) * len(hexahedra) * 4).reshape(LONG + 1, -1, 4)
-    return _shared(levels.reshape(-1, 3), np.concatenate([nodes[:-1], nodes[1:]], axis=-1).reshape(-1, 8))
+    low, high = (points[hexahedra[:, side].ravel()] for side in (slice(4), slice(4, 8)))
+    return _swept(_between(low, high), np.arange(len(low)).reshape(-1, 4))
 
 
 def box(*sides: float) -> Body:
