@@ -11,8 +11,9 @@ import gmsh  # here, for a child that has begun to read imports no library any m
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.mesh_file import TAGS, WEDGE, Array, Block, as_arrays
+from remodel_fenicsx.body.mesh_file import TAGS, WEDGE, Block, as_arrays
 from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.model.tensors import Array
 
 _FORMAT = re.compile(rb"\$MeshFormat\s+(2\.2|4\.1) 0 \d+\s+\$EndMeshFormat")
 _SECTION = re.compile(rb"^\$(\w+)\s*?\n(.*?)^\$End\1\b", re.DOTALL | re.MULTILINE)

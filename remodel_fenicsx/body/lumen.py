@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
@@ -18,15 +17,13 @@ from remodel_fenicsx.body.mesh_file import ORDERS, in_place, split_quads, split_
 from remodel_fenicsx.body.surface_file import SURFACES, Surface, triangles_of
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.system.children import DAMAGED, made_apart
 from remodel_fenicsx.system.files import write_new
 from remodel_fenicsx.system.terminal import announce
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 LARGE_SURFACE = 200_000  # triangles of which Gmsh divides 6,000 a second
 SHARP = 60.0  # degrees between two triangles from which on Gmsh keeps an edge between them
@@ -242,7 +239,7 @@ def _in_planes(vectors: Array, points: Array, openings: Sequence[Integers]) -> A
         nodes = np.unique(rim)
         across = np.linalg.svd(points[nodes] - points[nodes].mean(axis=0))[2][2]
         found[nodes] -= np.outer(found[nodes] @ across, across)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def _smoothed(normals: Array, surface: Surface, openings: Sequence[Integers]) -> Array:
@@ -368,7 +365,7 @@ def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) 
         raise SceneError(f"--thickness {said}: allowed is a number above 0, or an array at the points: {known}")
     if not ((surface.arrays[said] > 0) & np.isfinite(surface.arrays[said])).all():
         raise SceneError(f"--thickness {said}: this array has values that are not above 0, or not finite")
-    return np.asarray(surface.arrays[said], dtype=np.float64)
+    return surface.arrays[said]
 
 
 def _positive(text: str) -> float | None:

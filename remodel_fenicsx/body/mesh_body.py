@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
@@ -21,7 +20,6 @@ from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
     READERS,
     TAGS,
-    Array,
     MeshFile,
     assembled,
     distinct,
@@ -33,6 +31,7 @@ from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_col
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
@@ -130,16 +129,15 @@ def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], the
 class FileBody(WithRegions, FromFile):
     """A body whose mesh, faces and regions are those of a file."""
 
-    supported_faces: ClassVar[tuple[str, ...] | None] = None
+    supported_faces = None
     thickness_in_words: ClassVar[str] = "cube root of the volume"
 
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
-        description=(
-            "The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`, `.stl`, "
-            "`.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."
-        ),
-        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"},
+        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"}
     )
+    """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
+    `.stl`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your
+    own)."""
     tags: str | None = Field(
         default=None,
         min_length=1,
@@ -148,40 +146,28 @@ class FileBody(WithRegions, FromFile):
         json_schema_extra={"allowed": "the name of an array"},
     )
     file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
-        default=None,
-        description="Unit of the numbers in the file, where it differs from `length_unit`.",
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))},
+        default=None, json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))}
     )
+    """Unit of the numbers in the file, where it differs from `length_unit`."""
     faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={},
-        description=(
-            "Names of faces, each with the name or number of a face in the file, or a list of them: `inner`, `outer`, "
-            "`inlet` and `outlet` where the file has other names, and more for supports and loads. A surface of its "
-            'own is a face too: `{ file = "lumen.vtp" }`.'
-        ),
-        json_schema_extra=_GROUPS,
+        default={}, json_schema_extra=_GROUPS
     )
+    """Names of faces, each with the name or number of a face in the file, or a list of them:
+    `inner`, `outer`, `inlet` and `outlet` where the file has other names, and more for supports
+    and loads. A surface of its own is a face too: `{ file = "lumen.vtp" }`."""
     regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={},
-        description=(
-            "Names of regions, each with the name or number of a volume in the file, or a list of them."
-            " Default: the names in the file."
-        ),
-        json_schema_extra=_GROUPS,
+        default={}, json_schema_extra=_GROUPS
     )
-    open_boundary: bool = Field(
-        default=False,
-        description=(
-            "Whether parts of the boundary may belong to no face. Without it such a part is taken for a"
-            " hole and refused."
-        ),
-    )
+    """Names of regions, each with the name or number of a volume in the file, or a list of
+    them. Default: the names in the file."""
+    open_boundary: bool = False
+    """Whether parts of the boundary may belong to no face. Without it such a part is taken for
+    a hole and refused."""
     sha256: str | None = Field(
-        default=None,
-        pattern="^[0-9a-f]{64}$",
-        description="SHA-256 of the file, of several files together. A scene as run has it, and refuses others.",
-        json_schema_extra={"allowed": "64 hexadecimal digits"},
+        default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
     )
+    """SHA-256 of the file, of several files together. A scene as run has it, and refuses
+    others."""
 
     @model_validator(mode="before")
     @classmethod
@@ -427,7 +413,7 @@ NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to
 def _angle_at(face: str) -> AngleOf:
     """Mean angle over the elements that have a facet on a face."""
 
-    def elements(m: Any) -> NDArray[np.bool_]:
+    def elements(m: Any) -> Flags:
         from remodel_fenicsx.body.axes import facets_of
         from remodel_fenicsx.body.domain import cells_of
 
@@ -437,7 +423,7 @@ def _angle_at(face: str) -> AngleOf:
 
     def value(m: Any, angle: Array) -> float:
         chosen = m.tool(("elements at", face), lambda: elements(m))
-        return float(m.quadrature.mean_of_known(angle, chosen))
+        return m.quadrature.mean_of_known(angle, chosen)
 
     return value
 
@@ -445,14 +431,14 @@ def _angle_at(face: str) -> AngleOf:
 def _middle_angle(m: Any, angle: Array) -> float:
     """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
 
-    def elements() -> NDArray[np.bool_]:
+    def elements() -> Flags:
         from remodel_fenicsx.fem.compat import geometry_dofmap
 
         depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
         low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
-        return np.asarray((low <= 0.5) & (high >= 0.5), dtype=np.bool_)
+        return (low <= 0.5) & (high >= 0.5)
 
-    return float(m.quadrature.mean_of_known(angle, m.tool("middle elements", elements)))
+    return m.quadrature.mean_of_known(angle, m.tool("middle elements", elements))
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
@@ -474,9 +460,9 @@ class WalledMesh(Walled):
         *stress_columns(MEANS_ON_A_MESH),
         *Walled.columns_on_request,
     )
-    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
-    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
-    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
+    axis_kinds = ("local", "global")
+    constant_fields = CONSTANT_FIELDS
+    defaults = {"cells": {"axes": "local"}}
 
     def log_of_radii(self, wall: Any) -> float | None:
         """Faces are as their radii; None if the wall does not go around."""
@@ -502,7 +488,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
     all of one kind. A run keeps a copy of the file.
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {
+    loads = {
         "pressure": LoadKind(
             lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
             "pressure on the deformed inner face",
@@ -515,7 +501,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
             above=-1.0,
         ),
     }
-    columns: ClassVar[tuple[Column, ...]] = (
+    columns = (
         Column(
             "lumen_volume",
             "length^3",
@@ -524,7 +510,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         ),
         *WalledMesh.columns,
     )
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
+    columns_on_request = (
         Column(
             "outer_area",
             "length^2",
@@ -533,10 +519,11 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         ),
         *WalledMesh.columns_on_request,
     )
-    face_names: ClassVar[tuple[str, ...]] = ROLES
-    thickness_in_words: ClassVar[str] = "mean thickness of the wall"
+    face_names = ROLES
+    thickness_in_words = "mean thickness of the wall"
 
-    shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
+    shape: Literal["mesh"] = "mesh"
+    """Which body it is."""
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
         """Whether inner and outer have each other's names."""
@@ -561,8 +548,8 @@ class Solid(FileBody):
     Its faces have any names; each that is held has a table `[supports.NAME]`. Directions are those of x, y and z.
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {}
-    columns: ClassVar[tuple[Column, ...]] = (
+    loads = {}
+    columns = (
         Column(
             "fibre_angle",
             "degrees",
@@ -571,12 +558,14 @@ class Solid(FileBody):
         ),
         Column("volume", "length^3", "deformed volume", lambda m: m.quadrature.integral(np.linalg.det(m.F))),
     )
-    columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
-    angle_in_words: ClassVar[tuple[str, str]] = ("along the axis", "across")
-    depth_in_words: ClassVar[tuple[str, str, str]] = ("in the body", "", "")
+    columns_on_request = cauchy_columns("x", "y", "z")
+    angle_in_words = ("along the axis", "across")
+    depth_in_words = ("in the body", "", "")
 
-    shape: Literal["solid"] = Field(default="solid", description="Which body it is.")
-    axis: Literal["x", "y", "z"] = Field(default="x", description="The axis to which fibre angles are measured.")
+    shape: Literal["solid"] = "solid"
+    """Which body it is."""
+    axis: Literal["x", "y", "z"] = "x"
+    """The axis to which fibre angles are measured."""
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
         """To `axis`."""

@@ -19,9 +19,10 @@ from remodel_fenicsx.body.axes import facets_of, harmonic, slopes
 from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, symbolic_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
+from remodel_fenicsx.body.mesh_file import MeshFile
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import agreed, over_ranks
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
 
@@ -85,7 +86,7 @@ class MeshDomain(Domain):
 
     def middle(self, face: str) -> Array:
         """Mean of the places of a named face, (3,)."""
-        return np.asarray(np.concatenate([part.places for part in self.parts if part.name == face]).mean(axis=0))
+        return np.concatenate([part.places for part in self.parts if part.name == face]).mean(axis=0)
 
     @property
     def thickness(self) -> float:

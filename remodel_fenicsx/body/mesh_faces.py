@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, as_rows, distinct, in_place
+from remodel_fenicsx.body.mesh_file import MeshFile, as_rows, distinct, in_place
 from remodel_fenicsx.errors import UnreadableFile
-from remodel_fenicsx.model.tensors import det
+from remodel_fenicsx.model.tensors import Array, Flags, Integers, det
 
 dolfinx, basix = Late("dolfinx"), Late("basix")
 
@@ -119,11 +118,11 @@ def groups_inside(file: MeshFile) -> set[int]:
     return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if corners not in outside}
 
 
-def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> NDArray[np.bool_]:
+def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flags:
     """Which elements or facets of other groups are also in groups of these numbers, (rows,)."""
     chosen = np.isin(groups, list(numbers))
     _, which = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
-    return np.asarray(~chosen & np.isin(which.reshape(-1), which.reshape(-1)[chosen]))
+    return ~chosen & np.isin(which.reshape(-1), which.reshape(-1)[chosen])
 
 
 def through_the_wall(boundary: Boundary) -> bool:
@@ -161,9 +160,9 @@ def cap_vector(points: Array, rim: Integers) -> Array:
     """Integral of x cross dx / 2 along a closed line of straight or parabolic edges: area times normal of a cap."""
     a, b = points[rim[:, 0]], points[rim[:, 1]]
     if rim.shape[1] == 2:
-        return np.asarray(np.cross(a, b).sum(axis=0) / 2)
+        return np.cross(a, b).sum(axis=0) / 2
     m = points[rim[:, 2]]
-    return np.asarray((4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6)
+    return (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6
 
 
 def cap_volume(points: Array, rim: Integers) -> float:
@@ -237,10 +236,10 @@ def jacobian_determinants(file: MeshFile) -> Array:
     slopes = table[1:, :, :, 0]  # (3, points, nodes)
     nodes = file.points[file.cells[:, node_order(file)]]
     jacobians = np.tensordot(nodes, slopes, axes=(1, 2))  # (elements, coordinates, directions, points)
-    return np.asarray(det(np.moveaxis(jacobians, 3, 1)))
+    return det(np.moveaxis(jacobians, 3, 1))
 
 
-def node_order(file: MeshFile) -> NDArray[np.int64]:
+def node_order(file: MeshFile) -> Integers:
     """dolfinx's order of an element's nodes, as places in Gmsh's."""
     kind = getattr(dolfinx.mesh.CellType, file.kind)
     return np.asarray(dolfinx.cpp.io.perm_gmsh(kind, file.cells.shape[1]), dtype=np.int64)
@@ -249,8 +248,8 @@ def node_order(file: MeshFile) -> NDArray[np.int64]:
 def area_vectors(places: Array) -> Array:
     """Area times normal of facets at (facets, 3 or 4, 3): half the cross product of two edges, or of the diagonals."""
     if places.shape[1] == 3:
-        return np.asarray(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2)
-    return np.asarray(np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2)
+        return np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2
+    return np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2
 
 
 def _middle(file: MeshFile, cell: Any, pair: Any) -> int:

@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.surface_file import of_vtk, triangles_of, vtk_arrays
 from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.system.children import DAMAGED, read_guarded
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # by meshio's names of types of elements
 VOLUMES = {
@@ -313,7 +312,7 @@ def split_wedges(nodes: Integers) -> Integers:
     rows = np.arange(len(nodes))
     seen = nodes[rows[:, None], _SEEN[nodes.argmin(axis=1)]]
     other = np.minimum(seen[:, 1], seen[:, 5]) < np.minimum(seen[:, 2], seen[:, 4])
-    return np.asarray(seen[rows[:, None, None], _SPLIT[other.astype(int)]])
+    return seen[rows[:, None, None], _SPLIT[other.astype(int)]]
 
 
 def split_quads(nodes: Integers) -> Integers:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import LARGEST_MESH
 
 
@@ -26,14 +26,12 @@ from remodel_fenicsx.schema.settings import LARGEST_MESH
 # Whole bodies for pictures, from the meshes of reductions: extended, revolved or mirrored.
 #  Meshes are points (n, 3) and the corners of the elements (m, 2, 4 or 8) in VTK's order.
 
-Array = NDArray[np.float64]
-Corners = NDArray[np.int64]
-Body = tuple[Array, Corners]
+Body = tuple[Array, Integers]
 
 ROUND, LONG = 16, 12  # elements around and along, the paper's of its artery
 
 
-def _swept(levels: Array, elements: Corners) -> Body:
+def _swept(levels: Array, elements: Integers) -> Body:
     """Elements of one more dimension between the same mesh at places (levels, nodes, 3)."""
     near = np.arange(len(levels) - 1)[:, None, None] * levels.shape[1] + elements
     far = near + levels.shape[1]
@@ -47,20 +45,20 @@ def _between(low: Array, high: Array) -> Array:
     return (1.0 - share) * low + share * high
 
 
-def extended(points: Array, lines: Corners, length: float) -> Body:
+def extended(points: Array, lines: Integers, length: float) -> Body:
     """Quadrilaterals of lines across z, from z = 0 to the length."""
     low = points * [1.0, 1.0, 0.0]
     return _swept(_between(low, low + [0.0, 0.0, length]), lines)
 
 
-def revolved(points: Array, quadrilaterals: Corners) -> Body:
+def revolved(points: Array, quadrilaterals: Integers) -> Body:
     """Hexahedra around the z axis of quadrilaterals in the half-plane y = 0, x before z."""
     angles = -2 * np.pi * np.arange(ROUND + 1)[:, None] / ROUND  # the volumes of VTK's hexahedra are positive
     radii, z = points[:, 0], np.broadcast_to(points[:, 2], (ROUND + 1, len(points)))
     return _swept(np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1), quadrilaterals)
 
 
-def mirrored_twice(points: Array, elements: Corners) -> Body:
+def mirrored_twice(points: Array, elements: Integers) -> Body:
     """The quarter x > 0, y > 0 and its images in the planes x = 0 and y = 0; nodes on the planes are shared."""
     signs = np.array([(1.0, 1.0, 1.0), (-1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, 1.0)])
     every = (np.arange(4)[:, None, None] * len(points) + elements).reshape(-1, elements.shape[1])
@@ -68,7 +66,7 @@ def mirrored_twice(points: Array, elements: Corners) -> Body:
     return points, _oriented(points, elements)
 
 
-def _shared(points: Array, elements: Corners) -> Body:
+def _shared(points: Array, elements: Integers) -> Body:
     """Nodes at one place become one."""
     places = np.rint(points / (1e-7 * np.abs(points).max())).astype(np.int64)
     _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
@@ -83,14 +81,14 @@ _SIDES = {
 _MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}
 
 
-def _oriented(points: Array, elements: Corners) -> Corners:
+def _oriented(points: Array, elements: Integers) -> Integers:
     """The same hexahedra or tetrahedra, all of positive volume as VTK has them."""
     size = elements.shape[1]
     is_mirrored = np.linalg.det(np.array(_SIDES[size], dtype=np.float64) @ points[elements]) < 0
     return np.where(is_mirrored[:, None], elements[:, _MIRRORED[size]], elements)
 
 
-def divided_along(points: Array, hexahedra: Corners) -> Body:
+def divided_along(points: Array, hexahedra: Integers) -> Body:
     """One layer of hexahedra from a bottom to a top face across z, in `LONG` layers."""
     low, high = (points[hexahedra[:, side].ravel()] for side in (slice(4), slice(4, 8)))
     return _swept(_between(low, high), np.arange(len(low)).reshape(-1, 4))
@@ -127,7 +125,7 @@ class Strut:
 
 
 Rule = Callable[[Any], str | None]
-Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Turn = Callable[[Array], Array]
 POINTS = {
     ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
     ("hexahedron", 1): 8, ("hexahedron", 2): 27, ("tetrahedron", 1): 1, ("tetrahedron", 2): 4,
@@ -169,7 +167,7 @@ class Reduction:
     elements: Callable[[Any], int]
     rules: tuple[Rule, ...]
     turn: Turn
-    whole: Callable[[Any, NDArray[np.float64], Corners], Body] | None = None
+    whole: Callable[[Any, Array, Integers], Body] | None = None
     in_the_mean: tuple[Rule, ...] = ()
 
 
@@ -305,13 +303,13 @@ def _leaves_symmetry(scene: Any) -> str:
 
 
 # ---------------------------------------------------------------- where the body's places are in the reduction
-def about_z(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def about_z(places: Array) -> Array:
     """x, y, z become the radial, circumferential and axial direction."""
     circumferential, axial, radial = np.moveaxis(cylindrical_axes(places), -2, 0)
     return np.stack([radial, circumferential, axial], axis=-1)
 
 
-def mirrored(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def mirrored(places: Array) -> Array:
     """The quarter x > 0, y > 0 becomes each of the four."""
     signs = np.where(places < -1e-9 * np.abs(places).max(), -1.0, 1.0)
     signs[:, 2] = 1.0

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field
 
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis, global_axes
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import (
     NAME,
     TURNOVER_POWER,
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
 
 # ---------------------------------------------------------------- the columns of a history
 # Those of every shape, those on request, and which a scene has.
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -121,7 +118,7 @@ def profile_weights(depth: Array) -> Array:
 
 def _profile(number: int, m: Any) -> float:
     hats = m.tool("hats", lambda: profile_weights(m.state.cells.local_axes.depth))
-    return float(m.quadrature.mean_of_known(m.fibre_angle, hats[..., number]))
+    return m.quadrature.mean_of_known(m.fibre_angle, hats[..., number])
 
 
 _PROFILE_COLUMNS = tuple(
@@ -147,14 +144,14 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
             f"fibre_angle_{name}",
             "degrees",
             f"mean reference fibre angle in the region `{name}`",
-            lambda m: float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name))),
+            lambda m: m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name)),
             by_case=False,
         ),
         Column(
             f"max_chain_extension_{name}",
             "",
             f"largest r/L in the region `{name}`",
-            lambda m: float(m.quadrature.maximum(m.chain_extension * m.elements_of_region(name)[:, None])),
+            lambda m: m.quadrature.maximum(m.chain_extension * m.elements_of_region(name)[:, None]),
             extreme=True,
         ),
     )
@@ -255,7 +252,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "growth",
             "",
             "volume of the tissue free of stress over that at the start; mean over the volume at the start",
-            lambda m: float(m.quadrature.mean(m.observer.stepper.turnover.growth.ratio)),
+            lambda m: m.quadrature.mean(m.observer.stepper.turnover.growth.ratio),
             by_case=False,
         ),
         Column(
@@ -552,7 +549,8 @@ class Shape(_Is):  # type: ignore[misc]
     defaults: ClassVar[dict[str, Any]] = {}
     supported_faces: ClassVar[tuple[str, ...] | None] = ()
 
-    shape: str = Field(description="Which body it is.")
+    shape: str
+    """Which body it is."""
     length_unit: LengthUnit = None
 
     @property
@@ -601,7 +599,7 @@ class Shape(_Is):  # type: ignore[misc]
         coordinates
             Reference places, (..., 3), in the unit of length.
         """
-        return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
+        return self.station(coordinates)
 
     def station(self, coordinates: Array) -> Array:
         """How far places (..., 3) are along the body, from 0 to 1: here along z.
@@ -611,7 +609,8 @@ class Shape(_Is):  # type: ignore[misc]
         coordinates
             Reference places, (..., 3), in the unit of length.
         """
-        return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
+        found: Array = coordinates[..., 2] / self.axial_length
+        return found
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
         """Axes, depth and station at the points of a mesh of the body: here functions of the place.
@@ -940,7 +939,7 @@ def cauchy_columns(*names: str) -> tuple[Column, ...]:
 
     def mean(name: str, m: Any) -> float:
         row, column = "xyz".index(name[0]), "xyz".index(name[-1])
-        return float(m.quadrature.mean(m.stress[..., row, column]))
+        return m.quadrature.mean(m.stress[..., row, column])
 
     return tuple(
         Column(f"cauchy_stress_{name}", "stress", f"Cauchy stress {name}, volume mean", partial(mean, name))

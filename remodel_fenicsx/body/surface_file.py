@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.system.children import read_guarded
 
 ARRAY = "array "  # before the name of an array that a child hands over
@@ -21,9 +21,9 @@ SURFACES = (".vtp", ".stl", ".obj")  # endings
 class Surface(NamedTuple):
     """Triangles whose normals point out of the lumen, and arrays of numbers at their corners."""
 
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    arrays: dict[str, NDArray[np.float64]]
+    points: Array
+    triangles: Integers
+    arrays: dict[str, Array]
 
 
 def triangles_of(path: Path) -> tuple[Surface, bytes]:
