@@ -11,18 +11,13 @@ import gmsh  # here, for a child that has begun to read imports no library any m
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.mesh_file import TAGS, WEDGE, Block, as_arrays
+from remodel_fenicsx.body.mesh_file import KINDS, TAGS, Block, as_arrays
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array
 
 _FORMAT = re.compile(rb"\$MeshFormat\s+(2\.2|4\.1) 0 \d+\s+\$EndMeshFormat")
 _SECTION = re.compile(rb"^\$(\w+)\s*?\n(.*?)^\$End\1\b", re.DOTALL | re.MULTILINE)
 _TAGS = re.compile(rb"(?m)^[ \t]*\d+([ \t]+\d+[ \t]+\d+[ \t]+(\d+)[ \t]+)\d+(?=[ \t])")
-# by Gmsh's numbers of types of elements
-KINDS = {
-    15: "vertex", 1: "line", 8: "line3", 2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
-    4: "tetra", 11: "tetra10", 5: "hexahedron", 12: "hexahedron27", 6: WEDGE,
-}  # fmt: skip
 
 
 def arrays_msh(file: str) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +12,7 @@ import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
-from remodel_fenicsx.body.mesh_file import ORDERS, in_place, split_quads, split_wedges
+from remodel_fenicsx.body.mesh_file import ORDERS, Block, gmsh_text, in_place, split_quads, split_wedges
 from remodel_fenicsx.body.surface_file import SURFACES, Surface, triangles_of
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
@@ -269,8 +268,6 @@ def write_wall(
     surface: Path, path: Path, thickness: str | None, layers: Sequence[str], size: float, through: int
 ) -> list[str]:
     """Make the mesh of a wall and write it, a new file; what is in it, in lines."""
-    import meshio
-
     if path.suffix.lower() != ".msh":
         raise SceneError(f"-o {path}: allowed is a file that ends with .msh")
     if path.exists():
@@ -296,17 +293,11 @@ def write_wall(
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
     names = list(shares) or ["wall"]
-    groups = {name: (number, 2) for number, name in enumerate(wall.faces, 1)}
-    groups |= {name: (len(wall.faces) + number, 3) for number, name in enumerate(names, 1)}
-    tags = [np.full(len(face), groups[name][0]) for name, face in wall.faces.items()] + [
-        len(wall.faces) + 1 + wall.layers
-    ]
-    cells = [("triangle6", face) for face in wall.faces.values()] + [("tetra10", wall.tetrahedra)]
-    data: Any = {"gmsh:physical": tags, "gmsh:geometrical": tags}
-    mesh = meshio.Mesh(wall.points, cells, cell_data=data, field_data={k: np.array(v) for k, v in groups.items()})
-    with tempfile.TemporaryDirectory() as folder:
-        mesh.write(Path(folder) / "wall.msh", file_format="gmsh22", binary=False)
-        write_new(path, (Path(folder) / "wall.msh").read_bytes())
+    of_names = {2: {name: number for number, name in enumerate(wall.faces, 1)}}
+    of_names[3] = {name: number for number, name in enumerate(names, len(wall.faces) + 1)}
+    blocks = [Block("triangle6", np.full(len(face), of_names[2][name]), face) for name, face in wall.faces.items()]
+    blocks += [Block("tetra10", len(wall.faces) + 1 + wall.layers, wall.tetrahedra[:, ORDERS["tetra10"]])]
+    write_new(path, gmsh_text(wall.points, blocks, of_names).encode())
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))
     nodes = np.unique(outer)
     between = np.linalg.norm(wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1)

@@ -119,8 +119,6 @@ def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], the
         if number not in there:
             listed = [*map(repr, names), *(str(other) for other in sorted(there - set(names.values())))]
             rule = f"the file has no such {word}; it has {', '.join(listed) or 'none'}"
-            if number in names.values():
-                rule = f"this {word} of the file has no elements"
             raise SceneError(f"geometry.{kind}s.{name} = {shown(entry)}: {rule}")
         found.append(int(number))
     return found
@@ -240,7 +238,7 @@ class FileBody(WithRegions, FromFile):
             limits = f"allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, geometry.length_unit)"
             raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
         try:
-            boundary = mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
+            boundary = self._boundary(file)
         except mesh_faces.FaceError as error:
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
         except UnreadableFile as error:
@@ -262,7 +260,7 @@ class FileBody(WithRegions, FromFile):
         file = refined(file, mesh.refinement, mesh.degree)
         words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
-        return file, mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
+        return file, self._boundary(file)
 
     def _read(self) -> MeshFile:
         try:
@@ -282,25 +280,14 @@ class FileBody(WithRegions, FromFile):
         entry: Names = self.faces.get(face, (face,))
         return entry[0] if len(entry) == 1 else list(entry)
 
-    def _groups(self, file: MeshFile) -> dict[str, tuple[int, ...]]:
-        """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
+    def _boundary(self, file: MeshFile) -> mesh_faces.Boundary:
+        """With the faces of the body, and further named ones of the file under their own names."""
         names, there = file.names[2], set(distinct(file.facet_groups)) - {0}
         asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*self.face_names, *self.faces])}
-        groups = {face: tuple(_numbers("face", face, entries, names, there)) for face, entries in asked.items()}
-        taken = {number for numbers in groups.values() for number in numbers}
-        others = {name: number for name, number in names.items() if number in there and number not in taken}
-        left = mesh_faces.groups_inside(file) if others else set()
-        for name, number in others.items():
-            if name in groups or number in left:
-                continue
-            if number in file.facet_groups[mesh_faces.again(file.facets, file.facet_groups, taken)]:
-                log.info(
-                    "face %r of the file shares facets with others, and the scene does not name it: left out", name
-                )
-            else:
-                groups[name] = (number,)
-                taken.add(number)
-        return groups
+        groups = {face: _numbers("face", face, entries, names, there) for face, entries in asked.items()}
+        taken = set(itertools.chain.from_iterable(groups.values()))
+        others = {name: [n] for name, n in names.items() if n in there - taken and name not in groups}
+        return mesh_faces.boundary_of(file, groups, self.open_boundary, others)
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
         numbers = distinct(file.cell_groups)

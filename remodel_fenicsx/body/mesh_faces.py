@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from remodel_fenicsx.body.mesh_file import MeshFile, as_rows, distinct, in_place
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Flags, Integers, det
 
+log = logging.getLogger(__name__)
 dolfinx, basix = Late("dolfinx"), Late("basix")
 
 # corners of the facets of an element and of the edges around a facet, in Gmsh's order; the normals point outwards
@@ -70,32 +73,37 @@ class Boundary:
         return sum(face.area for face in self.parts(name))
 
 
-def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary:
-    """Find the named faces on the boundary of the one body that a file holds."""
+def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Groups = MappingProxyType({})) -> Boundary:
+    """Find the named faces on the boundary of the one body that a file holds, and others where they are faces."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
     normals = area_vectors(places)
     owner = np.full(len(facets), "", dtype=object)
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
-    for name, numbers in groups.items():
-        chosen = np.isin(file.facet_groups, numbers)
-        for key in as_rows(np.sort(file.facets[chosen], axis=1)):
-            row = index.get(key)
-            if row is None or owner[row] not in ("", name):
-                words = "has facets that are no facets of its elements"
-                if row is not None:
-                    words = f"shares facets with the face {owner[row]!r}"
-                elif key in as_rows(np.sort(twice, axis=1)):
-                    words = "has facets inside the body"
-                raise FaceError(name, f"{words}, the first at {in_place(file.points[list(key)].mean(axis=0))}")
-            owner[row] = name
+    for name, numbers in (*groups.items(), *others.items()):
+        keys = as_rows(np.sort(file.facets[np.isin(file.facet_groups, numbers)], axis=1))
+        found: list[Any] = [index.get(key) for key in keys]
+        for key, row in zip(keys, found, strict=True):
+            if row is not None and owner[row] in ("", name):
+                continue
+            if name in others:
+                log.info("face %r of the file is inside, or shares facets with others: left out", name)
+                break
+            words = "has facets that are no facets of its elements"
+            if row is not None:
+                words = f"shares facets with the face {owner[row]!r}"
+            elif key in as_rows(np.sort(twice, axis=1)):
+                words = "has facets inside the body"
+            raise FaceError(name, f"{words}, the first at {in_place(file.points[list(key)].mean(axis=0))}")
+        else:
+            owner[found] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
         where, share = in_place(places[bare][0].mean(axis=0)), bare.sum()
         rule = f"{share} of {len(bare)} facets of the boundary are in no face of geometry.faces, the first at {where}"
         raise UnreadableFile(rule + "; if that is meant: geometry.open_boundary = true")
     faces = []
-    for name in groups:
+    for name in (*groups, *others):
         rows = np.flatnonzero(owner == name)
         label = components(facets[rows], len(file.points))
         for one in distinct(label):
@@ -110,12 +118,6 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
             faces.append(Face(name, part, middles, units, float(size.sum()), normal, centre, places[part]))
     volume = float(np.einsum("fi,fi->", places.mean(axis=1), normals) / 3)
     return Boundary(facets, cell, faces, volume)
-
-
-def groups_inside(file: MeshFile) -> set[int]:
-    """Numbers of the named faces with facets that are not on the boundary: between regions, say."""
-    outside, rows = set(as_rows(np.sort(_facets(file)[0], axis=1))), as_rows(np.sort(file.facets, axis=1))
-    return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if corners not in outside}
 
 
 def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flags:

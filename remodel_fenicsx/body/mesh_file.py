@@ -13,7 +13,7 @@ import importlib
 import itertools
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -39,6 +39,11 @@ VOLUMES = {
 FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of facets
 WEDGE = "wedge"
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27, wedges of 6"
+# by Gmsh's numbers of types of elements
+KINDS = {
+    15: "vertex", 1: "line", 8: "line3", 2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
+    4: "tetra", 11: "tetra10", 5: "hexahedron", 12: "hexahedron27", 6: WEDGE,
+}  # fmt: skip
 # Gmsh's order of nodes, as places in VTK's, which meshio has
 # https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering, https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron)
 ORDERS = {
@@ -65,6 +70,13 @@ class MeshFile:
     data: bytes
     sha256: str
     surfaces: Mapping[str, bytes] = MappingProxyType({})
+
+    @property
+    def blocks(self) -> list[Block]:
+        """Facets by their corners, and elements."""
+        (kind,) = (name for name, of_kind in VOLUMES.items() if of_kind == (self.kind, self.degree))
+        side = "triangle" if self.kind == "tetrahedron" else "quad"
+        return [Block(side, self.facet_groups, self.facets), Block(kind, self.cell_groups, self.cells)]
 
     @property
     def corners(self) -> Integers:
@@ -382,3 +394,21 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
         data,
         hashlib.sha256(data).hexdigest(),
     )
+
+
+def gmsh_text(points: Array, blocks: Iterable[Block], names: Mapping[int, Mapping[str, int]]) -> str:
+    """A mesh as the text of a Gmsh file, format 2.2; nodes have the numbers 1, 2, ... in their order."""
+    numbers = {kind: number for number, kind in KINDS.items()}
+    groups = [f'{dimension} {number} "{name}"' for dimension, by in names.items() for name, number in by.items()]
+    places = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points]
+    rows = [
+        f"{numbers[kind]} 2 {group} {group} {' '.join(map(str, row))}"
+        for kind, of_rows, nodes in blocks
+        for group, row in zip(of_rows, as_rows(nodes + 1), strict=True)
+    ]
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(groups)), *groups]
+    lines += ["$EndPhysicalNames"]
+    for section, found in (("Nodes", places), ("Elements", rows)):
+        listed = (f"{number} {row}" for number, row in enumerate(found, start=1))
+        lines += [f"${section}", str(len(found)), *listed, f"$End{section}"]
+    return "\n".join([*lines, ""])

@@ -609,7 +609,7 @@ class Shape(_Is):  # type: ignore[misc]
         coordinates
             Reference places, (..., 3), in the unit of length.
         """
-        found: Array = coordinates[..., 2] / self.axial_length
+        found: Any = coordinates[..., 2] / self.axial_length
         return found
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:

@@ -502,8 +502,6 @@ class Scene(Table):
         turnover = self.remodeling.turnover
         if turnover.is_on:
             parts.append(f"turnover with rates = {turnover.rates!r} and volume = {turnover.volume:g}")
-            if not {"rates", "volume"} & turnover.model_fields_set:
-                parts[-1] += " by default; in 0.3.0 'tension' and 0"
         return "; ".join(parts)
 
     def warnings(self, wall: Any = None) -> list[str]:
