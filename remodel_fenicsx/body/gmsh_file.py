@@ -11,7 +11,7 @@ import gmsh  # here, for a child that has begun to read imports no library any m
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.mesh_file import KINDS, TAGS, Block, as_arrays
+from remodel_fenicsx.body.mesh_file import GMSH_KINDS, TAGS, Block, as_arrays
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array
 
@@ -56,7 +56,7 @@ def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
             continue
         groups: list[int] = [*model.getPhysicalGroupsForEntity(dimension, entity)]
         for kind, numbers, nodes in zip(*model.mesh.getElements(dimension, entity), strict=True):
-            name = KINDS.get(kind) or model.mesh.getElementProperties(kind)[0]
+            name = GMSH_KINDS.get(kind) or model.mesh.getElementProperties(kind)[0]
             rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(numbers), -1)
             found.setdefault(name, []).extend((numbers, np.full(len(rows), group), rows) for group in groups or [0])
     blocks = []

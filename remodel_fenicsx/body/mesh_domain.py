@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import dolfinx.fem
+import dolfinx.graph
+import dolfinx.io
 import dolfinx.mesh
 import numpy as np
 import ufl
@@ -16,7 +18,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.axes import facets_of, harmonic, slopes
-from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, symbolic_mesh
+from remodel_fenicsx.body.domain import Domain, cells_of, symbolic_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.body.mesh_file import MeshFile
@@ -103,7 +105,7 @@ def shared(
     mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
     faces = {name: number for number, name in enumerate(dict.fromkeys(part.name for part in parts), start=1)}
     values = np.repeat([faces[part.name] for part in parts], [len(part.facets) for part in parts])
-    tags = _tags_of_facets(mesh, np.sort(facets[np.concatenate([part.facets for part in parts])], axis=1), values)
+    tags = _tags_of_facets(mesh, facets[np.concatenate([part.facets for part in parts])], values)
     domain = MeshDomain(
         mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), parts, {}, lines, volume
     )
@@ -116,16 +118,13 @@ def shared(
 
 
 def _tags_of_facets(mesh: Any, corners: Integers, values: Integers) -> Any:
-    """Tags of the facets of the boundary with these corners, as rank 0 numbered them, each row ascending."""
-    dimension = mesh.topology.dim - 1
-    mesh.topology.create_connectivity(dimension, dimension + 1)
-    facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology)).astype(np.int32)
-    listed: Any = corners.tolist()
-    wanted = dict(zip(map(tuple, listed), values.astype(int), strict=True))
-    nodes = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[corners_of(mesh, facets)]
-    rows: Any = np.sort(nodes, axis=1).tolist()
-    found = np.array([wanted.get(tuple(row), 0) for row in rows], dtype=np.int32)
-    return dolfinx.mesh.meshtags(mesh, dimension, facets[found > 0], found[found > 0])
+    """Tags of the facets with these corners, as rank 0 numbered the nodes. Collective."""
+    dimension, here = mesh.topology.dim - 1, slice(None) if mesh.comm.rank == 0 else slice(0)
+    for other in (0, dimension + 1):
+        mesh.topology.create_connectivity(dimension, other)
+    listed = corners[here].astype(np.int64), values[here].astype(np.int32)
+    entities, found = dolfinx.io.distribute_entity_data(mesh, dimension, *listed)
+    return dolfinx.mesh.meshtags_from_entities(mesh, dimension, dolfinx.graph.adjacencylist(entities), found)
 
 
 # ---------------------------------------------------------------- supports of faces

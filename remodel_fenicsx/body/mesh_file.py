@@ -40,7 +40,7 @@ FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 
 WEDGE = "wedge"
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27, wedges of 6"
 # by Gmsh's numbers of types of elements
-KINDS = {
+GMSH_KINDS = {
     15: "vertex", 1: "line", 8: "line3", 2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
     4: "tetra", 11: "tetra10", 5: "hexahedron", 12: "hexahedron27", 6: WEDGE,
 }  # fmt: skip
@@ -398,7 +398,7 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
 
 def gmsh_text(points: Array, blocks: Iterable[Block], names: Mapping[int, Mapping[str, int]]) -> str:
     """A mesh as the text of a Gmsh file, format 2.2; nodes have the numbers 1, 2, ... in their order."""
-    numbers = {kind: number for number, kind in KINDS.items()}
+    numbers = {kind: number for number, kind in GMSH_KINDS.items()}
     groups = [f'{dimension} {number} "{name}"' for dimension, by in names.items() for name, number in by.items()]
     places = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points]
     rows = [

@@ -75,7 +75,7 @@ from remodel_fenicsx.schema.units import (
     LARGEST_NUMBER,
     STRESS,
     STRESS_UNIT,
-    TOO_LARGE,
+    NUMBER_TOO_LARGE,
     scene_units,
 )
 from remodel_fenicsx.system.interrupts import is_first_rank
@@ -669,7 +669,7 @@ def _check_sizes(value: Any, key: str) -> None:
         for name, inner in value.items():
             _check_sizes(inner, f"{key}.{name}" if key else str(name))
     elif is_number(value) and abs(value) > LARGEST_NUMBER:
-        raise fault(TOO_LARGE, key, value)
+        raise fault(NUMBER_TOO_LARGE, key, value)
 
 
 def _check_name(key: str, name: Any, names: Iterable[str]) -> None:

@@ -469,6 +469,11 @@ class Cells(Table):
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
+def _nothing_is_missing(scene: Any) -> str | None:
+    """Of scenes as they are."""
+    return None
+
+
 @dataclass(frozen=True)
 class CouplingKind:
     """How equilibrium and remodeling of one step are coupled, as scenes know it.
@@ -516,7 +521,7 @@ class CouplingKind:
     takes_cases: bool = False
     takes_turnover: bool = False
     solves_cells: bool = False
-    missing: Callable[[Any], str | None] = lambda scene: None
+    missing: Callable[[Any], str | None] = _nothing_is_missing
 
     @property
     def make(self) -> Callable[..., Any]:

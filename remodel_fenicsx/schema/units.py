@@ -28,7 +28,7 @@ STRESS_UNIT, LENGTH_UNIT = "material.stress_unit", "geometry.length_unit"
 _LENGTH_UNITS = Literal["m", "cm", "mm", "um"]
 LENGTH_UNITS: tuple[str, ...] = get_args(_LENGTH_UNITS)
 LARGEST_NUMBER = 1e60  # products of four are no overflow
-TOO_LARGE = f"too large a number; must be at most {LARGEST_NUMBER:g}"
+NUMBER_TOO_LARGE = f"too large a number; must be at most {LARGEST_NUMBER:g}"
 _UNITS: ContextVar[Mapping[str, str | None] | None] = ContextVar(
     "units", default=None
 )  # of the scene that is validated
@@ -118,7 +118,7 @@ class Dimension:
             raise fault(f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value)
         number = float(found[1])  # sorts out the exponents that would make a fraction of a billion digits
         if abs(number) > LARGEST_NUMBER:
-            raise fault(TOO_LARGE, key, value)
+            raise fault(NUMBER_TOO_LARGE, key, value)
         return float(_registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
