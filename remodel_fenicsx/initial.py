@@ -19,7 +19,7 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.measured import Fibres, in_files, measured_fibres, read_fibres
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.scene.scene import in_region
+from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.state import State, UnitCells
 from remodel_fenicsx.system.files import typed
 

@@ -16,8 +16,7 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.scene.scene import in_region
-from remodel_fenicsx.schema.settings import Cells, Turnover
+from remodel_fenicsx.schema.settings import Cells, Turnover, in_region
 
 log = logging.getLogger(__name__)
 

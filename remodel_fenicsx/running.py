@@ -38,7 +38,8 @@ from remodel_fenicsx.results.run_folder import (
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
-from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation, in_region
+from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation
+from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.schema.text import read_toml
 from remodel_fenicsx.initial import checked_domain, mesh_of, with_choices

@@ -582,7 +582,7 @@ def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
 def _with_one_matrix(
     tissues: Mapping[str, Tissue], properties: Mapping[str, Properties], matrices: Sequence[str]
 ) -> dict[str, Tissue]:
-    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # `Properties.check_with` asks
+    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # `rules.tissue_of_regions` asks
     defaults = {name: number.default for name, number in mixture.parameters.items()}
     found = {}
     for name, tissue in tissues.items():

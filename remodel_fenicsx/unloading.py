@@ -20,9 +20,8 @@ from petsc4py import PETSc
 from ufl.algorithms.map_integrands import map_integrands
 
 from remodel_fenicsx.body.domain import dof_of_node
-from remodel_fenicsx.body.mesh_domain import gmsh_text
 from remodel_fenicsx.body.mesh_faces import jacobian_determinants
-from remodel_fenicsx.body.mesh_file import MeshFile
+from remodel_fenicsx.body.mesh_file import MeshFile, gmsh_text
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem import jit
@@ -274,7 +273,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
 
     def write(places: Array) -> None:
         if file is not None:
-            path.write_text(gmsh_text(replace(file, points=places)), encoding="ascii")
+            path.write_text(gmsh_text(places, file.blocks, file.names), encoding="ascii")
         comm.barrier()
 
     def find(share: float, start: Array) -> Array:

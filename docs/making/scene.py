@@ -11,8 +11,8 @@ from remodel_fenicsx.extend import SHAPES, Dimension, markdown_reference
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES, RANDOM_CELLS
 from remodel_fenicsx.scene.reference import paragraphs
-from remodel_fenicsx.schema.tables import shown
-from remodel_fenicsx.schema.units import keys_with_units
+from remodel_fenicsx.schema.tables import sections, shown
+from remodel_fenicsx.schema.units import dimension_of
 
 
 def page() -> str:
@@ -24,11 +24,21 @@ def page() -> str:
     )
 
 
+def _keys_with_units() -> Iterator[tuple[str, Dimension]]:
+    """Dotted key and dimension of every field that has one; a key of several variants comes once."""
+    found: dict[str, Dimension] = {}
+    for key, _, table in sections(Scene):
+        for name, field in table.model_fields.items():
+            if (dimension := dimension_of(field)) is not None:
+                found.setdefault(f"{key}.{name}", dimension)
+    yield from found.items()
+
+
 def _units() -> Iterator[list[str]]:
     """A row for each dimension that a key of a scene has; regions have those of their tables."""
     loads = {name: kind.dimension for shape in SHAPES.values() for name, kind in shape.loads.items() if kind.dimension}
     keys: dict[Dimension, list[str]] = {}
-    for key, dimension in (*keys_with_units(Scene), *((f"loads.{name}.value", unit) for name, unit in loads.items())):
+    for key, dimension in (*_keys_with_units(), *((f"loads.{name}.value", unit) for name, unit in loads.items())):
         if not key.startswith("regions.NAME.material."):
             keys.setdefault(dimension, []).append(f"`{key}`")
     for dimension, names in keys.items():

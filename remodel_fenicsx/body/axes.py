@@ -30,10 +30,10 @@ from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.kinematics import lagrange
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import LocalAxes
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.tables import SceneError
 
 spatial = Late("scipy.spatial")  # few bodies need it
-Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 
 # of 1/thickness: an element with all its nodes on one face has no gradient of phi, and 0/0 would be everywhere
@@ -205,7 +205,7 @@ def found_axes(
     return LocalAxes(quadrature.coordinates, *makers, values[..., 6] + values[..., 7], ~known)
 
 
-def _axes(radial: Array, axial: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _axes(radial: Array, axial: Array) -> tuple[Array, Flags]:
     """Rows c, a, r from vectors of any length, and where they are defined."""
     length, along = np.linalg.norm(radial, axis=-1), np.linalg.norm(axial, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):  # what is undefined is filled afterwards
@@ -213,7 +213,7 @@ def _axes(radial: Array, axial: Array) -> tuple[Array, NDArray[np.bool_]]:
         tangent = axial - np.sum(axial * r, axis=-1)[..., None] * r
         size = np.linalg.norm(tangent, axis=-1)
         a = tangent / size[..., None]
-    known: NDArray[np.bool_] = (length > LEAST_RADIAL) & (size > LEAST_TANGENT * along)
+    known: Flags = (length > LEAST_RADIAL) & (size > LEAST_TANGENT * along)
     return np.stack([np.cross(a, r), a, r], axis=-2), known
 
 
@@ -224,14 +224,14 @@ def _share(first: Array, second: Array) -> Array:
     return np.divide(low, total, out=np.full_like(total, 0.5), where=total > 0)
 
 
-def _first_place(quadrature: Quadrature, there: NDArray[np.bool_]) -> Array:
+def _first_place(quadrature: Quadrature, there: Flags) -> Array:
     """The first marked place in space, whatever the number of ranks."""
     marked = quadrature.owned(quadrature.coordinates)[quadrature.owned(there)]
     places = [place for part in of_all_ranks(quadrature.mesh.comm, marked) for place in part]
     return min(places, key=lambda place: np.round(place, 9).tolist())
 
 
-def _fill(axes: Array, known: NDArray[np.bool_], quadrature: Quadrature) -> None:
+def _fill(axes: Array, known: Flags, quadrature: Quadrature) -> None:
     """Give points without axes those of the nearest one that has some. Collective."""
     good = quadrature.owned(known)
     own = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]

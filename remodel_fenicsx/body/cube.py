@@ -11,8 +11,6 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.shape import (
-    Column,
-    LoadKind,
     Shape,
     axial_dead_force,
     cauchy_columns,
@@ -20,7 +18,7 @@ from remodel_fenicsx.body.shape import (
     homogeneous_bar,
     uniaxial_columns,
 )
-from remodel_fenicsx.body.reductions import Reduction, box
+from remodel_fenicsx.body.reductions import box
 from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.units import LENGTH
 
@@ -34,9 +32,9 @@ if TYPE_CHECKING:
 class Box(Shape):
     """A block from the origin along x, y and z, which slides on the planes x = y = z = 0."""
 
-    face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
+    face_names = ("x0", "x1", "y0", "y1", "z0", "z1")
     _counts: ClassVar[tuple[int, int, int]]
-    reductions: ClassVar[dict[str, Reduction]] = {
+    reductions = {
         "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape._lengths)),
     }
 
@@ -96,16 +94,16 @@ class Cube(Box):
     (4.0, ['force'])
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {"force": axial_dead_force("z1")}
-    columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")
-    columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
-    number_of_elements: ClassVar[int] = 1
+    loads = {"force": axial_dead_force("z1")}
+    columns = uniaxial_columns("z1", "side")
+    columns_on_request = cauchy_columns("x", "y", "z")
+    number_of_elements = 1
     _counts: ClassVar[tuple[int, int, int]] = (1, 1, 1)
 
-    shape: Literal["cube"] = Field(default="cube", description="Which body it is.")
-    side: Annotated[float, LENGTH] = Field(
-        default=1.0, gt=0, description="Length of an edge, in the scene's unit of length."
-    )
+    shape: Literal["cube"] = "cube"
+    """Which body it is."""
+    side: Annotated[float, LENGTH] = Field(default=1.0, gt=0)
+    """Length of an edge, in the scene's unit of length."""
 
     @property
     def sides(self) -> dict[str, float]:

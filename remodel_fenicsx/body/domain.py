@@ -23,9 +23,9 @@ from mpi4py import MPI
 from remodel_fenicsx.body.gmsh_model import GeometryError, NamedGroups, gmsh_model, named_groups
 from remodel_fenicsx.fem import compat
 from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 
-Array = npt.NDArray[np.float64]
-Marker = Callable[[Array], npt.NDArray[np.bool_]]
+Marker = Callable[[Array], Flags]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +83,8 @@ class Domain:
     dimensions: dict[str, float]
     regions: dict[str, int] = field(default_factory=lambda: {"body": 1})
     element_region: npt.NDArray[np.int32] = None  # type: ignore[assignment]  # then made below
-    element_number: npt.NDArray[np.int64] = field(init=False)
-    node_number: npt.NDArray[np.int64] = field(init=False)
+    element_number: Integers = field(init=False)
+    node_number: Integers = field(init=False)
     number_of_elements: int = field(init=False)
     number_of_nodes: int = field(init=False)
 
@@ -169,7 +169,7 @@ class Domain:
         owned = self.mesh.geometry.index_map().size_local
         return self._gather(np.asarray(values), self.node_number[:owned])
 
-    def gather_mesh(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]] | tuple[None, None]:
+    def gather_mesh(self) -> tuple[Array, Integers] | tuple[None, None]:
         """The whole mesh on rank 0, in input order, the same for every number of ranks. Collective.
 
         Returns
@@ -182,7 +182,7 @@ class Domain:
         elements = self.gather_elements(self.node_number[compat.geometry_dofmap(self.mesh)])
         return (None, None) if points is None or elements is None else (points, elements)
 
-    def _gather(self, values: npt.NDArray[Any], number: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
+    def _gather(self, values: npt.NDArray[Any], number: Integers) -> npt.NDArray[Any] | None:
         if over_ranks(self.comm, len(values) < len(number), MPI.LOR):
             raise ValueError(f"{len(values)} rows for {len(number)} owned entities on rank {self.comm.rank}")
         own = number, values[: len(number)]
@@ -251,7 +251,7 @@ def build_domain(
 # ---------------------------------------------------------------- facets
 
 
-def cells_of(mesh: Any, facets: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def cells_of(mesh: Any, facets: npt.NDArray[np.int32]) -> tuple[Integers, Integers]:
     """The element behind each facet of the boundary, and the facet's number in it."""
     topology, dimension = mesh.topology, mesh.topology.dim
     for pair in ((dimension - 1, dimension), (dimension, dimension - 1), (dimension - 1, 0)):
@@ -264,18 +264,18 @@ def cells_of(mesh: Any, facets: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.i
     return cells, np.argmax(of_cells[cells] == facets[:, None], axis=1)
 
 
-def corners_of(mesh: Any, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+def corners_of(mesh: Any, facets: npt.NDArray[np.int32]) -> Integers:
     """Local nodes at the corners of facets of the boundary, in dolfinx's order, (facets, corners of one)."""
     cells, local = cells_of(mesh, facets)
     return np.take_along_axis(compat.geometry_dofmap(mesh)[cells], _corners_of_facets(mesh)[local], axis=1)
 
 
-def _corners_of_facets(mesh: Any) -> npt.NDArray[np.int64]:
+def _corners_of_facets(mesh: Any) -> Integers:
     """Of an element, (facets, corners of one)."""
     return np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[mesh.topology.dim - 1])
 
 
-def dof_of_node(mesh: Any, space: Any) -> npt.NDArray[np.int64]:
+def dof_of_node(mesh: Any, space: Any) -> Integers:
     """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
     # the element and the geometry have the same degree: node k of an element is dof k of that element
     found = np.zeros(len(mesh.geometry.x), dtype=np.int64)

@@ -8,18 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from remodel_fenicsx.body.mesh_file import in_place, read_exchange_file
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.conventions import convention_doubt
 from remodel_fenicsx.schema.text import read_columns
 from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE
 
-Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +47,7 @@ class FibreFile:
         """Of the file, in hexadecimal digits."""
         return hashlib.sha256(self.data).hexdigest()
 
-    def rows_of(self, corners: Array, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float | None]:
+    def rows_of(self, corners: Array, chosen: Flags) -> tuple[Integers, float | None]:
         """The row for each element of a mesh, and how far the farthest is away; None where rows are elements."""
         count, centres = len(next(iter(self.measured.values()))), corners.mean(axis=1)
         sizes = 2 * np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.model.tensors import Array
 
 gmsh: Any = Late("gmsh")  # it takes 0.2 s and only rank 0 needs it
 
@@ -103,7 +104,7 @@ def _groups(dimension: int) -> dict[str, int]:
 
 
 # ---------------------------------------------------------------- what the shapes are made of
-def circle(radius: float, number: int, start: int = 0) -> npt.NDArray[np.float64]:
+def circle(radius: float, number: int, start: int = 0) -> Array:
     """Corners of a regular polygon around the origin, (number, 2); corner `start` first, corner 0 on the x axis."""
     angle = 2.0 * np.pi * (start + np.arange(number)) / number
     corners = np.column_stack((np.cos(angle), np.sin(angle)))
@@ -119,7 +120,7 @@ class Point(NamedTuple):
     y: float
 
 
-def points(coordinates: npt.NDArray[np.float64]) -> list[Point]:
+def points(coordinates: Array) -> list[Point]:
     """Points at (n, 2)."""
     pairs = [(float(x), float(y)) for x, y in coordinates]
     return [Point(gmsh.model.geo.addPoint(x, y, 0.0), x, y) for x, y in pairs]
@@ -200,7 +201,7 @@ def extrude(
     gmsh.model.mesh.generate(3)
 
 
-def raise_degree(degree: int, bulge: Callable[[npt.NDArray[np.float64]], npt.NDArray[Any]]) -> None:
+def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> None:
     """Give the straight elements nodes between their corners, and curve them around the z axis."""
     if degree == 1:
         return
@@ -225,7 +226,7 @@ def raise_degree(degree: int, bulge: Callable[[npt.NDArray[np.float64]], npt.NDA
         mesh.setNode(tags[index], point, [])
 
 
-def _corner_weights(local: npt.NDArray[np.float64], corners: int) -> npt.NDArray[np.float64]:
+def _corner_weights(local: Array, corners: int) -> Array:
     """Linear shape functions of the corners at Gmsh's reference coordinates (n, 3), (n, corners)."""
     if corners == 4:
         return np.column_stack((1.0 - local.sum(axis=1), local))

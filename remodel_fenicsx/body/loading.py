@@ -9,15 +9,14 @@ import dolfinx.fem
 import numpy as np
 import ufl
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.tables import SceneError
 
-Array = NDArray[np.float64]
 LoadValues = dict[str, float]
 
 

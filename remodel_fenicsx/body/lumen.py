@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
-from remodel_fenicsx.body.mesh_file import ORDERS, in_place, split_quads, split_wedges
+from remodel_fenicsx.body.mesh_file import ORDERS, Block, gmsh_text, in_place, split_quads, split_wedges
 from remodel_fenicsx.body.surface_file import SURFACES, Surface, triangles_of
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import LARGEST_MESH
 from remodel_fenicsx.schema.tables import SceneError
 from remodel_fenicsx.system.children import DAMAGED, made_apart
 from remodel_fenicsx.system.files import write_new
 from remodel_fenicsx.system.terminal import announce
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 LARGE_SURFACE = 200_000  # triangles of which Gmsh divides 6,000 a second
 SHARP = 60.0  # degrees between two triangles from which on Gmsh keeps an edge between them
@@ -99,6 +95,8 @@ def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
 
 def by_gmsh(file: str) -> dict[str, Any]:
     """In the child process: points and triangles of a size, of those in a file."""
+    from remodel_fenicsx.body.gmsh_file import of_gmsh
+
     with np.load(file) as read, gmsh_model("wall") as gmsh:
         count, corners = len(read["points"]), read["triangles"].ravel() + 1
         gmsh.model.addDiscreteEntity(2, 1)
@@ -109,11 +107,9 @@ def by_gmsh(file: str) -> dict[str, Any]:
         for option in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
             gmsh.option.setNumber(option, float(read["size"]))
         gmsh.model.mesh.generate(2)
-        numbers, places, _ = gmsh.model.mesh.getNodes()
-        used, triangles = np.unique(gmsh.model.mesh.getElementsByType(2)[1], return_inverse=True)
-    order = np.argsort(numbers)
-    points = places.reshape(-1, 3)[order[np.searchsorted(numbers[order], used)]]
-    return {"points": points, "triangles": triangles.reshape(-1, 3)}
+        points, blocks = of_gmsh()
+    used, triangles = np.unique(next(b.nodes for b in blocks if b.kind == "triangle"), return_inverse=True)
+    return {"points": points[used], "triangles": triangles.reshape(-1, 3)}
 
 
 def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
@@ -242,7 +238,7 @@ def _in_planes(vectors: Array, points: Array, openings: Sequence[Integers]) -> A
         nodes = np.unique(rim)
         across = np.linalg.svd(points[nodes] - points[nodes].mean(axis=0))[2][2]
         found[nodes] -= np.outer(found[nodes] @ across, across)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def _smoothed(normals: Array, surface: Surface, openings: Sequence[Integers]) -> Array:
@@ -272,8 +268,6 @@ def write_wall(
     surface: Path, path: Path, thickness: str | None, layers: Sequence[str], size: float, through: int
 ) -> list[str]:
     """Make the mesh of a wall and write it, a new file; what is in it, in lines."""
-    import meshio
-
     if path.suffix.lower() != ".msh":
         raise SceneError(f"-o {path}: allowed is a file that ends with .msh")
     if path.exists():
@@ -299,17 +293,11 @@ def write_wall(
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
     names = list(shares) or ["wall"]
-    groups = {name: (number, 2) for number, name in enumerate(wall.faces, 1)}
-    groups |= {name: (len(wall.faces) + number, 3) for number, name in enumerate(names, 1)}
-    tags = [np.full(len(face), groups[name][0]) for name, face in wall.faces.items()] + [
-        len(wall.faces) + 1 + wall.layers
-    ]
-    cells = [("triangle6", face) for face in wall.faces.values()] + [("tetra10", wall.tetrahedra)]
-    data: Any = {"gmsh:physical": tags, "gmsh:geometrical": tags}
-    mesh = meshio.Mesh(wall.points, cells, cell_data=data, field_data={k: np.array(v) for k, v in groups.items()})
-    with tempfile.TemporaryDirectory() as folder:
-        mesh.write(Path(folder) / "wall.msh", file_format="gmsh22", binary=False)
-        write_new(path, (Path(folder) / "wall.msh").read_bytes())
+    of_names = {2: {name: number for number, name in enumerate(wall.faces, 1)}}
+    of_names[3] = {name: number for number, name in enumerate(names, len(wall.faces) + 1)}
+    blocks = [Block("triangle6", np.full(len(face), of_names[2][name]), face) for name, face in wall.faces.items()]
+    blocks += [Block("tetra10", len(wall.faces) + 1 + wall.layers, wall.tetrahedra[:, ORDERS["tetra10"]])]
+    write_new(path, gmsh_text(wall.points, blocks, of_names).encode())
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))
     nodes = np.unique(outer)
     between = np.linalg.norm(wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1)
@@ -368,7 +356,7 @@ def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) 
         raise SceneError(f"--thickness {said}: allowed is a number above 0, or an array at the points: {known}")
     if not ((surface.arrays[said] > 0) & np.isfinite(surface.arrays[said])).all():
         raise SceneError(f"--thickness {said}: this array has values that are not above 0, or not finite")
-    return np.asarray(surface.arrays[said], dtype=np.float64)
+    return surface.arrays[said]
 
 
 def _positive(text: str) -> float | None:

@@ -12,17 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic.config import JsonDict
 
 from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gmsh_model
 from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
-    ENDINGS,
+    READERS,
     TAGS,
-    Array,
-    Block,
     MeshFile,
     assembled,
     distinct,
@@ -34,6 +31,7 @@ from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_col
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
@@ -82,7 +80,7 @@ def _faces(value: Any) -> Any:
 def _files(value: Any) -> list[str]:
     """Paths of a mesh and of its surfaces, of one or a list; nothing where they are none."""
     files = list(value) if isinstance(value, (list, tuple)) else [value]
-    kinds = [ENDINGS, *[SURFACES] * len(files[1:])]
+    kinds = [READERS, *[SURFACES] * len(files[1:])]
     return files if files and all(map(_ends_with, files, kinds)) else []
 
 
@@ -93,7 +91,7 @@ def _ends_with(file: Any, endings: Collection[str]) -> bool:
 def _file(value: Any) -> Any:
     files = _files(value)
     if not files:
-        mesh, surfaces = ", ".join(ENDINGS), ", ".join(SURFACES)
+        mesh, surfaces = ", ".join(READERS), ", ".join(SURFACES)
         raise fault(
             f"must be the path of a mesh ({mesh}), relative to the scene's folder; in a list, what follows the mesh "
             f"must be paths of its surfaces ({surfaces})"
@@ -121,8 +119,6 @@ def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], the
         if number not in there:
             listed = [*map(repr, names), *(str(other) for other in sorted(there - set(names.values())))]
             rule = f"the file has no such {word}; it has {', '.join(listed) or 'none'}"
-            if number in names.values():
-                rule = f"this {word} of the file has no elements"
             raise SceneError(f"geometry.{kind}s.{name} = {shown(entry)}: {rule}")
         found.append(int(number))
     return found
@@ -131,16 +127,15 @@ def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], the
 class FileBody(WithRegions, FromFile):
     """A body whose mesh, faces and regions are those of a file."""
 
-    supported_faces: ClassVar[tuple[str, ...] | None] = None
+    supported_faces = None
     thickness_in_words: ClassVar[str] = "cube root of the volume"
 
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
-        description=(
-            "The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`, `.stl`, "
-            "`.ply`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."
-        ),
-        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"},
+        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"}
     )
+    """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
+    `.stl`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your
+    own)."""
     tags: str | None = Field(
         default=None,
         min_length=1,
@@ -149,40 +144,28 @@ class FileBody(WithRegions, FromFile):
         json_schema_extra={"allowed": "the name of an array"},
     )
     file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
-        default=None,
-        description="Unit of the numbers in the file, where it differs from `length_unit`.",
-        json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))},
+        default=None, json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))}
     )
+    """Unit of the numbers in the file, where it differs from `length_unit`."""
     faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={},
-        description=(
-            "Names of faces, each with the name or number of a face in the file, or a list of them: `inner`, `outer`, "
-            "`inlet` and `outlet` where the file has other names, and more for supports and loads. A surface of its "
-            'own is a face too: `{ file = "lumen.vtp" }`.'
-        ),
-        json_schema_extra=_GROUPS,
+        default={}, json_schema_extra=_GROUPS
     )
+    """Names of faces, each with the name or number of a face in the file, or a list of them:
+    `inner`, `outer`, `inlet` and `outlet` where the file has other names, and more for supports
+    and loads. A surface of its own is a face too: `{ file = "lumen.vtp" }`."""
     regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={},
-        description=(
-            "Names of regions, each with the name or number of a volume in the file, or a list of them."
-            " Default: the names in the file."
-        ),
-        json_schema_extra=_GROUPS,
+        default={}, json_schema_extra=_GROUPS
     )
-    open_boundary: bool = Field(
-        default=False,
-        description=(
-            "Whether parts of the boundary may belong to no face. Without it such a part is taken for a"
-            " hole and refused."
-        ),
-    )
+    """Names of regions, each with the name or number of a volume in the file, or a list of
+    them. Default: the names in the file."""
+    open_boundary: bool = False
+    """Whether parts of the boundary may belong to no face. Without it such a part is taken for
+    a hole and refused."""
     sha256: str | None = Field(
-        default=None,
-        pattern="^[0-9a-f]{64}$",
-        description="SHA-256 of the file, of several files together. A scene as run has it, and refuses others.",
-        json_schema_extra={"allowed": "64 hexadecimal digits"},
+        default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
     )
+    """SHA-256 of the file, of several files together. A scene as run has it, and refuses
+    others."""
 
     @model_validator(mode="before")
     @classmethod
@@ -255,7 +238,7 @@ class FileBody(WithRegions, FromFile):
             limits = f"allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, geometry.length_unit)"
             raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
         try:
-            boundary = mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
+            boundary = self._boundary(file)
         except mesh_faces.FaceError as error:
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
         except UnreadableFile as error:
@@ -277,7 +260,7 @@ class FileBody(WithRegions, FromFile):
         file = refined(file, mesh.refinement, mesh.degree)
         words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
-        return file, mesh_faces.boundary_of(file, self._groups(file), self.open_boundary)
+        return file, self._boundary(file)
 
     def _read(self) -> MeshFile:
         try:
@@ -297,25 +280,14 @@ class FileBody(WithRegions, FromFile):
         entry: Names = self.faces.get(face, (face,))
         return entry[0] if len(entry) == 1 else list(entry)
 
-    def _groups(self, file: MeshFile) -> dict[str, tuple[int, ...]]:
-        """Numbers of the file's groups by name of the face, further named faces of the file under their own."""
+    def _boundary(self, file: MeshFile) -> mesh_faces.Boundary:
+        """With the faces of the body, and further named ones of the file under their own names."""
         names, there = file.names[2], set(distinct(file.facet_groups)) - {0}
         asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*self.face_names, *self.faces])}
-        groups = {face: tuple(_numbers("face", face, entries, names, there)) for face, entries in asked.items()}
-        taken = {number for numbers in groups.values() for number in numbers}
-        others = {name: number for name, number in names.items() if number in there and number not in taken}
-        left = mesh_faces.groups_inside(file) if others else set()
-        for name, number in others.items():
-            if name in groups or number in left:
-                continue
-            if number in file.facet_groups[mesh_faces.again(file.facets, file.facet_groups, taken)]:
-                log.info(
-                    "face %r of the file shares facets with others, and the scene does not name it: left out", name
-                )
-            else:
-                groups[name] = (number,)
-                taken.add(number)
-        return groups
+        groups = {face: _numbers("face", face, entries, names, there) for face, entries in asked.items()}
+        taken = set(itertools.chain.from_iterable(groups.values()))
+        others = {name: [n] for name, n in names.items() if n in there - taken and name not in groups}
+        return mesh_faces.boundary_of(file, groups, self.open_boundary, others)
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
         numbers = distinct(file.cell_groups)
@@ -374,8 +346,10 @@ class FileBody(WithRegions, FromFile):
         for name in supports:
             if name not in domain.faces:
                 raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
+        from remodel_fenicsx.body.mesh_domain import check_supports
+
         chosen = self.supports_of(supports)
-        mesh_faces.check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
+        check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
         moved = {"outlet": "elongation"} if "elongation" in loads else {}
         for name, (face, load) in faces_of(loads).items():
             key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
@@ -399,6 +373,8 @@ class FileBody(WithRegions, FromFile):
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
         """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective."""
+        from remodel_fenicsx.body.mesh_domain import GUIDE, add_support
+
         domain: Any = loading.domain
         self.check_faces(domain, supports, loads)
         length = domain.length()
@@ -411,8 +387,8 @@ class FileBody(WithRegions, FromFile):
         if "elongation" in loads:
             ways["outlet"] = "elongation", length
         for name, support in self.supports_of(supports).items():
-            stiffness = mesh_faces.GUIDE * modulus / domain.thickness
-            mesh_faces.add_support(loading, name, support, stiffness, ways.get(name))
+            stiffness = GUIDE * modulus / domain.thickness
+            add_support(loading, name, support, stiffness, ways.get(name))
         for name, on in on_faces.items():
             if on.kind == "pressure":
                 loading.add_follower_pressure(name, on.face)
@@ -424,7 +400,7 @@ NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to
 def _angle_at(face: str) -> AngleOf:
     """Mean angle over the elements that have a facet on a face."""
 
-    def elements(m: Any) -> NDArray[np.bool_]:
+    def elements(m: Any) -> Flags:
         from remodel_fenicsx.body.axes import facets_of
         from remodel_fenicsx.body.domain import cells_of
 
@@ -434,7 +410,7 @@ def _angle_at(face: str) -> AngleOf:
 
     def value(m: Any, angle: Array) -> float:
         chosen = m.tool(("elements at", face), lambda: elements(m))
-        return float(m.quadrature.mean_of_known(angle, chosen))
+        return m.quadrature.mean_of_known(angle, chosen)
 
     return value
 
@@ -442,14 +418,14 @@ def _angle_at(face: str) -> AngleOf:
 def _middle_angle(m: Any, angle: Array) -> float:
     """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
 
-    def elements() -> NDArray[np.bool_]:
+    def elements() -> Flags:
         from remodel_fenicsx.fem.compat import geometry_dofmap
 
         depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
         low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
-        return np.asarray((low <= 0.5) & (high >= 0.5), dtype=np.bool_)
+        return (low <= 0.5) & (high >= 0.5)
 
-    return float(m.quadrature.mean_of_known(angle, m.tool("middle elements", elements)))
+    return m.quadrature.mean_of_known(angle, m.tool("middle elements", elements))
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
@@ -471,9 +447,9 @@ class WalledMesh(Walled):
         *stress_columns(MEANS_ON_A_MESH),
         *Walled.columns_on_request,
     )
-    axis_kinds: ClassVar[tuple[str, ...]] = ("local", "global")
-    constant_fields: ClassVar[tuple[str, ...]] = CONSTANT_FIELDS
-    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "local"}}
+    axis_kinds = ("local", "global")
+    constant_fields = CONSTANT_FIELDS
+    defaults = {"cells": {"axes": "local"}}
 
     def log_of_radii(self, wall: Any) -> float | None:
         """Faces are as their radii; None if the wall does not go around."""
@@ -499,7 +475,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
     all of one kind. A run keeps a copy of the file.
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {
+    loads = {
         "pressure": LoadKind(
             lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
             "pressure on the deformed inner face",
@@ -512,7 +488,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
             above=-1.0,
         ),
     }
-    columns: ClassVar[tuple[Column, ...]] = (
+    columns = (
         Column(
             "lumen_volume",
             "length^3",
@@ -521,7 +497,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         ),
         *WalledMesh.columns,
     )
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
+    columns_on_request = (
         Column(
             "outer_area",
             "length^2",
@@ -530,10 +506,11 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         ),
         *WalledMesh.columns_on_request,
     )
-    face_names: ClassVar[tuple[str, ...]] = ROLES
-    thickness_in_words: ClassVar[str] = "mean thickness of the wall"
+    face_names = ROLES
+    thickness_in_words = "mean thickness of the wall"
 
-    shape: Literal["mesh"] = Field(default="mesh", description="Which body it is.")
+    shape: Literal["mesh"] = "mesh"
+    """Which body it is."""
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
         """Whether inner and outer have each other's names."""
@@ -558,8 +535,8 @@ class Solid(FileBody):
     Its faces have any names; each that is held has a table `[supports.NAME]`. Directions are those of x, y and z.
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {}
-    columns: ClassVar[tuple[Column, ...]] = (
+    loads = {}
+    columns = (
         Column(
             "fibre_angle",
             "degrees",
@@ -568,12 +545,14 @@ class Solid(FileBody):
         ),
         Column("volume", "length^3", "deformed volume", lambda m: m.quadrature.integral(np.linalg.det(m.F))),
     )
-    columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
-    angle_in_words: ClassVar[tuple[str, str]] = ("along the axis", "across")
-    depth_in_words: ClassVar[tuple[str, str, str]] = ("in the body", "", "")
+    columns_on_request = cauchy_columns("x", "y", "z")
+    angle_in_words = ("along the axis", "across")
+    depth_in_words = ("in the body", "", "")
 
-    shape: Literal["solid"] = Field(default="solid", description="Which body it is.")
-    axis: Literal["x", "y", "z"] = Field(default="x", description="The axis to which fibre angles are measured.")
+    shape: Literal["solid"] = "solid"
+    """Which body it is."""
+    axis: Literal["x", "y", "z"] = "x"
+    """The axis to which fibre angles are measured."""
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
         """To `axis`."""
@@ -587,26 +566,24 @@ class Solid(FileBody):
 
 
 # ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh
-# Gmsh's number of elements and facets of degree 1; meshio's names of those of degree 1 and 2
-SPLIT: dict[str, dict[int, tuple[Any, ...]]] = {
-    "tetrahedron": {3: (4, "tetra", "tetra10"), 2: (2, "triangle", "triangle6")},
-    "hexahedron": {3: (5, "hexahedron", "hexahedron27"), 2: (3, "quad", "quad9")},
-}
+# Gmsh's numbers of elements and facets of degree 1
+SPLIT = {"tetrahedron": {3: 4, 2: 2}, "hexahedron": {3: 5, 2: 3}}
 
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     """A mesh of plane elements, split into halves along each edge, as often as asked for."""
+    from remodel_fenicsx.body.gmsh_file import of_gmsh
+
     with gmsh_model("file") as gmsh:
-        mesh, parts = gmsh.model.mesh, {3: (file.cells, file.cell_groups), 2: (file.facets, file.facet_groups)}
-        entities = {
-            d: {n: gmsh.model.addDiscreteEntity(d) for n in distinct(groups)} for d, (_, groups) in parts.items()
-        }
-        first = next(iter(entities[3].values()))
-        mesh.addNodes(3, first, np.arange(1, len(file.points) + 1), file.points.reshape(-1))
-        for dimension, (rows, groups) in parts.items():
-            for number, entity in entities[dimension].items():
-                nodes = 1 + rows[groups == number].reshape(-1)
-                mesh.addElementsByType(entity, SPLIT[file.kind][dimension][0], [], nodes)
+        model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
+        for dimension, rows, groups in ((3, file.cells, file.cell_groups), (2, file.facets, file.facet_groups)):
+            for group in distinct(groups):
+                entity = model.addDiscreteEntity(dimension)
+                mesh.addNodes(dimension, entity, number, file.points.reshape(-1))
+                number = []
+                mesh.addElementsByType(entity, SPLIT[file.kind][dimension], [], 1 + rows[groups == group].reshape(-1))
+                if group:
+                    model.addPhysicalGroup(dimension, [entity], group)
         for _ in range(refinement.bit_length() - 1):
             mesh.refine()
         if degree == 2:
@@ -614,13 +591,5 @@ def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
             gmsh.option.setNumber("Mesh.SecondOrderLinear", 1)
             mesh.setOrder(2)
             gmsh.option.setNumber("Mesh.SecondOrderLinear", before)
-        tags, places, _ = mesh.getNodes()
-        order = np.argsort(tags)
-        blocks = []
-        for dimension, by_number in entities.items():
-            for number, entity in by_number.items():
-                for elements, nodes in zip(*mesh.getElements(dimension, entity)[1:], strict=True):
-                    rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(elements), -1)
-                    blocks.append(Block(SPLIT[file.kind][dimension][degree], np.full(len(elements), number), rows))
-    points = np.asarray(places, dtype=np.float64).reshape(-1, 3)[order]
+        points, blocks = of_gmsh()
     return assembled(points, blocks, file.names, file.data)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import dolfinx.fem
+import dolfinx.graph
+import dolfinx.io
 import dolfinx.mesh
 import numpy as np
 import ufl
@@ -15,38 +18,17 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.axes import facets_of, harmonic, slopes
-from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, symbolic_mesh
+from remodel_fenicsx.body.domain import Domain, cells_of, symbolic_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile
+from remodel_fenicsx.body.loading import Loading
+from remodel_fenicsx.body.mesh_file import MeshFile
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import agreed, over_ranks
+from remodel_fenicsx.model.tensors import Array, Integers
+from remodel_fenicsx.schema.settings import Support
+from remodel_fenicsx.schema.tables import SceneError
 
-
-# ---------------------------------------------------------------- a mesh as the text of a Gmsh file, format 2.2
-# What `mesh_file` reads.
-
-# Gmsh's numbers of the types of elements and of facets, which are written by their corners
-TYPE_OF = {("tetrahedron", 1): 4, ("hexahedron", 1): 5, ("tetrahedron", 2): 11, ("hexahedron", 2): 12}
-FACET_OF = {3: 2, 4: 3}
-
-
-def gmsh_text(file: MeshFile) -> str:
-    """Nodes, elements and named groups of a mesh; nodes have the numbers 1, 2, ... in their order."""
-    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames"]
-    names = [(dimension, number, name) for dimension, by in file.names.items() for name, number in by.items()]
-    lines += [str(len(names)), *(f'{dimension} {number} "{name}"' for dimension, number, name in names)]
-    lines += ["$EndPhysicalNames", "$Nodes", str(len(file.points))]
-    places: Any = file.points.tolist()
-    lines += [f"{row} {x:.17g} {y:.17g} {z:.17g}" for row, (x, y, z) in enumerate(places, start=1)]
-    facets, solid = FACET_OF[file.facets.shape[1]], TYPE_OF[file.kind, file.degree]
-    lines += ["$EndNodes", "$Elements", str(len(file.facets) + len(file.cells))]
-    number = 0
-    for kind, groups, rows in ((facets, file.facet_groups, file.facets), (solid, file.cell_groups, file.cells)):
-        listed: Any = (rows + 1).tolist()
-        for group, row in zip(groups, listed, strict=True):
-            number += 1
-            lines.append(f"{number} {kind} 2 {group} {group} {' '.join(str(node) for node in row)}")
-    return "\n".join([*lines, "$EndElements", ""])
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +40,12 @@ class MeshDomain(Domain):
     rims: tuple[Integers, ...] = ()
     volume: float = 0.0
 
-    def of_parts(self, face: str, name: str) -> Array:
-        """`normal` or `centre` of each part of a face at the local elements beside it, 0 at others; (elements, 3)."""
+    def of_parts(self, face: str, name: str) -> Any:
+        """`normal` or `centre` of each part of a face, as a function that is constant on the elements beside it."""
+        found: Any = dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, ("DG", 0, (3,))))
         table = np.array([*(getattr(part, name) for part in self.parts), np.zeros(3)])
-        return np.asarray(table[self.part_of_element[face]])
+        found.x.array.reshape(-1, 3)[found.function_space.dofmap.list.reshape(-1)] = table[self.part_of_element[face]]
+        return found
 
     def facets_of_parts(self, face: str) -> Iterator[tuple[Face, NDArray[np.int32]]]:
         """The parts of a face with their local facets."""
@@ -77,7 +61,7 @@ class MeshDomain(Domain):
 
     def middle(self, face: str) -> Array:
         """Mean of the places of a named face, (3,)."""
-        return np.asarray(np.concatenate([part.places for part in self.parts if part.name == face]).mean(axis=0))
+        return np.concatenate([part.places for part in self.parts if part.name == face]).mean(axis=0)
 
     @property
     def thickness(self) -> float:
@@ -121,7 +105,7 @@ def shared(
     mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
     faces = {name: number for number, name in enumerate(dict.fromkeys(part.name for part in parts), start=1)}
     values = np.repeat([faces[part.name] for part in parts], [len(part.facets) for part in parts])
-    tags = _tags_of_facets(mesh, np.sort(facets[np.concatenate([part.facets for part in parts])], axis=1), values)
+    tags = _tags_of_facets(mesh, facets[np.concatenate([part.facets for part in parts])], values)
     domain = MeshDomain(
         mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), parts, {}, lines, volume
     )
@@ -134,13 +118,138 @@ def shared(
 
 
 def _tags_of_facets(mesh: Any, corners: Integers, values: Integers) -> Any:
-    """Tags of the facets of the boundary with these corners, as rank 0 numbered them, each row ascending."""
-    dimension = mesh.topology.dim - 1
-    mesh.topology.create_connectivity(dimension, dimension + 1)
-    facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology)).astype(np.int32)
-    listed: Any = corners.tolist()
-    wanted = dict(zip(map(tuple, listed), values.astype(int), strict=True))
-    nodes = np.asarray(mesh.geometry.input_global_indices, dtype=np.int64)[corners_of(mesh, facets)]
-    rows: Any = np.sort(nodes, axis=1).tolist()
-    found = np.array([wanted.get(tuple(row), 0) for row in rows], dtype=np.int32)
-    return dolfinx.mesh.meshtags(mesh, dimension, facets[found > 0], found[found > 0])
+    """Tags of the facets with these corners, as rank 0 numbered the nodes. Collective."""
+    dimension, here = mesh.topology.dim - 1, slice(None) if mesh.comm.rank == 0 else slice(0)
+    for other in (0, dimension + 1):
+        mesh.topology.create_connectivity(dimension, other)
+    listed = corners[here].astype(np.int64), values[here].astype(np.int32)
+    entities, found = dolfinx.io.distribute_entity_data(mesh, dimension, *listed)
+    return dolfinx.mesh.meshtags_from_entities(mesh, dimension, dolfinx.graph.adjacencylist(entities), found)
+
+
+# ---------------------------------------------------------------- supports of faces
+Density = Callable[[Any], Any]
+
+GUIDE = (
+    1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
+)
+PARALLEL = 1e-3  # radians between normals: what a mesh in single precision has
+LEAST_TANGENTIAL = 0.5  # measured with ends held: 0 has one or two negative eigenvalues, 0.3 and 1 have none
+STILL = 1e-8  # smallest eigenvalue over the largest below which nothing holds a rigid motion
+
+
+def add_support(
+    loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None
+) -> None:
+    """Hold a face, which a load may move along its normal: its name, and how far at magnitude 1."""
+    if support.kind == "held":  # u = d N
+        for part, facets in loading.domain.facets_of_parts(face):  # type: ignore[attr-defined]
+            loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
+        loading.supports[face] = None
+    elif support.kind in _DENSITIES:
+        density = _DENSITIES[support.kind](loading, face, support, moves)
+        half, measure = loading.constant((support.stiffness or stiffness) / 2), loading.surface_measure(face)
+
+        def potential(u: Any) -> Any:
+            return half * density(loading.kinematics.displacement(u)) * loading.weight * measure
+
+        loading.add_potential(potential)
+        loading.supports[face] = potential
+
+
+def _guided(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
+    """(u . N - d)^2 + (u . c)^2."""
+    domain: Any = loading.domain
+    sliding = _sliding(loading, face, support, moves)
+    normal, centre = (domain.of_parts(face, name) for name in ("normal", "centre"))
+    around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
+    # a Constant: a number in the kernel would be another kernel for each mesh
+    squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
+    return lambda u: sliding(u) + ufl.inner(u, around) ** 2 / squared
+
+
+def _sliding(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
+    """(u . N - d)^2."""
+    domain: Any = loading.domain
+    normal = domain.of_parts(face, "normal")
+    way = loading.magnitude(*moves) if moves else 0.0
+    return lambda u: (ufl.inner(u, normal) - way) ** 2
+
+
+def _elastic(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
+    """(u . N)^2 + s |u - (u . N) N|^2, N of the place."""
+    share, normal = loading.constant(support.tangential), ufl.FacetNormal(loading.domain.mesh)
+    return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, normal) ** 2
+
+
+# what a face's springs store over half of their stiffness, by the kind of support
+_DENSITIES: dict[str, Callable[[Loading, str, Support, tuple[str, float] | None], Density]] = {
+    "guided": _guided,
+    "sliding": _sliding,
+    "elastic": _elastic,
+}
+
+
+# ---------------------------------------------------------------- rigid motions
+
+
+def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
+    """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that."""
+    if free := free_motions(domain.parts, supports):
+        kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
+        raise SceneError(f"supports ({kinds}): they leave the body free to move, in {free} of 6 rigid motions")
+    sliding = [part for part in domain.parts if supports.get(part.name, Support(kind="free")).kind == "sliding"]
+    if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
+        raise SceneError(
+            "loads.elongation: both ends slide and are not parallel, so the elongation would only shift the body, "
+            "held by the pressure on its ends; allowed with an end that is 'guided' or 'held'"
+        )
+    for name, support in supports.items():
+        warn_of_twist(name, support, domain.comm)
+
+
+def warn_of_twist(name: str, support: Support, comm: Any) -> None:
+    """Say so where springs may turn a body about its axis."""
+    if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and comm.rank == 0:
+        log.warning(
+            "supports.%s.tangential = %g: springs that hardly hold a wall across their direction push it sideways "
+            "once it has grown, and it twists; with %g and more no wall has twisted",
+            name, support.tangential, LEAST_TANGENTIAL,
+        )  # fmt: skip
+
+
+def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
+    """How many rigid motions of the body no support holds: of the 6 x 6 matrix of the supports over them."""
+    everywhere = np.concatenate([part.places for part in parts])
+    middle = everywhere.mean(axis=0)
+    size = float(np.linalg.norm(everywhere - middle, axis=1).max())
+    matrix = np.zeros((6, 6))
+    for part in parts:
+        support = supports.get(part.name)
+        if support is not None and support.kind != "free":
+            # halfway to the corners, exact on triangles: a single one is held against turns too. Springs along N alone
+            # are taken at the middles: around a tube they would hold its facets, but nothing of the round body
+            share = 0.0 if support.kind == "elastic" and not support.tangential else 0.5
+            for places in np.swapaxes((1 - share) * part.places[:, None] + share * part.corners, 0, 1):
+                # displacements (facets, 6, 3) of the unit motions along and about the axes
+                turns = np.cross(np.eye(3)[None], (places - middle)[:, None] / size)
+                motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
+                held = _held_directions(support, part, places)
+                matrix += np.einsum("fki,fij,flj->kl", motions, held, motions) / len(motions)
+    values = np.linalg.eigvalsh(matrix)
+    return int(np.sum(values <= STILL * max(float(values[-1]), 1e-300)))
+
+
+def _held_directions(support: Support, part: Face, places: Array) -> Array:
+    """What a support holds at a place of each facet of a part, as projections (facets, 3, 3)."""
+    along = np.broadcast_to(np.outer(part.normal, part.normal), (len(part.places), 3, 3))
+    around = np.cross(part.normal, places - part.centre)
+    around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
+    own = part.normals
+    share, springs = support.tangential, np.einsum("fi,fj->fij", own, own)
+    return {
+        "guided": along + np.einsum("fi,fj->fij", around, around),
+        "sliding": along,
+        "held": np.broadcast_to(np.eye(3), along.shape),
+        "elastic": share * np.eye(3) + (1 - share) * springs,
+    }[support.kind]

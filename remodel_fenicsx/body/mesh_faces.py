@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.mesh_file import Array, Integers, MeshFile, as_rows, distinct, in_place
+from remodel_fenicsx.body.mesh_file import MeshFile, as_rows, distinct, in_place
 from remodel_fenicsx.errors import UnreadableFile
-from remodel_fenicsx.model.tensors import det
-from remodel_fenicsx.schema.settings import Support
-from remodel_fenicsx.schema.tables import SceneError
+from remodel_fenicsx.model.tensors import Array, Flags, Integers, det
 
-if TYPE_CHECKING:
-    from remodel_fenicsx.body.loading import Loading
-    from remodel_fenicsx.body.mesh_domain import MeshDomain
-
-ufl, dolfinx, basix, basix_ufl = Late("ufl"), Late("dolfinx"), Late("basix"), Late("basix.ufl")
 log = logging.getLogger(__name__)
+dolfinx, basix = Late("dolfinx"), Late("basix")
 
 # corners of the facets of an element and of the edges around a facet, in Gmsh's order; the normals point outwards
 FACETS = {
@@ -79,32 +73,37 @@ class Boundary:
         return sum(face.area for face in self.parts(name))
 
 
-def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary:
-    """Find the named faces on the boundary of the one body that a file holds."""
+def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Groups = MappingProxyType({})) -> Boundary:
+    """Find the named faces on the boundary of the one body that a file holds, and others where they are faces."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
     normals = area_vectors(places)
     owner = np.full(len(facets), "", dtype=object)
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
-    for name, numbers in groups.items():
-        chosen = np.isin(file.facet_groups, numbers)
-        for key in as_rows(np.sort(file.facets[chosen], axis=1)):
-            row = index.get(key)
-            if row is None or owner[row] not in ("", name):
-                words = "has facets that are no facets of its elements"
-                if row is not None:
-                    words = f"shares facets with the face {owner[row]!r}"
-                elif key in as_rows(np.sort(twice, axis=1)):
-                    words = "has facets inside the body"
-                raise FaceError(name, f"{words}, the first at {in_place(file.points[list(key)].mean(axis=0))}")
-            owner[row] = name
+    for name, numbers in (*groups.items(), *others.items()):
+        keys = as_rows(np.sort(file.facets[np.isin(file.facet_groups, numbers)], axis=1))
+        found: list[Any] = [index.get(key) for key in keys]
+        for key, row in zip(keys, found, strict=True):
+            if row is not None and owner[row] in ("", name):
+                continue
+            if name in others:
+                log.info("face %r of the file is inside, or shares facets with others: left out", name)
+                break
+            words = "has facets that are no facets of its elements"
+            if row is not None:
+                words = f"shares facets with the face {owner[row]!r}"
+            elif key in as_rows(np.sort(twice, axis=1)):
+                words = "has facets inside the body"
+            raise FaceError(name, f"{words}, the first at {in_place(file.points[list(key)].mean(axis=0))}")
+        else:
+            owner[found] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
         where, share = in_place(places[bare][0].mean(axis=0)), bare.sum()
         rule = f"{share} of {len(bare)} facets of the boundary are in no face of geometry.faces, the first at {where}"
         raise UnreadableFile(rule + "; if that is meant: geometry.open_boundary = true")
     faces = []
-    for name in groups:
+    for name in (*groups, *others):
         rows = np.flatnonzero(owner == name)
         label = components(facets[rows], len(file.points))
         for one in distinct(label):
@@ -121,17 +120,11 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool) -> Boundary
     return Boundary(facets, cell, faces, volume)
 
 
-def groups_inside(file: MeshFile) -> set[int]:
-    """Numbers of the named faces with facets that are not on the boundary: between regions, say."""
-    outside, rows = set(as_rows(np.sort(_facets(file)[0], axis=1))), as_rows(np.sort(file.facets, axis=1))
-    return {int(n) for n, corners in zip(file.facet_groups, rows, strict=True) if corners not in outside}
-
-
-def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> NDArray[np.bool_]:
+def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flags:
     """Which elements or facets of other groups are also in groups of these numbers, (rows,)."""
     chosen = np.isin(groups, list(numbers))
     _, which = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
-    return np.asarray(~chosen & np.isin(which.reshape(-1), which.reshape(-1)[chosen]))
+    return ~chosen & np.isin(which.reshape(-1), which.reshape(-1)[chosen])
 
 
 def through_the_wall(boundary: Boundary) -> bool:
@@ -169,9 +162,9 @@ def cap_vector(points: Array, rim: Integers) -> Array:
     """Integral of x cross dx / 2 along a closed line of straight or parabolic edges: area times normal of a cap."""
     a, b = points[rim[:, 0]], points[rim[:, 1]]
     if rim.shape[1] == 2:
-        return np.asarray(np.cross(a, b).sum(axis=0) / 2)
+        return np.cross(a, b).sum(axis=0) / 2
     m = points[rim[:, 2]]
-    return np.asarray((4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6)
+    return (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6
 
 
 def cap_volume(points: Array, rim: Integers) -> float:
@@ -245,10 +238,10 @@ def jacobian_determinants(file: MeshFile) -> Array:
     slopes = table[1:, :, :, 0]  # (3, points, nodes)
     nodes = file.points[file.cells[:, node_order(file)]]
     jacobians = np.tensordot(nodes, slopes, axes=(1, 2))  # (elements, coordinates, directions, points)
-    return np.asarray(det(np.moveaxis(jacobians, 3, 1)))
+    return det(np.moveaxis(jacobians, 3, 1))
 
 
-def node_order(file: MeshFile) -> NDArray[np.int64]:
+def node_order(file: MeshFile) -> Integers:
     """dolfinx's order of an element's nodes, as places in Gmsh's."""
     kind = getattr(dolfinx.mesh.CellType, file.kind)
     return np.asarray(dolfinx.cpp.io.perm_gmsh(kind, file.cells.shape[1]), dtype=np.int64)
@@ -257,8 +250,8 @@ def node_order(file: MeshFile) -> NDArray[np.int64]:
 def area_vectors(places: Array) -> Array:
     """Area times normal of facets at (facets, 3 or 4, 3): half the cross product of two edges, or of the diagonals."""
     if places.shape[1] == 3:
-        return np.asarray(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2)
-    return np.asarray(np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2)
+        return np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2
+    return np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2
 
 
 def _middle(file: MeshFile, cell: Any, pair: Any) -> int:
@@ -266,140 +259,3 @@ def _middle(file: MeshFile, cell: Any, pair: Any) -> int:
     element = basix.create_element(basix.ElementFamily.P, basix.CellType[file.kind], 2)
     edges = file.cells[cell][node_order(file)][np.array(element.entity_closure_dofs[1])]  # ends, middle
     return next(middle for *ends, middle in as_rows(edges) if {*ends} == {*pair.tolist()})
-
-
-# ---------------------------------------------------------------- supports of faces
-Density = Callable[[Any], Any]
-
-GUIDE = (
-    1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
-)
-PARALLEL = 1e-3  # radians between normals: what a mesh in single precision has
-LEAST_TANGENTIAL = 0.5  # measured with ends held: 0 has one or two negative eigenvalues, 0.3 and 1 have none
-STILL = 1e-8  # smallest eigenvalue over the largest below which nothing holds a rigid motion
-
-
-def add_support(
-    loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None
-) -> None:
-    """Hold a face, which a load may move along its normal: its name, and how far at magnitude 1."""
-    if support.kind == "held":  # u = d N
-        domain: MeshDomain = loading.domain  # type: ignore[assignment]
-        for part, facets in domain.facets_of_parts(face):
-            loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
-        loading.supports[face] = None
-    elif support.kind in _DENSITIES:
-        density = _DENSITIES[support.kind](loading, face, support, moves)
-        half, measure = loading.constant((support.stiffness or stiffness) / 2), loading.surface_measure(face)
-
-        def potential(u: Any) -> Any:
-            return half * density(loading.kinematics.displacement(u)) * loading.weight * measure
-
-        loading.add_potential(potential)
-        loading.supports[face] = potential
-
-
-def _guided(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N - d)^2 + (u . c)^2."""
-    sliding = _sliding(loading, face, support, moves)
-    normal, centre = of_parts(loading, face, "normal"), of_parts(loading, face, "centre")
-    around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
-    # a Constant: a number in the kernel would be another kernel for each mesh
-    squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
-    return lambda u: sliding(u) + ufl.inner(u, around) ** 2 / squared
-
-
-def _sliding(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N - d)^2."""
-    normal = of_parts(loading, face, "normal")
-    way = loading.magnitude(*moves) if moves else 0.0
-    return lambda u: (ufl.inner(u, normal) - way) ** 2
-
-
-def _elastic(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N)^2 + s |u - (u . N) N|^2, N of the place."""
-    share, normal = loading.constant(support.tangential), ufl.FacetNormal(loading.domain.mesh)
-    return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, normal) ** 2
-
-
-# what a face's springs store over half of their stiffness, by the kind of support
-_DENSITIES: dict[str, Callable[[Loading, str, Support, tuple[str, float] | None], Density]] = {
-    "guided": _guided,
-    "sliding": _sliding,
-    "elastic": _elastic,
-}
-
-
-def of_parts(loading: Loading, face: str, name: str) -> Any:
-    """A vector of each part of the face, as a function that is constant on elements."""
-    domain: MeshDomain = loading.domain  # type: ignore[assignment]
-    element = basix_ufl.element("DG", domain.mesh.topology.cell_name(), 0, shape=(3,))
-    field: Any = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, element))
-    values = domain.of_parts(face, name)
-    field.x.array.reshape(-1, 3)[np.asarray(field.function_space.dofmap.list).reshape(-1)] = values
-    return field
-
-
-# ---------------------------------------------------------------- rigid motions
-
-
-def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
-    """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that."""
-    if free := free_motions(domain.parts, supports):
-        kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
-        raise SceneError(f"supports ({kinds}): they leave the body free to move, in {free} of 6 rigid motions")
-    sliding = [part for part in domain.parts if supports.get(part.name, Support(kind="free")).kind == "sliding"]
-    if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
-        raise SceneError(
-            "loads.elongation: both ends slide and are not parallel, so the elongation would only shift the body, "
-            "held by the pressure on its ends; allowed with an end that is 'guided' or 'held'"
-        )
-    for name, support in supports.items():
-        warn_of_twist(name, support, domain.comm)
-
-
-def warn_of_twist(name: str, support: Support, comm: Any) -> None:
-    """Say so where springs may turn a body about its axis."""
-    if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and comm.rank == 0:
-        log.warning(
-            "supports.%s.tangential = %g: springs that hardly hold a wall across their direction push it sideways "
-            "once it has grown, and it twists; with %g and more no wall has twisted",
-            name, support.tangential, LEAST_TANGENTIAL,
-        )  # fmt: skip
-
-
-def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
-    """How many rigid motions of the body no support holds: of the 6 x 6 matrix of the supports over them."""
-    everywhere = np.concatenate([part.places for part in parts])
-    middle = everywhere.mean(axis=0)
-    size = float(np.linalg.norm(everywhere - middle, axis=1).max())
-    matrix = np.zeros((6, 6))
-    for part in parts:
-        support = supports.get(part.name)
-        if support is not None and support.kind != "free":
-            # halfway to the corners, exact on triangles: a single one is held against turns too. Springs along N alone
-            # are taken at the middles: around a tube they would hold its facets, but nothing of the round body
-            share = 0.0 if support.kind == "elastic" and not support.tangential else 0.5
-            for places in np.swapaxes((1 - share) * part.places[:, None] + share * part.corners, 0, 1):
-                # displacements (facets, 6, 3) of the unit motions along and about the axes
-                turns = np.cross(np.eye(3)[None], (places - middle)[:, None] / size)
-                motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
-                held = _held_directions(support, part, places)
-                matrix += np.einsum("fki,fij,flj->kl", motions, held, motions) / len(motions)
-    values = np.linalg.eigvalsh(matrix)
-    return int(np.sum(values <= STILL * max(float(values[-1]), 1e-300)))
-
-
-def _held_directions(support: Support, part: Face, places: Array) -> Array:
-    """What a support holds at a place of each facet of a part, as projections (facets, 3, 3)."""
-    along = np.broadcast_to(np.outer(part.normal, part.normal), (len(part.places), 3, 3))
-    around = np.cross(part.normal, places - part.centre)
-    around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
-    own = part.normals
-    share, springs = support.tangential, np.einsum("fi,fj->fij", own, own)
-    return {
-        "guided": along + np.einsum("fi,fj->fij", around, around),
-        "sliding": along,
-        "held": np.broadcast_to(np.eye(3), along.shape),
-        "elastic": share * np.eye(3) + (1 - share) * springs,
-    }[support.kind]

@@ -13,9 +13,7 @@ import importlib
 import itertools
 import json
 import logging
-import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -26,11 +24,10 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.surface_file import of_vtk, triangles_of, vtk_arrays
 from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.system.children import DAMAGED, read_guarded
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # by meshio's names of types of elements
 VOLUMES = {
@@ -42,6 +39,11 @@ VOLUMES = {
 FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of facets
 WEDGE = "wedge"
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27, wedges of 6"
+# by Gmsh's numbers of types of elements
+GMSH_KINDS = {
+    15: "vertex", 1: "line", 8: "line3", 2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
+    4: "tetra", 11: "tetra10", 5: "hexahedron", 12: "hexahedron27", 6: WEDGE,
+}  # fmt: skip
 # Gmsh's order of nodes, as places in VTK's, which meshio has
 # https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering, https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron)
 ORDERS = {
@@ -68,6 +70,13 @@ class MeshFile:
     data: bytes
     sha256: str
     surfaces: Mapping[str, bytes] = MappingProxyType({})
+
+    @property
+    def blocks(self) -> list[Block]:
+        """Facets by their corners, and elements."""
+        (kind,) = (name for name, of_kind in VOLUMES.items() if of_kind == (self.kind, self.degree))
+        side = "triangle" if self.kind == "tetrahedron" else "quad"
+        return [Block(side, self.facet_groups, self.facets), Block(kind, self.cell_groups, self.cells)]
 
     @property
     def corners(self) -> Integers:
@@ -102,7 +111,10 @@ def distinct(values: Integers) -> list[int]:
 
 # ---------------------------------------------------------------- files, by VTK and meshio
 
-ENDINGS = (".msh", ".vtu", ".vtk", ".xdmf")
+READERS = {
+    ".msh": "remodel_fenicsx.body.gmsh_file:arrays_msh",
+    **{f".{kind}": f"{__name__}:arrays_{kind}" for kind in ("vtu", "vtk", "xdmf")},
+}
 SAVED_OTHERWISE = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
 TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
 """Arrays of numbers of faces and volumes: as meshio, VMTK and Medit call them."""
@@ -120,10 +132,10 @@ class ExchangeFile(NamedTuple):
 
 
 def read_exchange_file(path: Path) -> ExchangeFile:
-    """Read one; its ending is one of `ENDINGS`."""
+    """Read one; its ending is one of `READERS`."""
     ending = path.suffix.lower()
     try:
-        arrays, data = read_guarded(path, f"{__name__}:arrays_{ending[1:]}")
+        arrays, data = read_guarded(path, READERS[ending])
     except UnreadableFile as error:
         is_exchanged = ending != ".msh" and str(error).startswith(DAMAGED)
         raise UnreadableFile(f"{error}{SAVED_OTHERWISE if is_exchanged else ''}") from None
@@ -143,7 +155,9 @@ def read_exchange_file(path: Path) -> ExchangeFile:
 
 def arrays_xdmf(file: str) -> dict[str, Any]:
     """Those of a file in XDMF."""
-    return _as_arrays(importlib.import_module("meshio.xdmf").read(file))
+    mesh = importlib.import_module("meshio.xdmf").read(file)
+    cells = [_in_gmsh_order(block.type, block.data) for block in mesh.cells]
+    return as_arrays(mesh.points, cells, mesh.point_data, mesh.cell_data)
 
 
 def arrays_vtu(file: str) -> dict[str, Any]:
@@ -158,7 +172,6 @@ def arrays_vtk(file: str) -> dict[str, Any]:
 
 def _of_vtk(reader: str, module: str, file: str) -> dict[str, Any]:
     """By VTK itself, as meshio would have them."""
-    import meshio
     from meshio._vtk_common import vtk_to_meshio_type
 
     made, numbers = of_vtk(module, reader)(), of_vtk("util.numpy_support", "vtk_to_numpy")
@@ -176,20 +189,26 @@ def _of_vtk(reader: str, module: str, file: str) -> dict[str, Any]:
     cells, pieces = [], [slice(a, b) for a, b in itertools.pairwise(cuts)]
     for piece in pieces:
         rows = nodes[starts[piece.start] : starts[piece.stop]].reshape(piece.stop - piece.start, -1)
-        cells.append((vtk_to_meshio_type[int(types[piece.start])], rows))
+        cells.append(_in_gmsh_order(vtk_to_meshio_type[int(types[piece.start])], rows))
 
     of_cells = {name: [values[piece] for piece in pieces] for name, values in vtk_arrays(grid.GetCellData()).items()}
     points = numbers(grid.GetPoints().GetData())
-    return _as_arrays(meshio.Mesh(points, cells, vtk_arrays(grid.GetPointData()), of_cells))
+    return as_arrays(points, cells, vtk_arrays(grid.GetPointData()), of_cells)
 
 
-def _as_arrays(mesh: Any, group_names: list[tuple[int, int, str]] | None = None) -> dict[str, Any]:
-    names = [[block.type for block in mesh.cells], [*mesh.point_data], [*mesh.cell_data], group_names or []]
-    found = {"names": np.frombuffer(json.dumps(names).encode(), np.uint8), "points": mesh.points}
-    found |= {f"cells{n}": block.data for n, block in enumerate(mesh.cells)}
-    found |= {f"point_data{n}": values for n, values in enumerate(mesh.point_data.values())}
-    blocks = enumerate(mesh.cell_data.values())
+def as_arrays(
+    points: Any, cells: Any, point_data: Any, cell_data: Any, group_names: Sequence[tuple[int, int, str]] = ()
+) -> dict[str, Any]:
+    names = [[kind for kind, _ in cells], [*point_data], [*cell_data], group_names]
+    found = {"names": np.frombuffer(json.dumps(names).encode(), np.uint8), "points": points}
+    found |= {f"cells{n}": rows for n, (_, rows) in enumerate(cells)}
+    found |= {f"point_data{n}": values for n, values in enumerate(point_data.values())}
+    blocks = enumerate(cell_data.values())
     return found | {f"cell_data{n}_{m}": values for n, listed in blocks for m, values in enumerate(listed)}
+
+
+def _in_gmsh_order(kind: str, rows: Any) -> tuple[str, Any]:
+    return kind, rows[:, ORDERS.get(kind, slice(None))]
 
 
 def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()) -> MeshFile:
@@ -216,7 +235,7 @@ def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tu
     for dimension, number, name in mesh.group_names:
         names.setdefault(dimension, {})[name] = number
     blocks = [
-        Block(kind, groups, np.asarray(rows, dtype=np.int64)[:, ORDERS.get(kind, slice(None))])
+        Block(kind, groups, np.asarray(rows, dtype=np.int64))
         for (kind, rows), groups in zip(mesh.cells, _tags(mesh, tags, bool(surfaces)), strict=True)
     ]
     found = assembled(points, blocks, {dimension: names[dimension] for dimension in (2, 3)}, mesh.data)
@@ -282,109 +301,6 @@ def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> list[Inte
     return found
 
 
-# ---------------------------------------------------------------- Gmsh's own format
-# meshio passes over lines that a section does not announce, takes the last numbers of any element for its nodes, and
-# knows one group only of a part in format 4.1.
-
-_FORMAT = re.compile(rb"\$MeshFormat\s+(2\.2|4\.1) 0 \d+\s+\$EndMeshFormat")
-_SECTION = re.compile(rb"^\$(\w+)\s*?\n(.*?)^\$End\1\b", re.DOTALL | re.MULTILINE)
-_OTHER_NUMBERS = "has other numbers than $Nodes and $Elements announce"
-_GROUP_NAME = re.compile(r'([0-3])\s+(\d{1,9})\s+"([^"\x00-\x1f]{0,127})"')
-_NO_NODE = re.compile(rb"^[ \t]*(\d+)(?:[ \t]+-?\d+){4}.*[ \t](0|-\d+)(?!\S)", re.MULTILINE)
-
-
-def arrays_msh(file: str) -> dict[str, Any]:
-    """Those of a file by Gmsh, where elements of several groups are there several times."""
-    data = Path(file).read_bytes()
-    version = _FORMAT.match(data)
-    if version is None:
-        raise UnreadableFile("is no mesh by Gmsh in format 2.2 or 4.1 as text (in Gmsh: Mesh.Binary = 0)")
-    found = _SECTION.findall(data)
-    if rest := _SECTION.sub(b"", data).split():
-        words = b" ".join(rest[:9])[:40].decode("ascii", "replace")
-        raise UnreadableFile(f"has {words!r} outside of its sections: is it cut off?")
-    for name in (b"Nodes", b"Elements"):
-        if [listed for listed, _ in found].count(name) != 1:
-            raise UnreadableFile(f"must have one section ${name.decode()}")
-    sections = dict(found)
-    groups, names = _groups_of_entities(sections.get(b"Entities", b"0 0 0 0")), _group_names(sections)
-    if parts := sections.get(b"PartitionedEntities"):
-        ghosts, *rows = parts.strip().split(b"\n")[1:]
-        groups |= _groups_of_entities(b"\n".join(rows[int(ghosts) :]), is_partitioned=True)
-    # without its groups, for meshio reads those of all parts or none
-    plain = version[0] + b"".join(b"\n$%s\n%s$End%s" % (k, sections[k], k) for k in (b"Nodes", b"Elements"))
-    Path(file).write_bytes(plain)  # in this process' memory
-    try:
-        mesh = importlib.import_module("meshio.gmsh").read(file)
-    except importlib.import_module("meshio").ReadError as error:
-        todo = "; save it without, in Gmsh: Mesh.SaveParametric = 0" if "parametric" in str(error) else ""
-        raise UnreadableFile(f"{error}{todo}") from None
-    except (IndexError, ValueError) as error:
-        raise UnreadableFile(f"{_OTHER_NUMBERS}, or nodes that are not there: {error}") from None
-    _check_numbers(sections, version[1], mesh)
-    if version[1] == b"4.1":
-        _add_groups(mesh, groups)
-    mesh.point_data = {}
-    return _as_arrays(mesh, names)
-
-
-def _group_names(sections: dict[bytes, bytes]) -> list[tuple[int, int, str]]:
-    """Dimensions, numbers and names of the physical groups."""
-    text = sections.get(b"PhysicalNames", b"0").decode("utf-8", "replace")
-    number, *lines = [line.strip() for line in text.split("\n") if line.strip()] or [""]
-    found = [_GROUP_NAME.fullmatch(line) for line in lines]
-    names = [(int(one[1]), int(one[2]), one[3]) for one in found if one is not None]
-    if number != str(len({(dimension, name) for dimension, _, name in names})) or None in found:
-        raise UnreadableFile("$PhysicalNames must have the lines that it announces: dimension, number and a new name")
-    return names
-
-
-def _groups_of_entities(text: bytes, is_partitioned: bool = False) -> dict[tuple[int, int], list[int]]:
-    """Numbers of the groups of points, curves, faces and volumes, by dimension and number."""
-    counts, *rows = [line.split() for line in text.splitlines() if line.strip()]
-    dimensions: Any = np.repeat(np.arange(4), np.array(counts, dtype=np.int64)).tolist()
-    if len(rows) != len(dimensions):
-        raise UnreadableFile(f"$Entities has {len(rows)} lines, but announces {len(dimensions)}")
-    found: dict[tuple[int, int], list[int]] = {}
-    for dimension, row in zip(dimensions, rows, strict=True):
-        if is_partitioned:  # behind the number: what it is a part of, and how many partitions have it, and which
-            del row[1 : 4 + int(row[3])]
-        start = 8 if dimension else 5  # behind the number, the box around it, and how many groups there are
-        groups = row[start : start + int(row[start - 1])]
-        found[dimension, int(row[0])] = [abs(int(group)) for group in groups]
-    return found
-
-
-def _check_numbers(sections: dict[bytes, bytes], version: bytes, mesh: Any) -> None:
-    """Whether the file has no other numbers than those that were read, and no nodes below 1."""
-    is_old, found = version == b"2.2", {}
-    for name in (b"Nodes", b"Elements"):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # NumPy reads up to what is no number, and warns
-            try:
-                found[name] = np.fromstring(sections[name], sep=" ")
-            except (ValueError, DeprecationWarning):
-                raise UnreadableFile(f"${name.decode()} has words among its numbers") from None
-    beside = 5 if is_old else 1  # an element's number; its type, how many tags it has, and these
-    in_elements = sum(len(block.data) * (beside + block.data.shape[1]) for block in mesh.cells)
-    heads = (1, 1) if is_old else (4 + 4 * int(found[b"Nodes"][0]), 4 + 4 * len(mesh.cells))
-    if is_old and len(found[b"Elements"]) > 3 and found[b"Elements"][3] > 2:
-        raise UnreadableFile("is partitioned; save it without, in Gmsh: Mesh, Unpartition (or in format 4.1)")
-    if [*map(len, found.values())] != [heads[0] + 4 * len(mesh.points), heads[1] + in_elements]:
-        raise UnreadableFile(_OTHER_NUMBERS)
-    if is_old and (lost := _NO_NODE.search(sections[b"Elements"])):
-        raise UnreadableFile(f"element {int(lost[1])} has the node {int(lost[2])}: nodes have numbers above zero")
-
-
-def _add_groups(mesh: Any, groups_of: dict[tuple[int, int], list[int]]) -> None:
-    """Of format 4.1: each block once for each of its groups."""
-    blocks = []
-    for block, entities in zip(mesh.cells, mesh.cell_data["gmsh:geometrical"], strict=True):
-        for group in groups_of.get((block.dim, int(entities[0])) if len(entities) else (0, 0)) or [0]:
-            blocks.append((block, np.full(len(block.data), group)))
-    mesh.cells, mesh.cell_data = [block for block, _ in blocks], {TAGS[0]: [groups for _, groups in blocks]}
-
-
 # ---------------------------------------------------------------- what all lead to
 
 
@@ -408,7 +324,7 @@ def split_wedges(nodes: Integers) -> Integers:
     rows = np.arange(len(nodes))
     seen = nodes[rows[:, None], _SEEN[nodes.argmin(axis=1)]]
     other = np.minimum(seen[:, 1], seen[:, 5]) < np.minimum(seen[:, 2], seen[:, 4])
-    return np.asarray(seen[rows[:, None, None], _SPLIT[other.astype(int)]])
+    return seen[rows[:, None, None], _SPLIT[other.astype(int)]]
 
 
 def split_quads(nodes: Integers) -> Integers:
@@ -478,3 +394,21 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
         data,
         hashlib.sha256(data).hexdigest(),
     )
+
+
+def gmsh_text(points: Array, blocks: Iterable[Block], names: Mapping[int, Mapping[str, int]]) -> str:
+    """A mesh as the text of a Gmsh file, format 2.2; nodes have the numbers 1, 2, ... in their order."""
+    numbers = {kind: number for number, kind in GMSH_KINDS.items()}
+    groups = [f'{dimension} {number} "{name}"' for dimension, by in names.items() for name, number in by.items()]
+    places = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points]
+    rows = [
+        f"{numbers[kind]} 2 {group} {group} {' '.join(map(str, row))}"
+        for kind, of_rows, nodes in blocks
+        for group, row in zip(of_rows, as_rows(nodes + 1), strict=True)
+    ]
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(groups)), *groups]
+    lines += ["$EndPhysicalNames"]
+    for section, found in (("Nodes", places), ("Elements", rows)):
+        listed = (f"{number} {row}" for number, row in enumerate(found, start=1))
+        lines += [f"${section}", str(len(found)), *listed, f"$End{section}"]
+    return "\n".join([*lines, ""])

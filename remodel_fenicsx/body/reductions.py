@@ -12,48 +12,53 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import AUTO
 from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import LARGEST_MESH
-from remodel_fenicsx.schema.tables import fault
 
 
 # ---------------------------------------------------------------- whole bodies for pictures
 # Whole bodies for pictures, from the meshes of reductions: extended, revolved or mirrored.
 #  Meshes are points (n, 3) and the corners of the elements (m, 2, 4 or 8) in VTK's order.
 
-Array = NDArray[np.float64]
-Corners = NDArray[np.int64]
-Body = tuple[Array, Corners]
+Body = tuple[Array, Integers]
 
 ROUND, LONG = 16, 12  # elements around and along, the paper's of its artery
 
 
-def extended(points: Array, lines: Corners, length: float) -> Body:
+def _swept(levels: Array, elements: Integers) -> Body:
+    """Elements of one more dimension between the same mesh at places (levels, nodes, 3)."""
+    near = np.arange(len(levels) - 1)[:, None, None] * levels.shape[1] + elements
+    far = near + levels.shape[1]
+    found = np.concatenate([near, far[..., ::-1] if elements.shape[1] == 2 else far], axis=-1)
+    return _shared(levels.reshape(-1, 3), found.reshape(-1, 2 * elements.shape[1]))
+
+
+def _between(low: Array, high: Array) -> Array:
+    """Places of a mesh at `LONG` + 1 levels, (levels, nodes, 3)."""
+    share = np.linspace(0.0, 1.0, LONG + 1)[:, None, None]
+    return (1.0 - share) * low + share * high
+
+
+def extended(points: Array, lines: Integers, length: float) -> Body:
     """Quadrilaterals of lines across z, from z = 0 to the length."""
-    levels = np.linspace(0.0, length, LONG + 1)
-    found = np.tile(points, (LONG + 1, 1))
-    found[:, 2] = np.repeat(levels, len(points))
-    first = np.arange(LONG)[:, None, None] * len(points) + lines
-    return found, np.concatenate([first, first[..., ::-1] + len(points)], axis=-1).reshape(-1, 4)
+    low = points * [1.0, 1.0, 0.0]
+    return _swept(_between(low, low + [0.0, 0.0, length]), lines)
 
 
-def revolved(points: Array, quadrilaterals: Corners) -> Body:
-    """Hexahedra around the z axis of quadrilaterals in the half-plane y = 0."""
-    angles = 2 * np.pi * np.arange(ROUND) / ROUND
-    radii, z = points[:, 0], np.tile(points[:, 2], ROUND)
-    found = np.stack([np.outer(np.cos(angles), radii).ravel(), np.outer(np.sin(angles), radii).ravel(), z], axis=1)
-    start = np.arange(ROUND)[:, None, None] * len(points)
-    here, next_one = start + quadrilaterals, np.roll(start, -1, axis=0) + quadrilaterals
-    return found, _oriented(found, np.concatenate([here, next_one], axis=-1).reshape(-1, 8))
+def revolved(points: Array, quadrilaterals: Integers) -> Body:
+    """Hexahedra around the z axis of quadrilaterals in the half-plane y = 0, x before z."""
+    angles = -2 * np.pi * np.arange(ROUND + 1)[:, None] / ROUND  # the volumes of VTK's hexahedra are positive
+    radii, z = points[:, 0], np.broadcast_to(points[:, 2], (ROUND + 1, len(points)))
+    return _swept(np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1), quadrilaterals)
 
 
-def mirrored_twice(points: Array, elements: Corners) -> Body:
+def mirrored_twice(points: Array, elements: Integers) -> Body:
     """The quarter x > 0, y > 0 and its images in the planes x = 0 and y = 0; nodes on the planes are shared."""
     signs = np.array([(1.0, 1.0, 1.0), (-1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, 1.0)])
     every = (np.arange(4)[:, None, None] * len(points) + elements).reshape(-1, elements.shape[1])
@@ -61,7 +66,7 @@ def mirrored_twice(points: Array, elements: Corners) -> Body:
     return points, _oriented(points, elements)
 
 
-def _shared(points: Array, elements: Corners) -> Body:
+def _shared(points: Array, elements: Integers) -> Body:
     """Nodes at one place become one."""
     places = np.rint(points / (1e-7 * np.abs(points).max())).astype(np.int64)
     _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
@@ -76,20 +81,17 @@ _SIDES = {
 _MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}
 
 
-def _oriented(points: Array, elements: Corners) -> Corners:
+def _oriented(points: Array, elements: Integers) -> Integers:
     """The same hexahedra or tetrahedra, all of positive volume as VTK has them."""
     size = elements.shape[1]
     is_mirrored = np.linalg.det(np.array(_SIDES[size], dtype=np.float64) @ points[elements]) < 0
     return np.where(is_mirrored[:, None], elements[:, _MIRRORED[size]], elements)
 
 
-def divided_along(points: Array, hexahedra: Corners) -> Body:
+def divided_along(points: Array, hexahedra: Integers) -> Body:
     """One layer of hexahedra from a bottom to a top face across z, in `LONG` layers."""
-    low, high = points[hexahedra[:, :4]], points[hexahedra[:, 4:]]
-    share = np.linspace(0.0, 1.0, LONG + 1)[:, None, None, None]
-    levels = (1.0 - share) * low + share * high  # (levels, elements, 4, 3)
-    nodes = np.arange((LONG + 1) * len(hexahedra) * 4).reshape(LONG + 1, -1, 4)
-    return _shared(levels.reshape(-1, 3), np.concatenate([nodes[:-1], nodes[1:]], axis=-1).reshape(-1, 8))
+    low, high = (points[hexahedra[:, side].ravel()] for side in (slice(4), slice(4, 8)))
+    return _swept(_between(low, high), np.arange(len(low)).reshape(-1, 4))
 
 
 def box(*sides: float) -> Body:
@@ -123,7 +125,7 @@ class Strut:
 
 
 Rule = Callable[[Any], str | None]
-Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Turn = Callable[[Array], Array]
 POINTS = {
     ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
     ("hexahedron", 1): 8, ("hexahedron", 2): 27, ("tetrahedron", 1): 1, ("tetrahedron", 2): 4,
@@ -165,7 +167,7 @@ class Reduction:
     elements: Callable[[Any], int]
     rules: tuple[Rule, ...]
     turn: Turn
-    whole: Callable[[Any, NDArray[np.float64], Corners], Body] | None = None
+    whole: Callable[[Any, Array, Integers], Body] | None = None
     in_the_mean: tuple[Rule, ...] = ()
 
 
@@ -271,14 +273,14 @@ def elements(scene: Any, name: str) -> int:
     return scene.geometry.number_of_elements * scene.mesh.refinement**3
 
 
-def check_number(scene: Any) -> None:
-    """Refuse a body, or the part that stands for it, of too many elements: raise a `fault` that names the key."""
+def too_many_elements(scene: Any) -> str:
+    """What is allowed where a body, or the part that stands for it, has too many elements; nothing elsewhere."""
     name, refinement = choice(scene).name, scene.mesh.refinement
-    if (number := elements(scene, name)) > LARGEST_MESH:
-        dimension = {"interval": 1, "quadrilateral": 2}.get(KINEMATICS[name].element(scene.mesh.element), 3)
-        largest = math.floor(math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension))
-        rule = f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
-        raise fault(rule, "mesh.refinement", refinement)
+    if (number := elements(scene, name)) <= LARGEST_MESH:
+        return ""
+    dimension = {"interval": 1, "quadrilateral": 2}.get(KINEMATICS[name].element(scene.mesh.element), 3)
+    largest = math.floor(math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension))
+    return f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
 
 
 def step_cost(scene: Any, name: str) -> float:
@@ -301,13 +303,13 @@ def _leaves_symmetry(scene: Any) -> str:
 
 
 # ---------------------------------------------------------------- where the body's places are in the reduction
-def about_z(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def about_z(places: Array) -> Array:
     """x, y, z become the radial, circumferential and axial direction."""
     circumferential, axial, radial = np.moveaxis(cylindrical_axes(places), -2, 0)
     return np.stack([radial, circumferential, axial], axis=-1)
 
 
-def mirrored(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def mirrored(places: Array) -> Array:
     """The quarter x > 0, y > 0 becomes each of the four."""
     signs = np.where(places < -1e-9 * np.abs(places).max(), -1.0, 1.0)
     signs[:, 2] = 1.0

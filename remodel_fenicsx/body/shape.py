@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field
 
 from remodel_fenicsx.body.gmsh_model import length_fault
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis, global_axes
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import (
     NAME,
     TURNOVER_POWER,
@@ -27,9 +26,8 @@ from remodel_fenicsx.schema.settings import (
     Region,
     Support,
     faces_of,
-    in_region,
 )
-from remodel_fenicsx.schema.tables import fault, refuse, with_key
+from remodel_fenicsx.schema.tables import fault, with_key
 from remodel_fenicsx.schema.units import FORCE, Dimension, LengthUnit
 
 if TYPE_CHECKING:
@@ -42,8 +40,6 @@ if TYPE_CHECKING:
 
 # ---------------------------------------------------------------- the columns of a history
 # Those of every shape, those on request, and which a scene has.
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -122,7 +118,7 @@ def profile_weights(depth: Array) -> Array:
 
 def _profile(number: int, m: Any) -> float:
     hats = m.tool("hats", lambda: profile_weights(m.state.cells.local_axes.depth))
-    return float(m.quadrature.mean_of_known(m.fibre_angle, hats[..., number]))
+    return m.quadrature.mean_of_known(m.fibre_angle, hats[..., number])
 
 
 _PROFILE_COLUMNS = tuple(
@@ -148,14 +144,14 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
             f"fibre_angle_{name}",
             "degrees",
             f"mean reference fibre angle in the region `{name}`",
-            lambda m: float(m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name))),
+            lambda m: m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name)),
             by_case=False,
         ),
         Column(
             f"max_chain_extension_{name}",
             "",
             f"largest r/L in the region `{name}`",
-            lambda m: float(m.quadrature.maximum(m.chain_extension * m.elements_of_region(name)[:, None])),
+            lambda m: m.quadrature.maximum(m.chain_extension * m.elements_of_region(name)[:, None]),
             extreme=True,
         ),
     )
@@ -256,7 +252,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "growth",
             "",
             "volume of the tissue free of stress over that at the start; mean over the volume at the start",
-            lambda m: float(m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio)),
+            lambda m: m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio),
             by_case=False,
         ),
         Column(
@@ -395,6 +391,8 @@ class LoadKind:
         Magnitude from which on a value is hardly meant, and what may have been.
     instead_of
         Name of another load that a scene may have in its place, not beside it.
+    of_one_strain
+        Whether it is a strain of the whole body, for kinematics whose strain is the same everywhere.
 
     Examples
     --------
@@ -426,6 +424,7 @@ class LoadKind:
     area: Callable[[Any], float] | None = None
     doubtful: tuple[float, str] | None = None
     instead_of: str = ""
+    of_one_strain: bool = False
 
     def column_name(self, name: str) -> str:
         """Of its column, for the load of this name."""
@@ -550,19 +549,9 @@ class Shape(_Is):  # type: ignore[misc]
     defaults: ClassVar[dict[str, Any]] = {}
     supported_faces: ClassVar[tuple[str, ...] | None] = ()
 
-    shape: str = Field(description="Which body it is.")
+    shape: str
+    """Which body it is."""
     length_unit: LengthUnit = None
-
-    @classmethod
-    def is_a(cls, kind: str) -> bool:
-        """Whether a class of this name, `WithRegions` say, is among its own: tables of settings cannot import them.
-
-        Parameters
-        ----------
-        kind
-            Its name.
-        """
-        return any(base.__name__ == kind for base in cls.__mro__)
 
     @property
     def is_loaded(self) -> bool:
@@ -610,7 +599,7 @@ class Shape(_Is):  # type: ignore[misc]
         coordinates
             Reference places, (..., 3), in the unit of length.
         """
-        return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
+        return self.station(coordinates)
 
     def station(self, coordinates: Array) -> Array:
         """How far places (..., 3) are along the body, from 0 to 1: here along z.
@@ -620,7 +609,8 @@ class Shape(_Is):  # type: ignore[misc]
         coordinates
             Reference places, (..., 3), in the unit of length.
         """
-        return np.asarray(coordinates[..., 2] / self.axial_length, dtype=np.float64)
+        found: Any = coordinates[..., 2] / self.axial_length
+        return found
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
         """Axes, depth and station at the points of a mesh of the body: here functions of the place.
@@ -793,30 +783,6 @@ class Shape(_Is):  # type: ignore[misc]
         """Values that a scene as run has in place of its own, by dotted key, and files beside it by name."""
         return {}, {}
 
-    def check_with(self, scene: Any, key: str) -> None:
-        """Mesh and regions that the shape can have; where it is the loaded one, whether the unloaded can be found."""
-        self.check_size(scene.mesh)
-        for name in scene.loads:
-            if (other := scene.load_kinds[name].instead_of) in scene.loads:
-                raise fault(f"not allowed beside loads.{other}: either", f"loads.{name}", scene.loads[name].value)
-        if isinstance(self, WithRegions):
-            self.check_regions(scene.regions, scene.mesh)
-        if not self.is_loaded:
-            return
-        measured = [f"{in_region(name)}cells.fibres" for name in scene.measured_cells]
-        reasons = {
-            f"allowed for the shapes {scene.shapes_that(lambda kind: kind.is_a('Unloads'))}": not isinstance(
-                self, Unloads
-            ),
-            "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius": (
-                scene.supports.ends == "clamped"
-            ),
-            f"not allowed with {', '.join(measured)}: its rows belong to places, which unloading moves": measured,
-            "not allowed with [[cases]]: the loaded body belongs to one set of loads; remodel-fenicsx unload SCENE, "
-            "with those alone, writes the scene of the unloaded one, to which [[cases]] may be added": scene.cases,
-        }
-        refuse(f"{key}.is", "loaded", reasons)
-
     def check_size(self, mesh: Mesh) -> None:
         """Refuse a mesh that the shape cannot have, whatever its size: raise a `fault` that names the key."""
 
@@ -973,7 +939,7 @@ def cauchy_columns(*names: str) -> tuple[Column, ...]:
 
     def mean(name: str, m: Any) -> float:
         row, column = "xyz".index(name[0]), "xyz".index(name[-1])
-        return float(m.quadrature.mean(m.stress[..., row, column]))
+        return m.quadrature.mean(m.stress[..., row, column])
 
     return tuple(
         Column(f"cauchy_stress_{name}", "stress", f"Cauchy stress {name}, volume mean", partial(mean, name))

@@ -6,15 +6,12 @@ from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from remodel_fenicsx.body.cube import Box
-from remodel_fenicsx.body.reductions import choice
 from remodel_fenicsx.body.shape import Column, LoadKind, cauchy_columns
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.schema.tables import fault
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.units import FORCE, LENGTH
 
 SIDES = "xy"
@@ -22,14 +19,14 @@ SIDES = "xy"
 
 def _gradient(row: int, column: int) -> Callable[[Any], float]:
     """Volume mean of a component of F; of the length from edge to edge where it is on the diagonal."""
-    return lambda m: float(m.quadrature.mean(m.F[..., row, column]))
+    return lambda m: m.quadrature.mean(m.F[..., row, column])
 
 
 def _nominal(row: int, column: int) -> Callable[[Any], float]:
     """Volume mean of P = J sigma F^-T."""
 
     def value(m: Any) -> float:
-        def mean() -> NDArray[np.float64]:
+        def mean() -> Array:
             stress = np.linalg.det(m.F)[..., None, None] * m.stress @ np.swapaxes(np.linalg.inv(m.F), -1, -2)
             return np.array([[m.quadrature.mean(stress[..., i, j]) for j in range(3)] for i in range(3)])
 
@@ -93,16 +90,17 @@ class Sheet(Box):
     (5.0, 16)
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {
+    loads = {
         **{f"force_{axis}": _force(side) for side, axis in enumerate(SIDES)},
         **{f"elongation_{axis}": _elongation(side) for side, axis in enumerate(SIDES)},
         "shear": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_shear(name),
             "shear F_xy of the sheet, by which places move along x with y; F_yx is 0",
             reductions=("point",),
+            of_one_strain=True,
         ),
     }
-    columns: ClassVar[tuple[Column, ...]] = (
+    columns = (
         Column(
             "fibre_angle",
             "degrees",
@@ -123,29 +121,25 @@ class Sheet(Box):
             for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)), ("yx", (1, 0)))
         ),
     )
-    number_of_elements: ClassVar[int] = 16
+    number_of_elements = 16
     _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
-    depth_in_words: ClassVar[tuple[str, str, str]] = ("through the sheet", "lower face", "upper face")
-    angle_in_words: ClassVar[tuple[str, str]] = ("along x", "across x")
-    buckles: ClassVar[bool] = False  # it lies on z = 0
+    depth_in_words = ("through the sheet", "lower face", "upper face")
+    angle_in_words = ("along x", "across x")
+    buckles = False  # it lies on z = 0
 
-    shape: Literal["sheet"] = Field(default="sheet", description="Which body it is.")
-    length_x: Annotated[float, LENGTH] = Field(default=10.0, gt=0, description="Side along x.")
-    length_y: Annotated[float, LENGTH] = Field(default=10.0, gt=0, description="Side along y.")
-    thickness: Annotated[float, LENGTH] = Field(default=1.0, gt=0, description="Side along z.")
+    shape: Literal["sheet"] = "sheet"
+    """Which body it is."""
+    length_x: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
+    """Side along x."""
+    length_y: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
+    """Side along y."""
+    thickness: Annotated[float, LENGTH] = Field(default=1.0, gt=0)
+    """Side along z."""
 
     @property
     def sides(self) -> dict[str, float]:
         """Along x, y and z, by their keys."""
         return {"length_x": self.length_x, "length_y": self.length_y, "thickness": self.thickness}
-
-    def check_with(self, scene: Any, key: str) -> None:
-        """What all bodies ask, and that the strain is the same everywhere where shear is prescribed."""
-        super().check_with(scene, key)
-        if "shear" in scene.loads and not KINEMATICS[(made := choice(scene)).name].homogeneous:
-            reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
-            rule = f"needs the same strain everywhere, model.kinematics = 'point': {reasons}"
-            raise fault(rule, "loads.shear.value", scene.loads["shear"].value)
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
         """To x."""

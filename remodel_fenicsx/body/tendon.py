@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
-from remodel_fenicsx.body.reductions import Reduction, Strut, cylinder
+from remodel_fenicsx.body.reductions import Strut, cylinder
 from remodel_fenicsx.body.shape import (
-    Column,
-    LoadKind,
     Shape,
     axial_dead_force,
     cauchy_columns,
@@ -22,6 +19,7 @@ from remodel_fenicsx.body.shape import (
     uniaxial_columns,
 )
 from remodel_fenicsx.model.cells import global_axes
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.units import AREA, LENGTH
 
@@ -62,13 +60,13 @@ class Tendon(Shape):
     remodel_fenicsx.schema.tables.SceneError: length = -1.0: must be a finite number greater than 0
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {"force": axial_dead_force("top")}
-    columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("top", "length")
-    columns_on_request: ClassVar[tuple[Column, ...]] = cauchy_columns("x", "y", "z")
-    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
-    number_of_elements: ClassVar[int] = 480
-    face_names: ClassVar[tuple[str, ...]] = ("bottom", "top", "side")
-    reductions: ClassVar[dict[str, Reduction]] = {
+    loads = {"force": axial_dead_force("top")}
+    columns = uniaxial_columns("top", "length")
+    columns_on_request = cauchy_columns("x", "y", "z")
+    axis_kinds = ("global", "cylindrical")
+    number_of_elements = 480
+    face_names = ("bottom", "top", "side")
+    reductions = {
         "point": homogeneous_bar(
             "bottom",
             "top",
@@ -77,13 +75,12 @@ class Tendon(Shape):
         ),
     }
 
-    shape: Literal["tendon"] = Field(default="tendon", description="Which body it is.")
-    length: Annotated[float, LENGTH] = Field(
-        default=10.0, gt=0, description="Length along z, in the scene's unit of length."
-    )
-    area: Annotated[float, AREA] = Field(
-        default=10.0, gt=0, description="Area of the cross-section, in the unit of length squared."
-    )
+    shape: Literal["tendon"] = "tendon"
+    """Which body it is."""
+    length: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
+    """Length along z, in the scene's unit of length."""
+    area: Annotated[float, AREA] = Field(default=10.0, gt=0)
+    """Area of the cross-section, in the unit of length squared."""
 
     @property
     def axial_length(self) -> float:
@@ -162,7 +159,7 @@ def draw_tendon(length: float, area: float, refinement: int = 1, element: str = 
     model.raise_degree(degree, lambda mean_radius: np.square(mean_radius / radius))
 
 
-def core_boundary(radius: float, refinement: int) -> npt.NDArray[np.float64]:
+def core_boundary(radius: float, refinement: int) -> Array:
     """Nodes around the core, (16 refinement, 2), from -45 degrees on: between a square and the circle around it."""
     number, quarter = AROUND * refinement, CORE * refinement
     round_side = model.circle(radius, number, -quarter // 2)

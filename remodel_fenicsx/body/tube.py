@@ -8,14 +8,14 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body import reductions as reduced
-from remodel_fenicsx.body.shape import Array, Column, End, LoadKind, check_lengths
+from remodel_fenicsx.body.shape import Column, End, LoadKind, check_lengths
 from remodel_fenicsx.body.wall import (
     AngleOf,
     CONFIGURATIONS,
@@ -29,6 +29,7 @@ from remodel_fenicsx.body.wall import (
 )
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
@@ -108,7 +109,7 @@ def _dimensions(shape: Any) -> dict[str, float]:
     return {name: float(getattr(shape, name)) for name in ("inner_radius", "outer_radius", "length")}
 
 
-def _in_layers(points: Array, elements: reduced.Corners) -> reduced.Body:
+def _in_layers(points: Array, elements: Integers) -> reduced.Body:
     """Hexahedra of a quarter as long as the body, which pictures show in layers; all others as they are."""
     as_long = np.isclose(np.ptp(points[elements, 2], axis=1), np.ptp(points[:, 2])).all()
     return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
@@ -171,7 +172,7 @@ REDUCTIONS = {
 
 def _mean_radius(face: str) -> Callable[[Any], float]:
     def value(m: Any) -> float:
-        return float(m.face_mean(face, np.linalg.norm(m.position[:, :2], axis=1), deformed=True))
+        return m.face_mean(face, np.linalg.norm(m.position[:, :2], axis=1), deformed=True)
 
     return value
 
@@ -181,7 +182,7 @@ def _mean_hoop_stress(m: Any) -> float:
     local = m.state.cells.local_axes
     around = np.linalg.norm(np.einsum("...ij,...j->...i", m.F, local.axes[..., 0, :]), axis=-1)
     radii = np.linalg.norm(local.coordinates[..., :2], axis=-1)
-    return float(m.quadrature.mean_of_known(m.wall_stress[..., 0], np.linalg.det(m.F) / (radii * around)))
+    return m.quadrature.mean_of_known(m.wall_stress[..., 0], np.linalg.det(m.F) / (radii * around))
 
 
 def _layer_angle(share: float) -> AngleOf:
@@ -190,7 +191,7 @@ def _layer_angle(share: float) -> AngleOf:
     def value(m: Any, angle: Array) -> float:
         inner, outer = (m.domain.dimensions[f"{side}_radius"] for side in ("inner", "outer"))
         radius = (1.0 - share) * inner + share * outer
-        return float(m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius)))
+        return m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius))
 
     return value
 
@@ -288,7 +289,7 @@ class Tube(RoundWall):
     (25.1327, ['pressure', 'elongation', 'axial_force'])
     """
 
-    loads: ClassVar[dict[str, LoadKind]] = {
+    loads = {
         "pressure": LoadKind(
             lambda shape, loading, name: (
                 loading.add_cavity_pressure if loading.has_caps else loading.add_follower_pressure
@@ -316,7 +317,7 @@ class Tube(RoundWall):
             area=lambda shape: shape.section_area,
         ),
     }
-    columns: ClassVar[tuple[Column, ...]] = (
+    columns = (
         Column(
             "inner_radius", "length", "mean distance from the axis over the deformed inner face", _mean_radius("inner")
         ),
@@ -325,7 +326,7 @@ class Tube(RoundWall):
         ),
         *angle_columns(MEANS),
     )
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
+    columns_on_request = (
         Column(
             "reduced_axial_force",
             "force",
@@ -356,30 +357,34 @@ class Tube(RoundWall):
         ),
         *RoundWall.columns_on_request,
     )
-    axis_kinds: ClassVar[tuple[str, ...]] = ("global", "cylindrical")
-    number_of_elements: ClassVar[int] = 1536
-    face_names: ClassVar[tuple[str, ...]] = ("bottom", "top", "inner", "outer")
-    reductions: ClassVar[dict[str, reduced.Reduction]] = REDUCTIONS
-    ends: ClassVar[dict[str, End]] = {
+    axis_kinds = ("global", "cylindrical")
+    number_of_elements = 1536
+    face_names = ("bottom", "top", "inner", "outer")
+    reductions = REDUCTIONS
+    ends = {
         "free": End(lambda shape, loading: shape.hold(loading)),
         "clamped": End(lambda shape, loading: shape.clamp(loading)),
         "closed": End(lambda shape, loading: shape.close(loading), frees_length=True),
     }
-    supported_faces: ClassVar[tuple[str, ...] | None] = ("outer",)
+    supported_faces = ("outer",)
     # with global axes a tube of isotropic cells would not stay round in the first step
-    defaults: ClassVar[dict[str, Any]] = {"cells": {"axes": "cylindrical"}}
+    defaults = {"cells": {"axes": "cylindrical"}}
 
-    shape: Literal["tube"] = Field(default="tube", description="Which body it is.")
-    inner_radius: Annotated[float, LENGTH] = Field(gt=0, description="Inner radius R_i, in the scene's unit of length.")
-    outer_radius: Annotated[float, LENGTH] = Field(gt=0, description="Outer radius R_o, in the scene's unit of length.")
-    length: Annotated[float, LENGTH] = Field(gt=0, description="Length along z, in the scene's unit of length.")
+    shape: Literal["tube"] = "tube"
+    """Which body it is."""
+    inner_radius: Annotated[float, LENGTH] = Field(gt=0)
+    """Inner radius R_i, in the scene's unit of length."""
+    outer_radius: Annotated[float, LENGTH] = Field(gt=0)
+    """Outer radius R_o, in the scene's unit of length."""
+    length: Annotated[float, LENGTH] = Field(gt=0)
+    """Length along z, in the scene's unit of length."""
 
     def hold_faces(
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
     ) -> None:
         """Springs of what surrounds it."""
         for face, support in supports.items():
-            from remodel_fenicsx.body.mesh_faces import add_support, warn_of_twist  # which few tubes need
+            from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # which few tubes need
 
             add_support(loading, face, support, modulus, None)
             if loading.kinematics.moves_rigidly:
@@ -480,7 +485,7 @@ class Tube(RoundWall):
         """Its ends keep their planes; one of them moves sideways unless they are clamped."""
 
         def squared_distances(places: Array) -> Array:
-            return np.asarray(np.square(places[:, :2]).sum(axis=1) / 2, dtype=np.float64)
+            return np.square(places[:, :2]).sum(axis=1) / 2
 
         radii, factor = (self.inner_radius, self.outer_radius), 0.5 if ends == "clamped" else 1.0
         return reduced.Strut(self.length, factor, reduced.about_z, squared_distances, radii)

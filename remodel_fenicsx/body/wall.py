@@ -10,16 +10,14 @@ from functools import partial
 from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.reductions import choice
 from remodel_fenicsx.body.shape import Column, Shape, Unloads, WithRegions
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.schema.settings import Natural, Region, in_region
+from remodel_fenicsx.model.tensors import Array
+from remodel_fenicsx.schema.settings import Natural, Region
 from remodel_fenicsx.schema.tables import fault, shown
 
 if TYPE_CHECKING:
@@ -28,8 +26,6 @@ if TYPE_CHECKING:
 
 # ---------------------------------------------------------------- layers of a round wall
 # Which regions lie where, and where elements begin and end so that none lies in two.
-
-Array = NDArray[np.float64]
 
 
 class Wall(NamedTuple):
@@ -248,11 +244,11 @@ def _fitted_to_face(face: str, m: Any) -> Array:
     powers = place.reshape(-1)[:, None] ** np.arange(layers * quadrature.element_degree)
     weighted = powers.T * np.repeat(volumes[near], t.shape[1])
     normal, right = comm.allreduce(weighted @ powers), comm.allreduce(weighted @ values.reshape(-1, 3))
-    return np.asarray(np.linalg.solve(normal, right)[0])
+    return np.linalg.solve(normal, right)[0]
 
 
 def _in_region(name: str) -> AngleOf:
-    return lambda m, values: float(m.quadrature.mean_of_known(values, m.elements_of_region(name)))
+    return lambda m, values: m.quadrature.mean_of_known(values, m.elements_of_region(name))
 
 
 class Walled(Shape):
@@ -276,13 +272,13 @@ class Walled(Shape):
             by_case=False,
         ),
     )
-    angle_layers: ClassVar[dict[str, float]] = {
+    angle_layers = {
         "fibre_angle_inner": 0.0,
         "fibre_angle_middle": 0.5,
         "fibre_angle_outer": 1.0,
     }
-    depth_in_words: ClassVar[tuple[str, str, str]] = ("through the wall", "inside", "outside")
-    angle_in_words: ClassVar[tuple[str, str]] = ("around", "along")
+    depth_in_words = ("through the wall", "inside", "outside")
+    angle_in_words = ("around", "along")
 
     @classmethod
     def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
@@ -308,16 +304,3 @@ class RoundWall(Walled, WithRegions, Unloads):
     def fills(self, regions: Collection[str]) -> bool:
         """The outermost ends at the outer radius."""
         return bool(regions)
-
-    def check_with(self, scene: Any, key: str) -> None:
-        """What all bodies ask, and that directions of a matrix turn with the wall."""
-        super().check_with(scene, key)
-        if not KINEMATICS[choice(scene).name].three_dimensional:
-            return
-        for name, properties in scene.properties().items():
-            if not properties.tissue.is_round():
-                rule = (
-                    "has directions along x, y and z, which follow the wall in the kinematics 'radial' and "
-                    "'axisymmetric' alone: the radius, the circumference and the length"
-                )
-                raise fault(rule, f"{in_region(name)}material.matrix", properties.material.matrix)

@@ -26,6 +26,8 @@ from remodel_fenicsx._lazy import Late
 
 ufl = Late("ufl")
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 CLOSE_EIGENVALUES = 1e-3
 """Relative distance of two or three eigenvalues below which a series stands for a quotient of differences: the quotient

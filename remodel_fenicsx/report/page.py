@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.shape import Column, columns_of_region
+from remodel_fenicsx.body.wall import Walled
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import GROWTH, moved_axes
@@ -145,7 +146,7 @@ class ShownBody:
     @classmethod
     def of(cls, whole: WholeBody, times: Places) -> ShownBody:
         """What a run has recorded at these times."""
-        names = (*NAMES, *(OF_WALLS if whole.recording.scene.geometry.is_a("Walled") else ()))
+        names = (*NAMES, *(OF_WALLS if isinstance(whole.recording.scene.geometry, Walled) else ()))
         rows = defaultdict[str, list[NDArray[np.float32]]](list)
         volume, is_deformed = _volumes(whole.points[whole.elements]), True
         for time in times:

@@ -392,7 +392,7 @@ class _SupportForce:
     """What springs do in a shift along the normal, or what is out of balance at nodes that are held."""
 
     def __init__(self, equilibrium: Equilibrium, face: str):
-        from remodel_fenicsx.body.mesh_faces import NOT_AROUND, of_parts
+        from remodel_fenicsx.body.mesh_faces import NOT_AROUND
 
         self._equilibrium, state = equilibrium, equilibrium.state
         self._unknown, loading = state.unknown, state.loading
@@ -402,7 +402,7 @@ class _SupportForce:
             raise SceneError(
                 f"output.columns = 'support_force_{face}': the face goes around the body, so that there is no direction"
             )
-        normal = of_parts(loading, face, "normal")
+        normal = domain.of_parts(face, "normal")
         self._form = potential and jit.form(-ufl.derivative(potential(self._unknown), self._unknown, normal))
         self._nodes: list[tuple[Any, Array]] = []
         for part, facets in domain.facets_of_parts(face) if potential is None else ():

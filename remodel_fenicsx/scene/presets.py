@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 from remodel_fenicsx.body.reductions import AUTO, for_means
-from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS, Chain
+from remodel_fenicsx.model.chains import Chain
 from remodel_fenicsx.model.laws import COMPLEX_STEP, LAWS
-from remodel_fenicsx.schema.settings import COUPLINGS, Cells, Material, Remodeling, STRESS_UNITS, in_region
-from remodel_fenicsx.schema.tables import fault, is_number, quoted
+from remodel_fenicsx.schema.settings import COUPLINGS, Properties, in_region
+from remodel_fenicsx.schema.tables import fault, quoted
 from remodel_fenicsx.schema.text import merged, put
 
 # ---------------------------------------------------------------- without a preset
@@ -220,12 +219,6 @@ def profile_for(name: str, scene: Any) -> Profile:
 # the model's own (docs/which_numbers.md).
 
 Values = Mapping[str, Any]
-Others = Callable[..., Any]  # value of a table's key (or a default), where it is one that can be counted with
-_TABLES = {"material": Material, "cells": Cells, "remodeling": Remodeling}
-
-
-class _NotThere(Exception):
-    """Another value is at fault; its own table says how."""
 
 
 def aligned_stiffness(chain: Chain, end_to_end_length: float, contour_length: float) -> float:
@@ -236,16 +229,12 @@ def aligned_stiffness(chain: Chain, end_to_end_length: float, contour_length: fl
     return float(r0**2 * (slope + chain.stiffness(r0, contour_length)))
 
 
-def _chain_density(initial_stiffness: float, others: Others) -> float:
-    number = partial(others, "material")
-    name, unit = number("chain"), number("stress_unit")
-    r0, contour_length = others("cells", "end_to_end_length"), number("contour_length")
-    if name not in CHAINS or unit not in STRESS_UNITS or r0 >= contour_length:
-        raise _NotThere
-    chain = CHAINS[name].of({key: number(key, own.default) for key, own in CHAINS[name].parameters.items()})
-    modulus = initial_stiffness * STRESS_UNITS[unit] / aligned_stiffness(chain, r0, contour_length)
-    k_theta = BOLTZMANN_CONSTANT * number("temperature")
-    return 4 * number("persistence_length") * modulus / (number("energy_factor") * k_theta)
+def _chain_density(one: Properties, initial_stiffness: float) -> float:
+    tissue = one._replace(material=one.material.model_copy(update={"chain_density": 1.0})).tissue
+    chain, r0, length = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+    if chain is None or (chain.locks and r0 >= length):  # refused as such
+        return one.material.chain_density
+    return initial_stiffness / (tissue.network_modulus * aligned_stiffness(chain, r0, length))
 
 
 class Experiment(NamedTuple):
@@ -254,16 +243,13 @@ class Experiment(NamedTuple):
     table: str
     key: str
     replaces: str
-    lowest: float
-    own: Callable[[float, Others], float]
+    own: Callable[[Properties, float], float]
 
 
 EXPERIMENTS = (  # in this order: the density asks for the contour length
-    Experiment(
-        "material", "locking_stretch", "contour_length", 1.0, lambda v, of: v * of("cells", "end_to_end_length")
-    ),
-    Experiment("material", "initial_stiffness", "chain_density", 0.0, _chain_density),
-    Experiment("remodeling", "half_life", "kappa", 0.0, lambda value, of: math.log(2) / value),
+    Experiment("material", "locking_stretch", "contour_length", lambda one, v: v * one.cells.end_to_end_length),
+    Experiment("material", "initial_stiffness", "chain_density", _chain_density),
+    Experiment("remodeling", "half_life", "kappa", lambda one, value: math.log(2) / value),
 )
 
 
@@ -291,14 +277,14 @@ def check_exclusive(own: Values) -> None:
                 raise fault(rule, f"{key}.{experiment.key}", value)
 
 
-def with_own_numbers(values: Values) -> dict[str, Any]:
-    """The values with the model's own numbers in place of those of experiments."""
-    found = dict(values)
-    for name, part in parts_of(values):
-        for experiment in EXPERIMENTS:
-            part = _with_own_number(experiment, part, found)
-        found = with_part(found, name, part)
-    return found
+def with_own_numbers(part: Any, properties: Callable[[Any], Properties]) -> Any:
+    """A scene, or a region, with the model's own numbers in place of those of experiments."""
+    for table, key, replaces, own in EXPERIMENTS:
+        keys = getattr(part, table)
+        if (value := getattr(keys, key)) is not None:
+            numbers = {key: None, replaces: own(properties(part), value)}
+            part = part.model_copy(update={table: keys.model_copy(update=numbers)})
+    return part
 
 
 def without_coupling(base: dict[str, Any], over: Mapping[str, Any]) -> None:
@@ -327,25 +313,3 @@ def place_of(name: str) -> str:
 def _of(part: Values, table: str, key: str) -> Any:
     keys = part.get(table)
     return keys.get(key) if isinstance(keys, Mapping) else None
-
-
-def _with_own_number(experiment: Experiment, part: Values, body: Values) -> Values:
-    value = _of(part, experiment.table, experiment.key)
-    if not is_number(value) or value <= experiment.lowest:
-        return part
-
-    def others(table: str, key: str, default: Any = None) -> Any:
-        if default is None:
-            default = _TABLES[table].model_fields[key].default
-        said = (_of(part, table, key), _of(body, table, key), default)
-        found = next(value for value in said if value is not None)
-        if not isinstance(found, str) and not (is_number(found) and found > 0):
-            raise _NotThere
-        return found
-
-    try:
-        number = experiment.own(value, others)
-    except (_NotThere, ValueError, OverflowError, ZeroDivisionError):
-        return part
-    keys = {name: value for name, value in part[experiment.table].items() if name != experiment.key}
-    return {**part, experiment.table: {**keys, experiment.replaces: number}}

@@ -11,7 +11,7 @@ import logging
 import math
 import os
 import re
-from collections import Counter
+from functools import partial
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -19,8 +19,8 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
-from remodel_fenicsx.body.reductions import AUTO, check_number, choice, objections
-from remodel_fenicsx.body.shape import Column, FromFile, columns_of, columns_on_request
+from remodel_fenicsx.body.reductions import AUTO, choice
+from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
@@ -28,7 +28,7 @@ from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue, neo_hookean
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene import presets
+from remodel_fenicsx.scene import presets, rules
 from remodel_fenicsx.schema.settings import (
     AS_GIVEN,
     COUPLINGS,
@@ -52,7 +52,6 @@ from remodel_fenicsx.schema.settings import (
     Time,
     NO_PRESTRETCH,
     faces_of,
-    in_region,
 )
 from remodel_fenicsx.schema.conventions import convention_doubt
 from remodel_fenicsx.schema.tables import (
@@ -65,12 +64,20 @@ from remodel_fenicsx.schema.tables import (
     allowed,
     fault,
     is_number,
-    named,
     quoted,
     shown,
 )
 from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, toml_text
-from remodel_fenicsx.schema.units import FORCE, LENGTH_UNIT, LENGTH_UNITS, STRESS, STRESS_UNIT, in_units
+from remodel_fenicsx.schema.units import (
+    FORCE,
+    LENGTH_UNIT,
+    LENGTH_UNITS,
+    LARGEST_NUMBER,
+    STRESS,
+    STRESS_UNIT,
+    NUMBER_TOO_LARGE,
+    scene_units,
+)
 from remodel_fenicsx.system.interrupts import is_first_rank
 
 log = logging.getLogger(__name__)
@@ -200,7 +207,6 @@ FORMAT = 2  # of recorded scenes: raised where a reader of the one before would 
 RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
 """Dotted key of an earlier format -> the key that has taken its place, for the error."""
 COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
-LARGEST_NUMBER = 1e60  # products of four are no overflow
 MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
 SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
 FORGOTTEN_AFTER = (
@@ -306,9 +312,9 @@ class Scene(Table):
 
         def made(settings: Mapping[str, Any]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
-            values = _in_own_units(values, SHAPES[shape])
             _check_sizes(values, "")
-            return handler(presets.with_own_numbers(values))
+            with scene_units(_units(values, SHAPES[shape])):
+                return handler(_with_numbers_of_loads(values, SHAPES[shape]))
 
         if profile is None:
             return made({})
@@ -317,35 +323,12 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Scene:
-        for key, table in self._tables():
-            table.check_with(self, key)
-        if not isinstance(self.geometry, FromFile):
-            check_number(self)
-        for name, count in Counter(column.name for column in self.columns()).items():
-            if count > 1:
-                raise fault("there are two columns of this name; parts of your own need other names", name, None)
+        whole = presets.with_own_numbers(self, Scene.whole)
+        over = partial(Region.over, others=whole.whole())
+        regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
+        self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
+        rules.check(self)
         return self
-
-    def _tables(self) -> Iterator[tuple[str, Table | Properties]]:
-        """All of them with their keys; regions first, and last the one whose rules are of scenes that fit together."""
-        for name in sorted(type(self).model_fields, key=lambda name: (name == "model", name != "regions")):
-            value = getattr(self, name)
-            if isinstance(value, Table):
-                yield name, value
-            elif isinstance(value, dict):
-                yield from ((f"{name}.{quoted(inner)}", table) for inner, table in value.items())
-            elif isinstance(value, tuple):
-                yield from ((f"{name}[{index}]", table) for index, table in enumerate(value))
-            if name == "regions":
-                yield from ((in_region(inner), properties) for inner, properties in self.properties().items())
-
-    def shapes_that(self, fit: Callable[[type[Shape]], bool]) -> str:
-        """The names of the shapes that can something, for an error."""
-        return named(SHAPES, fit)
-
-    def objections(self, kinematics: str) -> list[str]:
-        """Why these kinematics would be wrong for it."""
-        return objections(self, kinematics)
 
     @property
     def _stiffness_ratio(self) -> float:
@@ -423,9 +406,13 @@ class Scene(Table):
             found.append(self.model_copy(update={"loads": loads, "cases": ()}))
         return found or [self]
 
+    def whole(self) -> Properties:
+        """What holds where no region says otherwise."""
+        return Properties(self.material, self.cells, self.remodeling.kappa)
+
     def properties(self) -> dict[str, Properties]:
         """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
-        body = Properties(self.material, self.cells, self.remodeling.kappa)
+        body = self.whole()
         found = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
         if self.regions and isinstance(self.geometry, RoundWall):
             del found[""]
@@ -520,8 +507,6 @@ class Scene(Table):
         turnover = self.remodeling.turnover
         if turnover.is_on:
             parts.append(f"turnover with rates = {turnover.rates!r} and volume = {turnover.volume:g}")
-            if not {"rates", "volume"} & turnover.model_fields_set:
-                parts[-1] += " by default; in 0.3.0 'tension' and 0"
         return "; ".join(parts)
 
     def warnings(self, wall: Any = None) -> list[str]:
@@ -689,7 +674,7 @@ def _check_sizes(value: Any, key: str) -> None:
         for name, inner in value.items():
             _check_sizes(inner, f"{key}.{name}" if key else str(name))
     elif is_number(value) and abs(value) > LARGEST_NUMBER:
-        raise fault(f"too large a number; must be at most {LARGEST_NUMBER:g}", key, value)
+        raise fault(NUMBER_TOO_LARGE, key, value)
 
 
 def _check_name(key: str, name: Any, names: Iterable[str]) -> None:
@@ -707,8 +692,8 @@ def _known_shape(geometry: Any) -> str:
     return str(geometry["shape"])
 
 
-def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, Any]:
-    """The values, those of preset and shape among them, with numbers in the scene's units in place of "5 mm"."""
+def _units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, str | None]:
+    """The units that a scene chooses, by their keys."""
     units: dict[str, str | None] = {}
     for key, table, known in ((STRESS_UNIT, Material, tuple(STRESS_UNITS)), (LENGTH_UNIT, shape, LENGTH_UNITS)):
         table_name, name = key.split(".")
@@ -716,15 +701,20 @@ def _in_own_units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, An
         units[key] = chosen.get(name, field.default) if isinstance(chosen, Mapping) else field.default
         if units[key] not in (*known, None):
             raise fault(allowed(field), key, units[key])
-    result = {**values, "geometry": in_units(values["geometry"], shape, units, "geometry")}
-    if isinstance(loads := result.get("loads"), Mapping):
-        kinds = shape.loads_on(faces_of(loads))
-        result["loads"] = {
-            name: in_units(entry, Load, units, f"loads.{name}", {"value": kinds[name].dimension})
-            for name, entry in loads.items()
-        }
-    found: dict[str, Any] = in_units(result, Scene, units)
-    return found
+    return units
+
+
+def _with_numbers_of_loads(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, Any]:
+    """The values with numbers in place of units of loads, whose dimensions the shape knows."""
+    loads = values.get("loads")
+    if not isinstance(loads, Mapping):
+        return dict(values)
+    found = dict(loads)
+    for name, kind in shape.loads_on(faces_of(loads)).items():
+        load = loads.get(name)
+        if isinstance(load, Mapping) and "value" in load and kind.dimension is not None:
+            found[name] = {**load, "value": kind.dimension.number(load["value"], f"loads.{quoted(name)}.value")}
+    return {**values, "loads": found}
 
 
 def _check_load_names(shape: str, loads: Any) -> None:

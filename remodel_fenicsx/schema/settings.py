@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,18 +43,13 @@ from remodel_fenicsx.schema.tables import (
     SceneError,
     Table,
     fault,
-    listed,
     named,
     quoted,
-    refuse,
     shown,
     with_key,
 )
 from remodel_fenicsx.schema import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
-
-if TYPE_CHECKING:
-    from remodel_fenicsx.scene.scene import Scene
 
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 MEASURED_CELLS = "fibres"  # those of cells.fibres
@@ -116,13 +111,6 @@ class Mesh(Table):
             raise fault(rule, "formulation", self.formulation)
         return self
 
-    def check_with(self, scene: Scene, key: str) -> None:
-        """A formulation that takes W apart needs its parts."""
-        takes_parts = self.formulation != AUTO and FORMULATIONS[self.formulation].takes_parts
-        if takes_parts and not scene.material.tells_volume_apart:
-            rule = "needs a material.matrix with a known volumetric part, made as a Matrix"
-            raise fault(f"{rule}; {scene.material.matrix!r} has none", f"{key}.formulation", self.formulation)
-
 
 class Model(Table):
     """Which unknowns describe the deformation."""
@@ -132,11 +120,6 @@ class Model(Table):
         description="'auto' takes the cheapest one that is exact for the scene. "
         f"{meanings(KINEMATICS)} (docs/kinematics.md).",
     )
-
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Every reduction has reasons for which it is refused."""
-        if self.kinematics != AUTO and (reasons := scene.objections(self.kinematics)):
-            raise fault("; ".join(reasons), f"{key}.kinematics", self.kinematics)
 
 
 class Support(Table):
@@ -182,23 +165,6 @@ class Supports(Table):
     def faces(self) -> dict[str, Support]:
         """Supports by name of the face."""
         return dict(self.__pydantic_extra__ or {})
-
-    def check_with(self, scene: Scene, key: str) -> None:
-        """What a shape can be held by."""
-        shape = scene.geometry
-        if self.ends not in shape.ends:
-            rule = f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.ends))}"
-            raise fault(rule, f"{key}.ends", self.ends)
-        if (faces := shape.supported_faces) is None:
-            return
-        for name, support in self.faces.items():
-            place = f"{key}.{quoted(name)}"
-            if name not in faces:
-                springs = " or ".join(f"{key}.{face} of kind 'elastic'" for face in faces)
-                beside = f"; allowed beside is {springs}" if springs else ""
-                raise fault(f"a {shape.name} is held by {key}.ends{beside}", place, None)
-            if support.kind != "elastic":
-                raise fault("allowed here is 'elastic'", f"{place}.kind", support.kind)
 
 
 # ---------------------------------------------------------------- tissue and cells
@@ -394,43 +360,6 @@ class Natural(Table):
         """Whether the mesh is free of stress."""
         return self.opening_angle == 0.0 and not self.layers and not self.fibres
 
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Which bodies have residual stress, with which cells; all else is refused by name."""
-        shape = scene.geometry
-        if self.cells == "equilibrium" and not (shape.is_loaded and shape.is_a("RoundWall")):
-            able = scene.shapes_that(lambda kind: kind.is_a("RoundWall"))
-            raise fault(f"needs geometry.is = 'loaded' of the shape {able}", f"{key}.cells", self.cells)
-        if self.cells == "equilibrium" and not scene.time.is_equilibrium:
-            raise fault("needs time.end = 'equilibrium'", f"{key}.cells", self.cells)
-        if self.is_of_the_mesh:
-            return
-        if self.fibres:
-            reasons = {
-                "needs cells.fibres, a file that export has written": not scene.measured_cells,
-                f"{key}.opening_angle or layers are there too; one of them is enough": self.opening_angle
-                or self.layers,
-                "must be false unless mesh.formulation is 'displacement'": scene.formulation != "displacement",
-            }
-            refuse(f"{key}.fibres", True, reasons)
-            return
-        asked, value, none = f"{key}.opening_angle", self.opening_angle, "0"
-        able, is_able = scene.shapes_that(lambda kind: kind.is_a("RoundWall")), shape.is_a("RoundWall")
-        if not self.opening_angle:
-            asked, value, none = f"{key}.layers", len(self.layers), "none"
-            able, is_able = scene.shapes_that(lambda kind: kind.is_a("Walled")), shape.is_a("Walled")
-        needs = [
-            ("geometry.shape", is_able, able),
-            ("mesh.formulation", scene.formulation == "displacement", "'displacement'"),
-        ]
-        if shape.is_a("RoundWall"):  # the closing knows isotropic cells
-            needs.append(("cells.axes", scene.cells.axes == "cylindrical", "'cylindrical'"))
-            for name, properties in scene.properties().items():
-                isotropic = properties.cells.initial == "isotropic"
-                needs.append((f"{in_region(name)}cells.initial", isotropic, "'isotropic'"))
-        for other, has, possible in needs:
-            if not has:
-                raise fault(f"must be {none} unless {other} is {possible.replace(', ', ' or ')}", asked, value)
-
     @model_validator(mode="after")
     def _layers_lie_apart(self) -> Natural:
         for index, layer in enumerate(self.layers):
@@ -512,12 +441,6 @@ class Cells(Table):
             raise fault(rule, "initial", self.initial)
         return self
 
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Which axes a shape has."""
-        if self.axes not in scene.geometry.axis_kinds:
-            names = ", ".join(map(repr, scene.geometry.axis_kinds))
-            raise fault(f"allowed for shape {scene.geometry.name!r} is {names}", f"{key}.axes", self.axes)
-
     def fault_of_length(self) -> str | None:
         """What keeps three lengths from being those of a chain; None if nothing does."""
         length = self.end_to_end_length if isinstance(self.initial, str) else math.hypot(*self.initial)
@@ -546,7 +469,7 @@ class Cells(Table):
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
-def _nothing_is_missing(scene: Scene) -> str | None:
+def _nothing_is_missing(scene: Any) -> str | None:
     """Of scenes as they are."""
     return None
 
@@ -824,50 +747,13 @@ class Remodeling(Table):
             able = named(COUPLINGS, lambda kind: kind.takes_turnover)
             raise fault(f"with remodeling.turnover must be one of: {able}", "coupling", self.coupling)
         if coupling.needs_a_target and law.target is None:
-            rule = f"needs a remodeling.law with a target that can be extrapolated: {_laws_with_a_target()}"
+            rule = f"needs a remodeling.law with a target that can be extrapolated: {laws_with_a_target()}"
             raise fault(rule, "coupling", self.coupling)
         return self
 
-    def check_with(self, scene: Scene, key: str) -> None:
-        """What coupling and mean ask of the rest, and the end of a scene that goes to an equilibrium."""
-        coupling = COUPLINGS[self.coupling]
-        if (missing := coupling.missing(scene)) is not None:
-            raise fault(f"needs {missing}", f"{key}.coupling", self.coupling)
-        if self.mean != "tensor" and not scene.cases:
-            raise fault("needs [[cases]]", f"{key}.mean", self.mean)
-        if self.turnover.grows:
-            self._check_growth(scene, f"{key}.turnover")
-        if MEANS_OF_CASES[self.mean].of_targets and LAWS[self.law].target is None:
-            raise fault(f"needs a remodeling.law with a target: {_laws_with_a_target()}", f"{key}.mean", self.mean)
-        if scene.cases[1:] and not coupling.takes_cases:
-            able = named(COUPLINGS, lambda kind: kind.takes_cases)
-            raise fault(f"with [[cases]] must be one of: {able}", f"{key}.coupling", self.coupling)
 
-    def _check_growth(self, scene: Scene, key: str) -> None:
-        """What bodies grow, and when."""
-        if not scene.geometry.is_a("Walled"):
-            walled = scene.shapes_that(lambda kind: kind.is_a("Walled"))
-            rule = f"must be 0 unless geometry.shape is {walled.replace(', ', ' or ')}"
-            raise fault(rule, f"{key}.volume", self.turnover.volume)
-        if scene.formulation != "displacement":
-            raise fault("must be 0 unless mesh.formulation is 'displacement'", f"{key}.volume", self.turnover.volume)
-        start, at_once = self.turnover.start, scene.time.is_equilibrium
-        if self.turnover.starts_at_rest:
-            reasons = {
-                "needs time.end = 'equilibrium'; give the time of rest": not at_once,
-                "needs loads.NAME.ramp that stay for a while and change again": scene.last_hold is None,
-                "needs a scene without [[cases]]": scene.cases,
-            }
-            refuse(f"{key}.from", AT_REST, reasons)
-        elif start and at_once:
-            raise fault("must be 0 or 'rest' with time.end = 'equilibrium', which has no times", f"{key}.from", start)
-        elif start and start > scene.time.end:
-            raise fault(f"must be at most time.end = {shown(scene.time.end)}", f"{key}.from", start)
-        elif start:
-            scene.time.check_hit(start, f"{key}.from")
-
-
-def _laws_with_a_target() -> str:
+def laws_with_a_target() -> str:
+    """The names of laws with a target, for an error."""
     return named(LAWS, lambda law: law.target is not None)
 
 
@@ -890,31 +776,6 @@ class Properties(NamedTuple):
     def tissue(self) -> Tissue:
         """The tissue of these parameters."""
         return self.material.tissue(self.cells.end_to_end_length)
-
-    def check_with(self, scene: Scene, region: str) -> None:
-        """What the keys of a region say together with those of the whole body."""
-        material, cells, law = self.material, self.cells, LAWS[scene.remodeling.law]
-        if CHAINS[material.chain].locks and cells.end_to_end_length >= material.contour_length:
-            rule = f"must be smaller than {region}material.contour_length = {shown(material.contour_length)}"
-            raise fault(rule, f"{region}cells.end_to_end_length", cells.end_to_end_length)
-        if (length := cells.fault_of_length()) is not None:
-            raise fault(length, f"{region}cells.initial", cells.initial)
-        if cells.initial == MEASURED_CELLS and cells.fibres is None:
-            raise fault("needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial)
-        differ = material.matrix != scene.material.matrix
-        if differ and not (material.tells_volume_apart and scene.material.tells_volume_apart):
-            rule = f"allowed beside {scene.material.matrix!r} are those that are made as a Matrix, if it is one"
-            raise fault(rule, f"{region}material.matrix", material.matrix)
-        plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
-        if self.kappa != plain and law.remodels and not law.asks_kappa:
-            key, value = ("remodeling.kappa", self.kappa) if material.chain_density else ("material.chain_density", 0.0)
-            raise fault(f"the law {scene.remodeling.law!r} has no kappa", f"{region}{key}", value)
-        turnover, longest = scene.remodeling.turnover, material.contour_length / cells.end_to_end_length
-        if turnover.is_on and not material.chain_density:
-            raise fault(f"needs chains: {region}material.chain_density above 0", "remodeling.turnover", None)
-        if turnover.is_on and CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
-            rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
-            raise fault(rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch)
 
 
 def _as_in(table: type[Table], name: str, key: str) -> Any:
@@ -973,19 +834,6 @@ class Region(Table):
     material: Annotated[SerializeAsAny[RegionMaterial], KeysOfParts({"matrix": MATRICES}, True)] = RegionMaterial()
     cells: RegionCells = RegionCells()
     remodeling: RegionRemodeling = RegionRemodeling()
-
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Its name, which is part of the names of columns."""
-        shape, name = scene.geometry, key.removeprefix("regions.")
-        if not shape.is_a("WithRegions"):
-            able = scene.shapes_that(lambda kind: kind.is_a("WithRegions"))
-            raise fault(f"a {shape.name} has no regions; shapes with regions: {able}", key, None)
-        if not re.fullmatch(NAME, name):
-            rule = "the name of a region must be a letter, then letters, digits and _, at most 40 in all"
-            raise fault(rule, key, None)
-        columns = [column for column in scene.column_names if column.endswith(f"_{name}")]
-        if twice := {column for column in columns if columns.count(column) > 1}:
-            raise fault(f"the column {min(twice)!r} has another meaning; choose another name", key, None)
 
     def over(self, others: Properties) -> Properties:
         """What holds in the region, its own keys over these."""
@@ -1048,24 +896,6 @@ class Load(Table):
                 raise fault(f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None)
         return self
 
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Times at which steps end, values that the body can have, and a length that is prescribed or unknown."""
-        name = key.removeprefix("loads.")
-        kind = scene.load_kinds[name]
-        if name == "elongation" and scene.has_free_length and any(self.value * factor for _, factor in self.ramp):
-            rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
-            raise fault(rule, f"{key}.value", self.value)
-        for index, (time, factor) in enumerate(self.ramp):
-            if not scene.time.is_equilibrium and time <= scene.time.end:
-                scene.time.check_hit(time, f"{key}.ramp[{index}][0]")
-            for case in scene.each_case():
-                full = case.loads[name].value
-                if full * factor <= kind.above:
-                    share = factor * full / self.value if self.value else factor
-                    words = f"with the factor {shown(share)} it is {full * factor:.6g}"
-                    rule = f"must be greater than {kind.above:g} at every time; {words}"
-                    raise fault(rule, f"{key}.value", self.value)
-
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
         hit = next((corner for corner, _ in self.ramp if same_time(time, corner)), time)  # exact at its own times
@@ -1101,17 +931,6 @@ class LoadCase(Table):
         default_factory=dict, json_schema_extra={"allowed": "a table of numbers by the names of loads"}
     )
     """Factor on each load by its name, beside the factor of its ramp. Loads that are not named have 1."""
-
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Shares of one whole and factors on loads that there are."""
-        for name in self.loads:
-            if name not in scene.loads:
-                rule = "no such load; the scene has " + (", ".join(scene.loads) or "none")
-                raise fault(rule, f"{key}.loads.{quoted(name)}", self.loads[name])
-        total = math.fsum(case.weight for case in scene.cases)
-        if self is scene.cases[-1] and abs(total - 1.0) > SUM_OF_WEIGHTS:
-            rule = f"the weights of all cases sum to {total:.10g}; they must sum to 1"
-            raise fault(rule, f"{key}.weight", self.weight)
 
 
 class OnFace(NamedTuple):
@@ -1183,22 +1002,6 @@ class Time(Table):
             nearest = f"{below * self.step:.12g} and {(below + 1) * self.step:.12g}"
             rule = f"must be a multiple of time.step = {shown(self.step)}; the nearest are {nearest}"
             raise fault(rule, key, time)
-
-    def check_with(self, scene: Scene, key: str) -> None:
-        """An equilibrium of the cells that depends on no way there."""
-        if not self.is_equilibrium:
-            return
-        remodeling, laws = scene.remodeling, named(LAWS, lambda law: law.has_limit)
-        parts = scene.properties().items()
-        bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
-        still = [f"{in_region(name)}remodeling.kappa" for name, one in parts if one.kappa == 0]
-        reasons = {
-            f"remodeling.law = {remodeling.law!r} has no limit that is the same on every path; allowed are the laws "
-            + laws: not LAWS[remodeling.law].has_limit,
-            f"needs chains: {', '.join(bare)} above 0": bare,
-            f"{', '.join(still)} = 0: the cells never change": still,
-        }
-        refuse(f"{key}.end", self.end, reasons)
 
     @property
     def is_equilibrium(self) -> bool:
@@ -1293,13 +1096,6 @@ class Solver(Table):
     """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_... and mat_.... Options
     that run code or write files are refused."""
 
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Multigrid has no place for one more unknown."""
-        if scene.has_free_length and self.method == "iterative":
-            names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != self.method)
-            rule = f"allowed where the length is an unknown, with loads.axial_force or closed ends, are {names}"
-            raise fault(rule, f"{key}.method", self.method)
-
     @model_validator(mode="after")
     def _has_a_tolerance(self) -> Solver:
         if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
@@ -1356,33 +1152,3 @@ class Output(Table):
     checkpoint: int | None = Field(default=None, ge=0)
     """Number of steps between two checkpoints; 0 means only at the end. Without it at most 10 minutes are lost, and
     checkpoints cost less than 5 % of the run."""
-
-    def check_with(self, scene: Scene, key: str) -> None:
-        """Times, fields and columns that the run will have."""
-        for index, time in enumerate(self.times):
-            place = f"{key}.times[{index}]"
-            if scene.time.is_equilibrium:
-                raise fault("not allowed with time.end = 'equilibrium', which has no times", place, time)
-            if time > scene.time.end:
-                raise fault(f"must be at most time.end = {shown(scene.time.end)}", place, time)
-            scene.time.check_hit(time, place)
-        for field, reason in scene.lacking_fields.items():
-            if not isinstance(self.fields, bool) and field in self.fields:
-                raise fault(reason, f"{key}.fields", field)
-        for name in self.columns:
-            self._check_column(name, scene, f"{key}.columns")
-
-    def _check_column(self, name: str, scene: Scene, key: str) -> None:
-        shape, known = scene.geometry, dict.fromkeys(scene.column_names)
-        of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
-        if name == "time_error" and scene.time.is_equilibrium:
-            raise fault(f"{name!r} is an error of steps; must be left out with time.end = 'equilibrium'", key, name)
-        if name in of_one_tissue and scene.regions:
-            raise fault(f"{name!r} is for bodies of one tissue; the scene has regions", key, name)
-        if name in (*TURNED_OVER, TURNOVER_POWER) and not scene.remodeling.turnover.is_on:
-            raise fault(f"{name!r} changes only with remodeling.turnover, which is not set", key, name)
-        if name in GROWTH_COLUMNS and not scene.remodeling.turnover.grows:
-            raise fault(f"{name!r} needs remodeling.turnover with a volume above 0", key, name)
-        if name not in known:
-            names = listed(map(repr, known), repr(name))
-            raise fault(f"no such column on request; allowed for shape {shape.name!r} are {names}", key, name)

@@ -79,9 +79,6 @@ class Table(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
-    def check_with(self, scene: Any, key: str) -> None:
-        """Refuse what does not go with the rest of a scene, in which this table stands at a key: raise a `fault`."""
-
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         """With the meaning of each key, and without what scripts alone need."""
@@ -234,13 +231,6 @@ def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomErro
     """Error to raise in a validator."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
     return PydanticCustomError("fault", "{rule}", context)
-
-
-def refuse(key: str, value: Any, reasons: Mapping[str, Any]) -> None:
-    """Raise the fault of the first reason that holds, if one does."""
-    for reason, holds in reasons.items():
-        if holds:
-            raise fault(reason, key, value)
 
 
 def named(registry: Mapping[str, Any], fits: Callable[[Any], Any]) -> str:

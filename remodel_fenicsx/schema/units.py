@@ -6,19 +6,20 @@ Of the keys of a scene it knows only the two that choose its units: material.str
 from __future__ import annotations
 
 import functools
-import math
 import re
 import tokenize
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, Field, GetJsonSchemaHandler
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
-from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from remodel_fenicsx.schema.tables import allowed, fault, free_names, is_table, quoted, sections, shown
+from remodel_fenicsx.schema.tables import fault, shown
 
 if TYPE_CHECKING:  # it takes half a second to start, and most scenes have no units
     import pint
@@ -26,6 +27,11 @@ if TYPE_CHECKING:  # it takes half a second to start, and most scenes have no un
 STRESS_UNIT, LENGTH_UNIT = "material.stress_unit", "geometry.length_unit"
 _LENGTH_UNITS = Literal["m", "cm", "mm", "um"]
 LENGTH_UNITS: tuple[str, ...] = get_args(_LENGTH_UNITS)
+LARGEST_NUMBER = 1e60  # products of four are no overflow
+NUMBER_TOO_LARGE = f"too large a number; must be at most {LARGEST_NUMBER:g}"
+_UNITS: ContextVar[Mapping[str, str | None] | None] = ContextVar(
+    "units", default=None
+)  # of the scene that is validated
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
 # the type of geometry.length_unit, for every shape
@@ -72,6 +78,49 @@ class Dimension:
     example: str
     powers: tuple[tuple[str, int], ...]
 
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self.number, handler(source))
+
+    def number(self, value: Any, key: str = "") -> Any:
+        """The number that a text stands for, in the units of the scene that is validated.
+
+        Parameters
+        ----------
+        value
+            What the scene has: a number, or a text with a unit.
+        key
+            Of the value, below that of the table that is validated.
+
+        Returns
+        -------
+        float
+            In the scene's unit; whatever is no text stays.
+
+        Raises
+        ------
+        PydanticCustomError
+            If the text is no number with a unit of this dimension, or the scene has not chosen its unit.
+        """
+        units = _UNITS.get()
+        if not isinstance(value, str) or units is None:
+            return value
+        rule, found = f"a unit of {self.name} as in {shown(self.example)}", _QUANTITY.fullmatch(value.strip())
+        if found is None:
+            raise fault(f"must be a number, or one with {rule}", key, value)
+        source = _unit(found[2])
+        powers = {units.get(name, name): power for name, power in self.powers}
+        # a unit of length stands in for one that was not chosen, to tell first whether it is a length at all
+        target = _unit(" * ".join(f"{unit or 'm'}**{power}" for unit, power in powers.items()))
+        if source is None or target is None or source.dimensionality != target.dimensionality:
+            raise fault(f"{shown(found[2])} is no unit of {self.name}; must be {rule}", key, value)
+        if unset := [name for name, _ in self.powers if units.get(name, name) is None]:
+            remedy = f"set {unset[0]} (m, cm, mm or um), or leave the unit out"
+            raise fault(f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value)
+        number = float(found[1])  # sorts out the exponents that would make a fraction of a billion digits
+        if abs(number) > LARGEST_NUMBER:
+            raise fault(NUMBER_TOO_LARGE, key, value)
+        return float(_registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude)
+
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         return {"anyOf": [handler(schema), schema_with_unit(self)]}
 
@@ -96,30 +145,14 @@ def is_quantity(text: str) -> bool:
     return found is not None and _UNIT.fullmatch(found[2].rstrip()) is not None
 
 
-def in_units(
-    values: Any,
-    table: type[BaseModel],
-    units: Mapping[str, str | None],
-    key: str = "",
-    dimensions: Mapping[str, Dimension | None] | None = None,
-) -> Any:
-    """The values of a table and of the tables in it, where "5 mm" has become a number."""
-    if not isinstance(values, Mapping):
-        return values
-    result = dict(values)
-    for name, value in values.items():
-        field, path = table.model_fields.get(name), f"{key}.{quoted(str(name))}" if key else name
-        kind: Any = free_names(table) if field is None else field.annotation
-        if is_table(kind):
-            result[name] = in_units(value, kind, units, path)
-        elif get_origin(kind) is dict and is_table(inner := get_args(kind)[1]) and isinstance(value, Mapping):
-            result[name] = {
-                own: in_units(one, inner, units, f"{path}.{quoted(str(own))}") for own, one in value.items()
-            }
-        elif field is not None and float in (kind, *get_args(kind)) and isinstance(value, str):
-            dimension = dimension_of(field) if dimensions is None else dimensions.get(name)
-            result[name] = _number(value, field, dimension, units, path)
-    return result
+@contextmanager
+def scene_units(units: Mapping[str, str | None]) -> Iterator[None]:
+    """Within, numbers with units that are validated become those in these units of a scene."""
+    token = _UNITS.set(units)
+    try:
+        yield
+    finally:
+        _UNITS.reset(token)
 
 
 def dimension_of(field: FieldInfo) -> Dimension | None:
@@ -127,53 +160,13 @@ def dimension_of(field: FieldInfo) -> Dimension | None:
     return next((entry for entry in field.metadata if isinstance(entry, Dimension)), None)
 
 
-def keys_with_units(table: type[BaseModel]) -> Iterator[tuple[str, Dimension]]:
-    """Dotted key and dimension of every annotated field in a table; a key of several variants comes once."""
-    seen: set[str] = set()
-    for key, _, inner in sections(table):
-        for name, field in inner.model_fields.items():
-            dimension, path = dimension_of(field), f"{key}.{name}"
-            if dimension is not None and path not in seen:
-                seen.add(path)
-                yield path, dimension
-
-
 def factor_to_scene(unit: str, dimension: Dimension, units: Mapping[str, str | None]) -> float:
     """How many of the scene's units one of another unit is."""
     try:
-        return float(_number(f"1 {unit}", FieldInfo(annotation=float), dimension, units, "units"))
+        with scene_units(units):
+            return float(dimension.number(f"1 {unit}"))
     except PydanticCustomError as error:
         raise ValueError(error.message()) from error
-
-
-def _number(
-    text: str, field: FieldInfo, dimension: Dimension | None, units: Mapping[str, str | None], key: str
-) -> float | str:
-    """The number that a text stands for, in the scene's unit."""
-    rule, found = allowed(field), _QUANTITY.fullmatch(text.strip())
-    if dimension is None:
-        if found is None:
-            return text
-        raise fault(f"{rule}, without a unit", key, text)
-    rule += f", or one with a unit of {dimension.name} as in {shown(dimension.example)}"
-    if found is None:
-        raise fault(rule, key, text)
-    source = _unit(found[2])
-    powers = {units.get(name, name): power for name, power in dimension.powers}
-    # a unit of length stands in for one that was not chosen, to tell first whether it is a length at all
-    target = _unit(" * ".join(f"{unit or 'm'}**{power}" for unit, power in powers.items()))
-    if source is None or target is None or source.dimensionality != target.dimensionality:
-        raise fault(f"{shown(found[2])} is no unit of {dimension.name}; {rule}", key, text)
-    for name, _ in dimension.powers:
-        if units.get(name, name) is None:
-            remedy = f"set {name} (m, cm, mm or um), or leave the unit out"
-            raise fault(f"a unit of {dimension.name} needs the scene's unit of length: {remedy}", key, text)
-    try:
-        number = float(found[1])  # sorts out the exponents that would make a fraction of a billion digits
-        exact = Fraction(found[1]) if number and math.isfinite(number) else Fraction(number)
-        return float(_registry().Quantity(exact, source).to(target).magnitude)
-    except OverflowError:
-        raise fault(f"too large a number; {rule}", key, text) from None
 
 
 def _unit(text: str) -> pint.Unit | None:

@@ -47,6 +47,6 @@ def attempted(solve: Callable[[], T], *failures: type[F]) -> T | F:
         return failed
 
 
-def say(attempt: Attempt, reason: object) -> None:
-    """Log that an attempt has failed."""
-    log.info("%s: %s", attempt.fails, reason)
+def say(attempt: Attempt, reason: object, how: str = "") -> None:
+    """Log that an attempt has failed, and how the next one goes."""
+    log.info("%s%s: %s", attempt.fails, f", {how}" if how else "", reason)

@@ -301,7 +301,7 @@ class GuardedNewton:
         if second is None:
             raise first
         words, other_way = second
-        say(SAFER, f"{words} ({first.reason})")
+        say(SAFER, first.reason, words)
         with other_way:
             again = attempted(lambda: self._attempt(origin), SolveFailure)
         again.count(first)

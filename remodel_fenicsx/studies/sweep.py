@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import only_for_means
-from remodel_fenicsx.scene.scene import Scene, SceneError, in_region
+from remodel_fenicsx.scene.scene import Scene, SceneError
+from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.studies.page import COLOURS, Answer, aligned, label, panels
 from remodel_fenicsx.studies.study import FEWEST_RUNS, Study, TooFewRuns

@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body import Tube
 from remodel_fenicsx.body.gmsh_model import gmsh_model
-from remodel_fenicsx.body.mesh_faces import free_motions
+from remodel_fenicsx.body.mesh_domain import free_motions
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict

@@ -15,6 +15,7 @@ from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.report import write_report
 from tests.mesh_files import write_tube
 from tests.runs import SELF, goes_on, last_row, rows_of
+from tests.tables import rows, values
 
 GEL = Path(__file__).parents[2] / "demos" / "gel"
 RAMP = [[0.0, 0.0], [2.0, 1.0]]
@@ -101,39 +102,8 @@ def test_the_gel_between_posts(tmp_path: Path) -> None:
     assert not re.search(r"\b(wall|lumen|inlet)\b", said), said
 
 
-def test_what_is_refused(block: Path, tmp_path: Path) -> None:
-    def refusal(moved: dict[str, Any], **tables: Any) -> str:
-        with pytest.raises(SceneError) as refused:
-            last_row(scene(block, moved, **tables))
-        assert "\n" not in str(refused.value)
-        return str(refused.value)
-
-    def on(face: str, kind: str = "displacement") -> dict[str, Any]:
-        return {"way": {"kind": kind, "face": face, "value": 0.1, "ramp": RAMP}}
-
-    free = {face: {"kind": "sliding"} for face in ("x0", "y0", "z0")}
-    assert refusal({}, loads=on("z1")).startswith(
-        "loads.way.face = 'z1': its support ('free') lets it move; a face that"
-    )
-    assert refusal({}, loads=on("lid")).startswith("loads.way.face = 'lid': the body has no such face; it has x0, x1")
-    assert refusal({}, loads=on("z0", "pressure")).startswith(
-        "loads.way.face = 'z0': its support ('sliding') takes all"
-    )
-    assert refusal({}, loads=on("z0") | {"more": on("z0")["way"]}).startswith(
-        "loads.more.face = 'z0': loads.way moves this face too"
-    )
-    assert refusal({}, supports={"x0": free["x0"]}, output={}).startswith(
-        "supports (x0 'sliding'): they leave the body free to move, in 3 of 6 rigid"
-    )
-    assert refusal({}, supports=free | {"lid": {}}, output={}).startswith(
-        "supports.lid: the body has no such face; it has x0"
-    )
-    assert refusal({}, cells={"axes": "local"}).startswith(
-        "cells.axes = 'local': allowed for shape 'solid' is 'global'"
-    )
-    columns = {"columns": ["lumen_volume"]}
-    assert refusal({}, output=columns).startswith("output.columns = 'lumen_volume': no such column on request; allowed")
-    tube = write_tube(tmp_path / "tube.msh")
-    held = {end: {"kind": "held"} for end in ("inlet", "outer")}
-    with pytest.raises(SceneError, match="loads.way.face = 'outer': this face goes around the body, so that there is"):
-        last_row(scene(tube, {}, supports=held, loads=on("outer"), output={}))
+@pytest.mark.parametrize(("body", "tables", "words"), rows(__file__, "bad_solids.txt"))
+def test_what_is_refused(body: str, tables: str, words: str, block: Path, tmp_path: Path) -> None:
+    file = block if body == "block" else write_tube(tmp_path / "tube.msh")
+    with pytest.raises(SceneError, match=f"^{words}.*$"):
+        last_row(scene(file, {}, **values(tables)))

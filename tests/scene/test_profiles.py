@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from remodel_fenicsx import cli, read_scene
-from remodel_fenicsx.scene.presets import PROFILES, RANDOM_CELLS
+from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import scene_from_dict
 from tests.conftest import Refused
 
@@ -70,13 +70,3 @@ def test_random_cells_keep_mesh_and_steps(name: str, changes: dict[str, Any], ki
     over = read_scene(path, ["solver.relative_tolerance=1e-8"], name)
     assert over.model.kinematics == ("sector" if kinematics == "full" else kinematics)  # over all that the file says
     assert over.solver.relative_tolerance == 1e-8 and over.time == plain.time
-
-
-def test_validate_says_what_was_measured_for_random_cells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "artery.toml"
-    path.write_text(scene_from_dict(TUBE).to_toml())
-    assert cli.main(["validate", str(path), "--profile", "balanced"]) == 0
-    words = capsys.readouterr().out
-    assert RANDOM_CELLS["balanced"].in_words("balanced") in words and "the artery of random cells" in words
-    assert cli.main(["validate", str(path), "--profile", "balanced", "--set", "cells.initial=isotropic"]) == 0
-    assert PROFILES["balanced"].in_words("balanced") in capsys.readouterr().out

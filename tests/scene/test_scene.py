@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from remodel_fenicsx.body import SHAPES, Cube, Tube
+from remodel_fenicsx.body import SHAPES, Tube
 from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
@@ -285,14 +285,6 @@ def test_the_demos_are_the_preset():
 
 def test_a_preset_by_name():
     assert preset_scene(PAPER, "tube") == read_scene(ROOT / "demos" / "artery.toml", ["name=tube"])
-    with pytest.raises(
-        SceneError, match=r"^preset = 'none': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'$"
-    ):
-        preset_scene("none", "tube")
-    with pytest.raises(
-        SceneError, match=r"^geometry\.shape = 'heart': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'solid'$"
-    ):
-        preset_scene(PAPER, "heart")
 
 
 def test_python_says_what_toml_says():
@@ -305,17 +297,6 @@ def test_python_says_what_toml_says():
     )
     assert built == read_scene(ROOT / "demos" / "artery.toml")
     assert pickle.loads(pickle.dumps(built)) == built
-
-
-def test_python_objects_are_checked_with_the_same_words():
-    with pytest.raises(SceneError, match=r"^inner_radius = 3\.0: must be smaller than geometry\.outer_radius = 2\.0$"):
-        Tube(inner_radius=3.0, outer_radius=2.0, length=1.0)
-    with pytest.raises(SceneError, match=r"^kapa = 1\.0: unknown key; did you mean kappa\?$"):
-        Remodeling(kapa=1.0)  # type: ignore[call-arg]
-    with pytest.raises(SceneError, match=r"^loads\.pressure = \{value = 1\.0, ramp = .*\}: a cube has no such load"):
-        Scene(geometry=Cube(), time=Time(end=1.0), loads={"pressure": Load(value=1.0, ramp=[[0.0, 1.0]])})
-    with pytest.raises(SceneError, match=r"^cells\.axes = 'cylindrical': allowed for shape 'cube' is 'global'$"):
-        Scene(geometry=Cube(), time=Time(end=1.0), cells=Cells(axes="cylindrical"))
 
 
 def test_a_changed_copy_is_validated():
@@ -361,7 +342,7 @@ def test_the_summary_is_one_line_in_one_unit():
     grows = preset_scene(PAPER, "tube").with_values(
         {"remodeling.law": "tensor", "remodeling.turnover": {"time": 40.0, "deposition_stretch": 1.1}}
     )
-    assert grows.summary().endswith("'cauchy' and volume = 0.3 by default; in 0.3.0 'tension' and 0")
+    assert grows.summary().endswith("'cauchy' and volume = 0.3")
 
 
 def test_the_largest_load_is_the_largest_of_the_run():

@@ -1,0 +1,407 @@
+"""What fits with what across the tables of a scene: rules in their order, of which the first that is broken is told.
+
+A rule yields what does not fit: what is allowed, the key and its value. Tables know their own keys alone.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from remodel_fenicsx.body import SHAPES
+from remodel_fenicsx.body.reductions import AUTO, choice, objections, too_many_elements
+from remodel_fenicsx.body.shape import FromFile, Unloads, WithRegions
+from remodel_fenicsx.body.wall import RoundWall, Walled
+from remodel_fenicsx.fem.formulations import FORMULATIONS
+from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
+from remodel_fenicsx.model.chains import CHAINS
+from remodel_fenicsx.model.energy import TURNED_OVER
+from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
+from remodel_fenicsx.schema.settings import (
+    AT_REST,
+    COUPLINGS,
+    GROWTH_COLUMNS,
+    MEASURED_CELLS,
+    NAME,
+    SUM_OF_WEIGHTS,
+    TURNOVER_POWER,
+    in_region,
+    laws_with_a_target,
+)
+from remodel_fenicsx.schema.tables import fault, listed, named, quoted, shown
+
+Faults = Iterator[tuple[str, str, Any]]
+Rule = Callable[[Any], Faults]
+
+
+def check(scene: Any) -> None:
+    """Raise the fault of the first rule that a scene breaks."""
+    for rule in RULES:
+        for broken in rule(scene):
+            raise fault(*broken)
+
+
+def _shapes(kind: type, mark: str = ", ") -> str:
+    """Names of the shapes that are of a kind."""
+    return named(SHAPES, lambda shape: issubclass(shape, kind)).replace(", ", mark)
+
+
+def named_regions(scene: Any) -> Faults:
+    """Regions of bodies that have some; their names are parts of the names of columns."""
+    shape = scene.geometry
+    for name in scene.regions:
+        key = f"regions.{quoted(name)}"
+        if not isinstance(shape, WithRegions):
+            yield f"a {shape.name} has no regions; shapes with regions: {_shapes(WithRegions)}", key, None
+        if not re.fullmatch(NAME, name):
+            yield "the name of a region must be a letter, then letters, digits and _, at most 40 in all", key, None
+        columns = [column for column in scene.column_names if column.endswith(f"_{name}")]
+        if twice := {column for column in columns if columns.count(column) > 1}:
+            yield f"the column {min(twice)!r} has another meaning; choose another name", key, None
+
+
+def tissue_of_regions(scene: Any) -> Faults:
+    """The keys of a region together with those of the whole body."""
+    law, turnover = LAWS[scene.remodeling.law], scene.remodeling.turnover
+    for name, (material, cells, kappa) in scene.properties().items():
+        region, length = in_region(name), cells.end_to_end_length
+        if CHAINS[material.chain].locks and length >= material.contour_length:
+            rule = f"must be smaller than {region}material.contour_length = {shown(material.contour_length)}"
+            yield rule, f"{region}cells.end_to_end_length", length
+        if (rule := cells.fault_of_length()) is not None:
+            yield rule, f"{region}cells.initial", cells.initial
+        if cells.initial == MEASURED_CELLS and cells.fibres is None:
+            yield "needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial
+        are_apart = material.tells_volume_apart and scene.material.tells_volume_apart
+        if material.matrix != scene.material.matrix and not are_apart:
+            rule = f"allowed beside {scene.material.matrix!r} are those that are made as a Matrix, if it is one"
+            yield rule, f"{region}material.matrix", material.matrix
+        plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
+        if kappa != plain and law.remodels and not law.asks_kappa:
+            key, value = ("remodeling.kappa", kappa) if material.chain_density else ("material.chain_density", 0.0)
+            yield f"the law {scene.remodeling.law!r} has no kappa", f"{region}{key}", value
+        if not turnover.is_on:
+            continue
+        if not material.chain_density:
+            yield f"needs chains: {region}material.chain_density above 0", "remodeling.turnover", None
+        longest = material.contour_length / length
+        if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
+            rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
+            yield rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch
+
+
+def meshed_body(scene: Any) -> Faults:
+    """Sizes and layers that the shape can have."""
+    scene.geometry.check_size(scene.mesh)
+    if isinstance(scene.geometry, WithRegions):
+        scene.geometry.check_regions(scene.regions, scene.mesh)
+    yield from ()
+
+
+def loads_beside_others(scene: Any) -> Faults:
+    """One of two loads in whose place the other stands."""
+    for name, load in scene.loads.items():
+        if (other := scene.load_kinds[name].instead_of) in scene.loads:
+            yield f"not allowed beside loads.{other}: either", f"loads.{name}", load.value
+
+
+def loaded_body(scene: Any) -> Faults:
+    """Bodies whose unloaded shape can be found."""
+    if not scene.geometry.is_loaded:
+        return
+    key, value = "geometry.is", "loaded"
+    if not isinstance(scene.geometry, Unloads):
+        yield f"allowed for the shapes {_shapes(Unloads)}", key, value
+    if scene.supports.ends == "clamped":
+        yield "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius", key, value
+    if measured := ", ".join(f"{in_region(name)}cells.fibres" for name in scene.measured_cells):
+        yield f"not allowed with {measured}: its rows belong to places, which unloading moves", key, value
+    if scene.cases:
+        rule = (
+            "not allowed with [[cases]]: the loaded body belongs to one set of loads; remodel-fenicsx unload SCENE, "
+            "with those alone, writes the scene of the unloaded one, to which [[cases]] may be added"
+        )
+        yield rule, key, value
+
+
+def same_strain(scene: Any) -> Faults:
+    """Loads that are the strain of the whole body."""
+    made = choice(scene)
+    for name, load in scene.loads.items():
+        if scene.load_kinds[name].of_one_strain and not KINEMATICS[made.name].homogeneous:
+            reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
+            rule = f"needs the same strain everywhere, model.kinematics = 'point': {reasons}"
+            yield rule, f"loads.{name}.value", load.value
+
+
+def directions_of_matrices(scene: Any) -> Faults:
+    """Directions of a matrix that turn with a round wall."""
+    if not isinstance(scene.geometry, RoundWall) or not KINEMATICS[choice(scene).name].three_dimensional:
+        return
+    for name, properties in scene.properties().items():
+        if not properties.tissue.is_round():
+            rule = (
+                "has directions along x, y and z, which follow the wall in the kinematics 'radial' and "
+                "'axisymmetric' alone: the radius, the circumference and the length"
+            )
+            yield rule, f"{in_region(name)}material.matrix", properties.material.matrix
+
+
+def parts_of_the_energy(scene: Any) -> Faults:
+    """A formulation that takes W apart needs its parts."""
+    name, matrix = scene.mesh.formulation, scene.material.matrix
+    if name != AUTO and FORMULATIONS[name].takes_parts and not scene.material.tells_volume_apart:
+        rule = f"needs a material.matrix with a known volumetric part, made as a Matrix; {matrix!r} has none"
+        yield rule, "mesh.formulation", name
+
+
+def axes_of_the_shape(scene: Any) -> Faults:
+    """Axes that a shape has."""
+    shape, axes = scene.geometry, scene.cells.axes
+    if axes not in shape.axis_kinds:
+        yield f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.axis_kinds))}", "cells.axes", axes
+
+
+def supports_of_the_shape(scene: Any) -> Faults:
+    """Supports that a shape can have."""
+    shape, ends, faces = scene.geometry, scene.supports.ends, scene.geometry.supported_faces
+    if ends not in shape.ends:
+        yield f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.ends))}", "supports.ends", ends
+    for name, support in scene.supports.faces.items() if faces is not None else ():
+        key = f"supports.{quoted(name)}"
+        if name not in faces:
+            springs = " or ".join(f"supports.{face} of kind 'elastic'" for face in faces)
+            beside = f"; allowed beside is {springs}" if springs else ""
+            yield f"a {shape.name} is held by supports.ends{beside}", key, None
+        if support.kind != "elastic":
+            yield "allowed here is 'elastic'", f"{key}.kind", support.kind
+
+
+def cells_of_the_loaded_body(scene: Any) -> Faults:
+    """Cells that have come to rest in the loaded body."""
+    key, cells, shape = "natural.cells", scene.natural.cells, scene.geometry
+    if cells != "equilibrium":
+        return
+    if not (shape.is_loaded and isinstance(shape, RoundWall)):
+        yield f"needs geometry.is = 'loaded' of the shape {_shapes(RoundWall)}", key, cells
+    if not scene.time.is_equilibrium:
+        yield "needs time.end = 'equilibrium'", key, cells
+
+
+def measured_natural_state(scene: Any) -> Faults:
+    """Prestretch from the file of the cells."""
+    natural, key = scene.natural, "natural.fibres"
+    if not natural.fibres:
+        return
+    if not scene.measured_cells:
+        yield "needs cells.fibres, a file that export has written", key, True
+    if natural.opening_angle or natural.layers:
+        yield "natural.opening_angle or layers are there too; one of them is enough", key, True
+    if scene.formulation != "displacement":
+        yield "must be false unless mesh.formulation is 'displacement'", key, True
+
+
+def natural_state(scene: Any) -> Faults:
+    """Bodies with residual stress, with cells that the closing knows."""
+    natural, shape, able, none = scene.natural, scene.geometry, Walled, "none"
+    if natural.is_of_the_mesh or natural.fibres:
+        return
+    key, value = "natural.layers", len(natural.layers)
+    if natural.opening_angle:
+        key, value, able, none = "natural.opening_angle", natural.opening_angle, RoundWall, "0"
+    needs = [
+        ("geometry.shape", isinstance(shape, able), _shapes(able, " or ")),
+        ("mesh.formulation", scene.formulation == "displacement", "'displacement'"),
+    ]
+    if isinstance(shape, RoundWall):
+        needs.append(("cells.axes", scene.cells.axes == "cylindrical", "'cylindrical'"))
+        for name, properties in scene.properties().items():
+            needs.append((f"{in_region(name)}cells.initial", properties.cells.initial == "isotropic", "'isotropic'"))
+    for other, has, possible in needs:
+        if not has:
+            yield f"must be {none} unless {other} is {possible}", key, value
+
+
+def loads_of_the_body(scene: Any) -> Faults:
+    """Times at which steps end, values that the body can have, and a length that is prescribed or unknown."""
+    time = scene.time
+    for name, load in scene.loads.items():
+        key, least = f"loads.{quoted(name)}", scene.load_kinds[name].above
+        if name == "elongation" and scene.has_free_length and any(load.value * factor for _, factor in load.ramp):
+            rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
+            yield rule, f"{key}.value", load.value
+        for index, (moment, factor) in enumerate(load.ramp):
+            if not time.is_equilibrium and moment <= time.end:
+                time.check_hit(moment, f"{key}.ramp[{index}][0]")
+            for case in scene.each_case():
+                full = case.loads[name].value * factor
+                if full <= least:
+                    words = f"with the factor {shown(full / load.value if load.value else factor)} it is {full:.6g}"
+                    yield f"must be greater than {least:g} at every time; {words}", f"{key}.value", load.value
+
+
+def weights_and_factors(scene: Any) -> Faults:
+    """Load cases that are shares of one whole, and factors on loads that there are."""
+    for index, case in enumerate(scene.cases):
+        for name, factor in case.loads.items():
+            if name not in scene.loads:
+                rule = f"no such load; the scene has {', '.join(scene.loads) or 'none'}"
+                yield rule, f"cases[{index}].loads.{quoted(name)}", factor
+    total = math.fsum(case.weight for case in scene.cases)
+    if scene.cases and abs(total - 1.0) > SUM_OF_WEIGHTS:
+        rule = f"the weights of all cases sum to {total:.10g}; they must sum to 1"
+        yield rule, f"cases[{len(scene.cases) - 1}].weight", scene.cases[-1].weight
+
+
+def coupling_and_mean(scene: Any) -> Faults:
+    """What the coupling and the mean over load cases ask of the rest."""
+    remodeling, coupling = scene.remodeling, COUPLINGS[scene.remodeling.coupling]
+    if (missing := coupling.missing(scene)) is not None:
+        yield f"needs {missing}", "remodeling.coupling", remodeling.coupling
+    if remodeling.mean != "tensor" and not scene.cases:
+        yield "needs [[cases]]", "remodeling.mean", remodeling.mean
+    if MEANS_OF_CASES[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
+        yield f"needs a remodeling.law with a target: {laws_with_a_target()}", "remodeling.mean", remodeling.mean
+    if scene.cases[1:] and not coupling.takes_cases:
+        able = named(COUPLINGS, lambda kind: kind.takes_cases)
+        yield f"with [[cases]] must be one of: {able}", "remodeling.coupling", remodeling.coupling
+
+
+def growth(scene: Any) -> Faults:
+    """Which bodies grow, and from when."""
+    turnover, time = scene.remodeling.turnover, scene.time
+    if not turnover.grows:
+        return
+    key, volume, start = "remodeling.turnover.from", turnover.volume, turnover.start
+    if not isinstance(scene.geometry, Walled):
+        yield f"must be 0 unless geometry.shape is {_shapes(Walled, ' or ')}", "remodeling.turnover.volume", volume
+    if scene.formulation != "displacement":
+        yield "must be 0 unless mesh.formulation is 'displacement'", "remodeling.turnover.volume", volume
+    if turnover.starts_at_rest:
+        if not time.is_equilibrium:
+            yield "needs time.end = 'equilibrium'; give the time of rest", key, AT_REST
+        if scene.last_hold is None:
+            yield "needs loads.NAME.ramp that stay for a while and change again", key, AT_REST
+        if scene.cases:
+            yield "needs a scene without [[cases]]", key, AT_REST
+    elif start and time.is_equilibrium:
+        yield "must be 0 or 'rest' with time.end = 'equilibrium', which has no times", key, start
+    elif start and start > time.end:
+        yield f"must be at most time.end = {shown(time.end)}", key, start
+    elif start:
+        time.check_hit(start, key)
+
+
+def equilibrium(scene: Any) -> Faults:
+    """An equilibrium of the cells that depends on no way there."""
+    law, parts, key, end = scene.remodeling.law, scene.properties().items(), "time.end", scene.time.end
+    if not scene.time.is_equilibrium:
+        return
+    if not LAWS[law].has_limit:
+        laws = named(LAWS, lambda law: law.has_limit)
+        rule = f"remodeling.law = {law!r} has no limit that is the same on every path; allowed are the laws {laws}"
+        yield rule, key, end
+    bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
+    if bare:
+        yield f"needs chains: {', '.join(bare)} above 0", key, end
+    if still := [f"{in_region(name)}remodeling.kappa" for name, one in parts if one.kappa == 0]:
+        yield f"{', '.join(still)} = 0: the cells never change", key, end
+
+
+def unknown_length(scene: Any) -> Faults:
+    """Multigrid has no place for one more unknown."""
+    method = scene.solver.method
+    if scene.has_free_length and method == "iterative":
+        names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != method)
+        rule = f"allowed where the length is an unknown, with loads.axial_force or closed ends, are {names}"
+        yield rule, "solver.method", method
+
+
+def times_of_output(scene: Any) -> Faults:
+    """Times at which there are rows."""
+    for index, moment in enumerate(scene.output.times):
+        key = f"output.times[{index}]"
+        if scene.time.is_equilibrium:
+            yield "not allowed with time.end = 'equilibrium', which has no times", key, moment
+        if moment > scene.time.end:
+            yield f"must be at most time.end = {shown(scene.time.end)}", key, moment
+        scene.time.check_hit(moment, key)
+
+
+def fields_of_the_body(scene: Any) -> Faults:
+    """Fields that the run will have."""
+    fields = scene.output.fields
+    for field, reason in scene.lacking_fields.items():
+        if not isinstance(fields, bool) and field in fields:
+            yield reason, "output.fields", field
+
+
+def columns_of_the_history(scene: Any) -> Faults:
+    """Columns that the run will have."""
+    shape, turnover, key = scene.geometry, scene.remodeling.turnover, "output.columns"
+    of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
+    for name in scene.output.columns:
+        if name == "time_error" and scene.time.is_equilibrium:
+            yield f"{name!r} is an error of steps; must be left out with time.end = 'equilibrium'", key, name
+        if name in of_one_tissue and scene.regions:
+            yield f"{name!r} is for bodies of one tissue; the scene has regions", key, name
+        if name in (*TURNED_OVER, TURNOVER_POWER) and not turnover.is_on:
+            yield f"{name!r} changes only with remodeling.turnover, which is not set", key, name
+        if name in GROWTH_COLUMNS and not turnover.grows:
+            yield f"{name!r} needs remodeling.turnover with a volume above 0", key, name
+        if name not in (known := dict.fromkeys(scene.column_names)):
+            names = listed(map(repr, known), repr(name))
+            yield f"no such column on request; allowed for shape {shape.name!r} are {names}", key, name
+
+
+def kinematics(scene: Any) -> Faults:
+    """Kinematics that are right for the scene."""
+    name = scene.model.kinematics
+    if name != AUTO and (reasons := objections(scene, name)):
+        yield "; ".join(reasons), "model.kinematics", name
+
+
+def number_of_elements(scene: Any) -> Faults:
+    """As many elements as Gmsh and memory bear."""
+    if not isinstance(scene.geometry, FromFile) and (rule := too_many_elements(scene)):
+        yield rule, "mesh.refinement", scene.mesh.refinement
+
+
+def names_of_columns(scene: Any) -> Faults:
+    """A name for each column of the history."""
+    for name, count in Counter(column.name for column in scene.columns()).items():
+        if count > 1:
+            yield "there are two columns of this name; parts of your own need other names", name, None
+
+
+RULES: tuple[Rule, ...] = (
+    named_regions,
+    tissue_of_regions,
+    meshed_body,
+    loads_beside_others,
+    loaded_body,
+    same_strain,
+    directions_of_matrices,
+    parts_of_the_energy,
+    axes_of_the_shape,
+    supports_of_the_shape,
+    cells_of_the_loaded_body,
+    measured_natural_state,
+    natural_state,
+    loads_of_the_body,
+    weights_and_factors,
+    coupling_and_mean,
+    growth,
+    equilibrium,
+    unknown_length,
+    times_of_output,
+    fields_of_the_body,
+    columns_of_the_history,
+    kinematics,
+    number_of_elements,
+    names_of_columns,
+)
