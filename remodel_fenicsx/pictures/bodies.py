@@ -53,8 +53,8 @@ Pixels = NDArray[np.uint8]
 
 ANGLE = "fibre_angle_deformed"  # colours the bodies
 ANGLES = ("fibre_angle", ANGLE)  # fields in degrees, from 0 to 90
-OF_CHAINS = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)  # fields that chains are made of
-SHOWN_FIELDS = ("displacement", ANGLE, *OF_CHAINS)
+OF_TUBES = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)  # fields that chains are made of
+SHOWN_FIELDS = ("displacement", ANGLE, *OF_TUBES)
 NOTHING_KNOWN = "#999ea6"  # where chains have no angle
 LIFT = 0.03  # of chains over the width of a face, which need not be plane
 LIGHT: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular": 0.0}
@@ -117,7 +117,7 @@ def add_body(
     if name in ANGLES:
         looks |= {"cmap": list(ANGLE_COLOURS), "clim": (0, 90), "nan_color": NOTHING_KNOWN}
     actor = plotter.add_mesh(body, **{**looks, **options})
-    if with_chains and set(OF_CHAINS) <= set(body.cell_data):
+    if with_chains and set(OF_TUBES) <= set(body.cell_data):
         plotter.add_mesh(chains(body), color=CHAIN_LOOK["colour"], **LIGHT)
     return actor
 

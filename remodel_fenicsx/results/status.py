@@ -19,7 +19,7 @@ from remodel_fenicsx.system.terminal import duration
 
 RECENT = 20  # steps whose mean is the rate
 BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
-_ENTRY = re.compile(r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*?)\n?(?=^\d{4}-\d\d-|\Z)", re.M | re.S)
+_LOG_ENTRY = re.compile(r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*?)\n?(?=^\d{4}-\d\d-|\Z)", re.M | re.S)
 
 
 def status(folder: Path) -> list[str]:
@@ -66,7 +66,7 @@ def status(folder: Path) -> list[str]:
 def log_entries(folder: Path) -> list[tuple[str, str, str]]:
     """Stamp, level and text of each entry of run.log, which may have several lines."""
     text = read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace") if (folder / LOG).exists() else ""
-    return _ENTRY.findall(text)
+    return _LOG_ENTRY.findall(text)
 
 
 def state_of(recording: RecordedRun) -> tuple[str, str]:

@@ -217,6 +217,6 @@ class RestedCells(WarnsOnce):
             "cells that had rested without tension remodel again, and the law catches up in one pass. In "
             f"{100 * share:.2g} % of the body the structure tensor A changes by {change:.2g} r0^2 (root mean square "
             f"over the body; most at {self.quadrature.shown_place_of_largest(squares)}). "
-            'When cells rest depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a remodeling.law '
-            "that is a rate (docs/theory.md, Stability of the pass)",
+            'When cells rest depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a '
+            "remodeling.law that is a rate (docs/theory.md, Stability of the pass)",
         )

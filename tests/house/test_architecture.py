@@ -20,7 +20,8 @@ PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
 ROOMS = ("errors", "_lazy", "_version", "system", "schema", "model", "fem", "kernels", "schema.settings", "body",
          "scene", "state", "solver", "evolution", "watch", "results", "report", "measured", "initial",
-         "simulation", "unloading", "running", "studies", "pictures", "recording", "cli", "parts", "extend")  # fmt: skip
+         "simulation", "unloading", "running", "studies", "pictures", "recording", "cli", "parts",
+         "extend")  # fmt: skip
 
 
 @dataclass(frozen=True)
