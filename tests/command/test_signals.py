@@ -57,16 +57,16 @@ from remodel_fenicsx import cli
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.solver.continuation import Blend
 from remodel_fenicsx.system.interrupts import stopping_at_once
-whole = Staggered._solved_as_expected
+whole = Staggered._solve
 def compiled(blend):
     with stopping_at_once():
         os.kill(os.getpid(), signal.SIGTERM)
-def in_parts(coupling, step, loads, work):
+def in_parts(coupling, step, time, old_loads, loads, work, again):
     if coupling.state.number < 3:
-        return whole(coupling, step, loads, work)
+        return whole(coupling, step, time, old_loads, loads, work, again)
     coupling._solve_in_parts(4.0, dict(coupling.state.loading.values), loads, work, None)
 Blend.equilibrium = property(compiled)
-Staggered._solved_as_expected = in_parts
+Staggered._solve = in_parts
 sys.exit(cli.main(sys.argv[1:]))
 """
 

@@ -194,21 +194,21 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
     newton = coupled.blend.newton
     solve = newton.solve
 
-    def in_parts(time: float, old_loads: Any, loads: Any, work: Any) -> None:
+    def in_parts(step: Any, time: float, old_loads: Any, loads: Any, work: Any, again: bool) -> None:
         coupled._solve_in_parts(time, old_loads, loads, work, None)
 
-    def solved(origin: Any = None) -> Any:
+    def solved(origin: Any = None, roughly: bool = False) -> Any:
         if simulation.state.number not in refused:
             refused.add(simulation.state.number)
             raise SolveFailure("in vain", 0, 0, coupled.equilibrium.extension())
-        return solve(origin=origin)
+        return solve(origin, roughly)
 
     def noted(fraction: float) -> None:
         set_part(fraction)
         parts.append((fraction, turnover.logarithms()[0].mean()))
 
     monkeypatch.setattr(newton, "solve", solved)
-    monkeypatch.setattr(coupled, "_solve_from_the_last", in_parts)
+    monkeypatch.setattr(coupled, "_solve", in_parts)
     monkeypatch.setattr(turnover, "set_part", noted)
     rows = [dict(step.row) for step in simulation.steps()]
     simulation.close()

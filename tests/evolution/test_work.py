@@ -33,9 +33,9 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Attempt]]:
     found: list[Attempt] = []
     solve = GuardedNewton.solve
 
-    def counted(self: GuardedNewton, origin: Any = None) -> Solution:
+    def counted(self: GuardedNewton, origin: Any = None, roughly: bool = False) -> Solution:
         try:
-            solution = solve(self, origin)
+            solution = solve(self, origin, roughly)
         except SolveFailure as failure:
             found.append(failure)
             raise

@@ -109,15 +109,15 @@ def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
         far = wide.unknown.x.array.copy()
     solve, starts = GuardedNewton.solve, [far]
 
-    def misled(newton: GuardedNewton, origin: Any = None) -> Any:
+    def misled(newton: GuardedNewton, origin: Any = None, roughly: bool = False) -> Any:
         if starts:
             first = newton.unknown.x.array.copy()
             newton.unknown.x.array[:] = starts.pop()
-            solution = solve(newton, origin)
+            solution = solve(newton, origin, roughly)
             assert np.abs(newton.unknown.x.array - first).max() > 1.0
             object.__setattr__(solution, "reach", 10.0)
             return solution
-        return solve(newton, origin)
+        return solve(newton, origin, roughly)
 
     monkeypatch.setattr(GuardedNewton, "solve", misled)
     found, _ = radii(thin_tube(0.29, **{"solver.relative_tolerance": 1e-9}))

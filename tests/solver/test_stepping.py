@@ -103,10 +103,10 @@ def test_the_first_part_of_an_exchange_is_no_longer_than_its_bound(monkeypatch: 
     coupling: Any = stepper.coupling
     done, real = [0.0], GuardedNewton.solve
 
-    def noted(newton: GuardedNewton, origin: Any = None) -> Solution:
+    def noted(newton: GuardedNewton, origin: Any = None, roughly: bool = False) -> Solution:
         if newton is not coupling.newton:
             done.append(float(coupling.blend.theta.value))
-        return real(newton, origin)
+        return real(newton, origin, roughly)
 
     monkeypatch.setattr(GuardedNewton, "solve", noted)
     monkeypatch.setattr(GuardedNewton, "tangent_direction", lambda *change: np.array([np.nan]))
@@ -171,7 +171,7 @@ class Refusing:
         self.tried: list[float] = []
         self.accepted = [0.0]
 
-    def __call__(self, origin: Any = None) -> Solution:
+    def __call__(self, origin: Any = None, roughly: bool = False) -> Solution:
         force = self.made.loading.values["force"]
         self.tried.append(force)
         if force - self.accepted[-1] > self.limit:
@@ -201,7 +201,7 @@ def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(monkeyp
     refusing = Refusing(made, 2.5)
     real = refusing.__call__
 
-    def stricter_near_the_end(origin: Any = None) -> Solution:
+    def stricter_near_the_end(origin: Any = None, roughly: bool = False) -> Solution:
         refusing.limit = 1.5 if refusing.accepted[-1] >= 6.0 else 2.5
         return real()
 
@@ -246,7 +246,7 @@ def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeyp
     coupling: Any = stepper.coupling
     tried: list[tuple[str, float]] = []
 
-    def refuse_the_first(newton: GuardedNewton, origin: Any = None) -> Solution:
+    def refuse_the_first(newton: GuardedNewton, origin: Any = None, roughly: bool = False) -> Solution:
         tried.append(("loads" if newton is coupling.newton else "cells", made.loading.values["force"]))
         if len(tried) == 1:
             raise SolveFailure("too much", 7, 7, Extension(0.9, 0.5, (0.0, 0.0, 0.0)))
