@@ -18,7 +18,7 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
 from remodel_fenicsx.schema.settings import Solver
-from remodel_fenicsx.solver.attempts import EXPECTED, LAST, Attempt, attempted, say
+from remodel_fenicsx.solver.attempts import FROM_EXPECTED, FROM_LAST, Attempt, attempted, say
 from remodel_fenicsx.solver.continuation import Blend, Change, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
@@ -298,22 +298,22 @@ class Staggered:
     def _solve(
         self, step: LoadStep, time: float, old_loads: LoadValues, loads: LoadValues, work: Work, again: bool
     ) -> None:
-        """Try `attempts.EXPECTED`, `LAST` and `PARTS`."""
+        """Try `attempts.FROM_EXPECTED`, `FROM_LAST` and `IN_PARTS`."""
         unknown, loading, failure = self.state.unknown.x.array, self.state.loading, None
         before = unknown.copy()
         loading.set(loads)  # what they prescribe is part of what is expected
         if not again and self._starts_as_expected(step):
-            if self._tried(EXPECTED, work, before) is None:
+            if self._tried(FROM_EXPECTED, work, before) is None:
                 return
         unknown[:] = before
         loading.set(old_loads)
         if self.equilibrium.extension().admissible:
             loading.set(loads)
-            failure = self._tried(LAST, work)
+            failure = self._tried(FROM_LAST, work)
             if failure is None:
                 return
         else:
-            say(LAST, "the remodeled cells have r >= L at the old displacement")
+            say(FROM_LAST, "the remodeled cells have r >= L at the old displacement")
         self._solve_in_parts(time, old_loads, loads, work, failure)
 
     def _starts_as_expected(self, step: LoadStep) -> bool:

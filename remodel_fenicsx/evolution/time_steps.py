@@ -17,7 +17,7 @@ from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.model.tensors import largest_change_of_length
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.solver.attempts import SHORTER, attempted, say
+from remodel_fenicsx.solver.attempts import SHORTER_STEP, attempted, say
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Earlier, Numbers
 
@@ -283,7 +283,7 @@ class StepControl:
             duration = (time - self.state.time) / 4
             if failures > FAILED_STEPS or duration < SMALLEST * self.first:
                 raise found
-            say(SHORTER, found)
+            say(SHORTER_STEP, found)
 
     def _end_of_step(self, duration: float, stop: float) -> float:
         """Steps to a stop are alike: none that is left over is shorter than the others."""

@@ -19,23 +19,25 @@ class Attempt(NamedTuple):
     fails: str
 
 
-EXPECTED = Attempt(
+FROM_EXPECTED = Attempt(
     "from the displacement that the last steps let expect",
     "Staggered",
     "not solved from the predicted displacement",
 )
-LAST = Attempt("from the last displacement", "Staggered", "solving in parts")
-SAFER = Attempt(
+FROM_LAST = Attempt("from the last displacement", "Staggered", "solving in parts")
+MADE_ANEW = Attempt(
     "in each solve: once more, with new factors or levels in each iteration",
     "EveryTangent.second_try",
     "the step is solved once more",
 )
-PARTS = Attempt(
+IN_PARTS = Attempt(
     "in parts: first what has remodeled, then the loads, a failed part halved", "Change", "a smaller part is tried"
 )
-REFUSED = Attempt("the step is refused, with its kind and advice", "diagnosed", "")
-SHORTER = Attempt("with a tolerance: a step of a quarter, up to three times", "StepControl", "a shorter step is tried")
-ATTEMPTS = (EXPECTED, LAST, SAFER, PARTS, REFUSED, SHORTER)
+STEP_REFUSED = Attempt("the step is refused, with its kind and advice", "diagnosed", "")
+SHORTER_STEP = Attempt(
+    "with a tolerance: a step of a quarter, up to three times", "StepControl", "a shorter step is tried"
+)
+ATTEMPTS = (FROM_EXPECTED, FROM_LAST, MADE_ANEW, IN_PARTS, STEP_REFUSED, SHORTER_STEP)
 """In their order; docs/architecture.md has the table."""
 
 

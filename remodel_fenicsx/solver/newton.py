@@ -24,7 +24,7 @@ from remodel_fenicsx.fem.solver_methods import (
     method_options,
 )
 from remodel_fenicsx.schema.settings import Solver
-from remodel_fenicsx.solver.attempts import SAFER, attempted, say
+from remodel_fenicsx.solver.attempts import MADE_ANEW, attempted, say
 from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
 from remodel_fenicsx.solver.linear import EveryTangent
 from remodel_fenicsx.state import stress_rounding
@@ -301,7 +301,7 @@ class GuardedNewton:
         if second is None:
             raise first
         words, other_way = second
-        say(SAFER, first.reason, words)
+        say(MADE_ANEW, first.reason, words)
         with other_way:
             again = attempted(lambda: self._attempt(origin), SolveFailure)
         again.count(first)

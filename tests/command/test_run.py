@@ -331,6 +331,7 @@ def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "a valid scene (tube, 150 steps)\nnetwork modulus c = 1.568 Pa, " in capsys.readouterr().out
     for preset in ("kuhl-holzapfel-2007", "sun-2002"):
         for shape in ("cube", "tendon", "tube", "sheet"):
+            capsys.readouterr()
             assert cli.main(["new", preset, "--shape", shape]) == 0
             scene = tmp_path / f"{preset}-{shape}.toml"
             scene.write_text(capsys.readouterr().out)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import tomlkit
 
-from remodel_fenicsx import cli, simulation
+from remodel_fenicsx import cli, initial
 from tests.conftest import Refused
 from tests.mesh_files import changed
 
@@ -80,7 +80,7 @@ def test_what_would_take_long_is_said(
     refused: Refused,
 ) -> None:
     """Files that are not there are found nevertheless."""
-    monkeypatch.setattr(simulation, limit, 10)
+    monkeypatch.setattr(initial, limit, 10)
     assert cli.main(["validate", str(written(tube, {"cells": {"fibres": "far.csv"}}))]) == 0
     assert words in capsys.readouterr().out
     refused("validate", written(tube, {"cells": {"fibres": "none.csv"}}))

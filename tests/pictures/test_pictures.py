@@ -113,7 +113,7 @@ def test_all_elements_are_drawn_and_chains_where_they_were_recorded(drawn: Drawn
     body = panel(drawn(name))
     rows, columns = outline(body)
     assert 0.4 < (np.ptp(body, axis=2) > 12).sum() / (rows * columns) <= 1.0
-    assert (np.all(body < 70, axis=2).mean() > 0.005) == dark
+    assert (np.all(body < 70, axis=2).mean() > 0.003) == dark
 
 
 # ---------------------------------------------------------------- files
