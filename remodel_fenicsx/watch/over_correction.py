@@ -159,8 +159,8 @@ class OverCorrection(WarnsOnce):
         return (
             "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
             f"changes by {swing.cells:.2g} r0^2 (root mean square; most at "
-            f"{self.quadrature.shown_place_of_largest(change)}), the displacement by {swing.body:.2g} of its size; each pass "
-            f"multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
+            f"{self.quadrature.shown_place_of_largest(change)}), the displacement by {swing.body:.2g} of its size; "
+            f"each pass multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
             f"{self._advice(swing.cells_factor)} "
             "(docs/theory.md, Stability of the pass)"
         )
