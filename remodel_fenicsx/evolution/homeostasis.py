@@ -49,7 +49,7 @@ LARGEST_RATIO = 0.95  # of two changes, for Aitken's extrapolation: it then goes
 
 
 class PathToRest(NamedTuple):
-    """What is known of the path before it: its end, stops and first step, and the tolerance of its steps in degrees.
+    """Hold what is known of the path: end, stops, first step, and tolerance in degrees.
 
     `held_from`: time from which all loads are held. `before_change`: hold of the loads in which all rests once before,
     from and to.
@@ -77,11 +77,11 @@ class Homeostasis:
         self._held: Snapshot | None = None  # the first state on the way under held loads
 
     def remaining(self) -> list[float]:
-        """Return the time of the state at rest, where it is left."""
+        """Return the time of the steady state, unless it is reached."""
         return [self.plan.end] if self.state.time < self.plan.end else []
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """The state at rest, as a step; what is yielded is committed."""
+        """Yield the steady state as one committed step."""
         self.stepper.start(watchers)
         for time in self.remaining():
             yield self.stepper.advance(time, watchers, is_last=True, way=self)
@@ -109,7 +109,7 @@ class Homeostasis:
         return work
 
     def _rest_before(self, held: float, change: float, work: Work) -> None:
-        """Wait under loads that are held until all rests; then begins what waits for that."""
+        """Wait under constant loads for the steady state; then begins what waits for it."""
         stops = [*(stop for stop in self.plan.stops if stop <= held), self.plan.stops[-1]]
         control = self.control.with_stops(stops)
         with self.stepper.holding(held):
@@ -158,7 +158,7 @@ class Homeostasis:
                 control.limit(UNCHECKED, longest)
 
     def _left(self, residual: float) -> float:
-        """By how much all changes, relatively, in a time of 1/kappa from here."""
+        """Return the largest relative change in a time of 1/kappa."""
         soon = self.state.time + 1 / self.stepper.slowest
         return max(part.left(soon, residual) for part in self.remodels)
 
@@ -212,7 +212,7 @@ class Homeostasis:
         return False
 
     def _to_the_limit(self, time: float, residual: float) -> list[Array]:
-        """Changes of what remodels to where it tends."""
+        """Return the changes of all that remodels to its limits."""
         return [part.to_the_limit(time, 1 / self.stepper.slowest, residual) for part in self.remodels]
 
     def _size(self, changes: Sequence[Array]) -> float:

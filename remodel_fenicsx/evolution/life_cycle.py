@@ -1,4 +1,4 @@
-"""What remodels: the life of cells, collagen content and further load cases in a step, and their error in time."""
+"""Cells, collagen content and further load cases share one life cycle in a step: `Remodels`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 
 
 class Remodels:
-    """Something that remodels beside the displacement; a subclass overrides what it has.
+    """Take part in a step as something that remodels; a subclass overrides what it needs.
 
-    Values are those of all points in one row, in a form that the subclass chooses; as components they are an array
-    (n, components), in which differences are taken.
+    Values are flattened over the quadrature points, in a form that the subclass chooses. As
+    components they are an array (n, components), whose differences have a meaning.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Remodels:
     slowest, fastest
         Smallest rate above 0, and largest one, 1/time.
     depends_on_path
-        Whether the values at rest depend on the path that leads there.
+        Whether the steady state depends on the load path.
     tissue
         The tissue with what it brings.
     watchers
@@ -51,23 +51,23 @@ class Remodels:
 
     # ------------------------------------------------------------ a step
     def before(self, time: float, order: int) -> None:
-        """Take the values for the equilibrium at a time: of the last rates, or extrapolated (order 2)."""
+        """Take the values for the equilibrium at a time, by the last rates or extrapolated."""
 
     def settle(self, time: float, again: bool) -> Work:
-        """The state is in equilibrium; `again`: of this step a second time."""
+        """Follow a solved equilibrium; `again`: a second one of this step."""
         return Work()
 
     def after(self, time: float) -> float:
-        """The step is solved: remodel, and return the power."""
+        """Remodel after a solved step, and return the power."""
         return 0.0
 
     def set_part(self, fraction: float) -> None:
         """Take a part of what has changed since the last equilibrium."""
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free the objects that PETSc has made."""
 
-    # ------------------------------------------------------------ error in time
+    # ------------------------------------------------------------ time discretisation error
     def row(self) -> Any:
         """Return the values of the solved state."""
 
@@ -75,7 +75,7 @@ class Remodels:
         """Return, after a step, values by a better rule; None where there are none."""
 
     def set(self, values: Any) -> None:
-        """Take other values."""
+        """Replace the values at all points."""
 
     def as_components(self, values: Any) -> Array:
         """Return values as components."""
@@ -93,13 +93,13 @@ class Remodels:
         """Return a distance of two values over the body, degrees."""
         return 0.0
 
-    # ------------------------------------------------------------ rest
+    # ------------------------------------------------------------ steady state
     def left(self, time: float, residual: float) -> float:
         """Return the largest relative change up to a time."""
         return 0.0
 
     def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
-        """Return the change to where it tends, or over a duration where it has no limit, (elements, points, ...)."""
+        """Return the change to its limit, or over a duration, (elements, points, ...)."""
         return np.zeros(())
 
     def size(self, change: Array) -> float:
@@ -110,11 +110,11 @@ class Remodels:
         """Take a multiple of such a change."""
 
     def begin_path(self) -> None:
-        """A path to rest begins."""
+        """Begin a path to the steady state."""
 
     def without_rest(self, waiting: float) -> str:
-        """Say, where it is so, that it does not come to rest; `waiting`: under constant loads, times its rate."""
+        """Return why it reaches no steady state, or nothing; `waiting`: under constant loads."""
         return ""
 
     def rested(self, time: float) -> None:
-        """All is at rest before a time at which what waits for that begins."""
+        """Begin at a time what waits for the steady state that is reached."""

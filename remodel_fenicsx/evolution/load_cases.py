@@ -1,4 +1,4 @@
-"""Further load cases: states with the same cells, solved after the first one, whose stresses drive the cells too."""
+"""Solve further load cases: states with the same cells, whose stresses drive the cells too."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from remodel_fenicsx.state import State
 
 
 class FurtherCase:
-    """A load case beside the first: solved after it in each step, and asked for its drive before the pass."""
+    """Hold a further load case: it is solved after the first one, and drives the same cells."""
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class FurtherCase:
 
 
 class LoadCases(Remodels):
-    """All load cases beside the first; they have the cells of the first, and no values of their own."""
+    """Solve all further load cases of a step; they have no values of their own."""
 
     name = "cases"
 
@@ -64,14 +64,14 @@ class LoadCases(Remodels):
         self.cases = cases
 
     def settle(self, time: float, again: bool) -> Work:
-        """Solve each."""
+        """Solve each load case."""
         work = Work()
         for case in self.cases:
             work.count(case.solve(time, again))
         return work
 
     def close(self) -> None:
-        """Free what PETSc has made for each."""
+        """Free the objects that PETSc has made for each."""
         for case in self.cases:
             case.coupling.close()
 

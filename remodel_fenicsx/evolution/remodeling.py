@@ -280,7 +280,7 @@ class RemodelingPass(Remodels):
         return UnitCell(*self.state.equilibrium_cells.point_cells[:2])
 
     def set(self, values: UnitCell) -> None:
-        """Take other cells."""
+        """Replace the cells at all points."""
         self.state.cells.set(*values[:2])
 
     def as_components(self, values: UnitCell) -> Array:

@@ -438,13 +438,13 @@ class Stepper:
             yield self.advance(time, watchers, is_last=number == len(remaining), judge=judge)
 
     def take(self, load_values: Callable[[float], LoadValues], kappa: Any) -> None:
-        """From now on take other loads and rates."""
+        """Replace loads and rates."""
         self.load_values = load_values
         self.remodeling.set_kappa(kappa)
 
     @contextmanager
     def holding(self, held: float) -> Iterator[None]:
-        """Meanwhile all loads stay what they are at a time."""
+        """Keep all loads constant from a time on, within the block."""
         given = self.load_values
         self.load_values = lambda time: given(min(time, held))
         try:
@@ -459,7 +459,7 @@ class Stepper:
 
 
 class FixedSteps:
-    """The way through time in steps of one length."""
+    """March in steps of one length."""
 
     def __init__(self, stepper: Stepper, end: float, step: float, judge: Callable[[Step], object] = lambda step: None):
         self.stepper, self.end, self.step, self.judge = stepper, end, step, judge
@@ -469,7 +469,7 @@ class FixedSteps:
         return list(times(self.end, self.step))[self.stepper.state.number :]
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """From where the state is to the end; what is yielded is committed."""
+        """Yield the committed steps from the present state to the end."""
         return self.stepper.march(self.remaining(), watchers, self.judge)
 
 
