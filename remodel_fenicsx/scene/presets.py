@@ -22,7 +22,7 @@ from remodel_fenicsx.schema.text import merged, put
 DEFAULT_LAW = "tensor"
 
 
-def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def default_method(values: Mapping[str, object]) -> dict[str, dict[str, object]]:
     """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has."""
     remodeling = values.get("remodeling")
     law = remodeling.get("law", DEFAULT_LAW) if isinstance(remodeling, Mapping) else DEFAULT_LAW
@@ -35,7 +35,11 @@ def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _printed_method(
-    geometry: dict[str, Any], loads: dict[str, Any], end: float, material: dict[str, Any], cells: dict[str, Any]
+    geometry: dict[str, float],
+    loads: dict[str, object],
+    end: float,
+    material: dict[str, float],
+    cells: dict[str, object],
 ) -> dict[str, dict[str, Any]]:
     """The paper's method on one of its bodies, every choice spelled out; how systems are solved is none of them."""
     common_material = {
@@ -67,7 +71,7 @@ def _printed_method(
     }
 
 
-def _load(value: float, end_of_ramp: float) -> dict[str, Any]:
+def _load(value: float, end_of_ramp: float) -> dict[str, object]:
     return {"value": value, "ramp": [[0.0, 0.0], [end_of_ramp, 1.0]]}
 
 
@@ -145,7 +149,7 @@ PRESET_NOTES = {
 class Profile:
     """How much accuracy a run shall have: settings, with the error and cost that were measured on the artery."""
 
-    values: dict[str, Any]
+    values: dict[str, object]
     degrees: float
     percent: float
     seconds: float
@@ -169,7 +173,7 @@ class Profile:
             )
         return settings
 
-    def settings(self, scene: Any) -> dict[str, Any]:
+    def settings(self, scene: Any) -> dict[str, object]:
         """Its values for a scene, by dotted key."""
         found = dict(self.values)
         if self.is_for_means and (part := for_means(scene)) != AUTO:
@@ -177,15 +181,15 @@ class Profile:
         return found
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+def nested(values: Mapping[str, object]) -> dict[str, Any]:
     """Values by dotted key as tables of a scene."""
-    tables: dict[str, Any] = {}
+    tables: dict[str, object] = {}
     for key, value in values.items():
         put(tables, key, value)
     return tables
 
 
-def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
+def _values(refinement: int, degree: int, tolerance: float) -> dict[str, object]:
     values = {"model.kinematics": AUTO, "mesh.refinement": refinement, "mesh.degree": degree, "mesh.formulation": AUTO}
     return values | {"time.tolerance": tolerance}
 
@@ -287,7 +291,7 @@ def with_own_numbers(part: Any, properties: Callable[[Any], Properties]) -> Any:
     return part
 
 
-def without_coupling(base: dict[str, Any], over: Mapping[str, Any]) -> None:
+def without_coupling(base: dict[str, Any], over: Mapping[str, object]) -> None:
     """Take out of the values a coupling that extrapolates where what lies over them has a law without a target."""
     law, coupling = str(_of(over, "remodeling", "law")), str(_of(base, "remodeling", "coupling"))
     if law in LAWS and LAWS[law].target is None and coupling in COUPLINGS and COUPLINGS[coupling].needs_a_target:

@@ -30,10 +30,10 @@ Schema = dict[str, Any]
 class _Keys(GenerateJsonSchema):
     """No key is required, for a preset may lie under it; nothing is null, which TOML does not have."""
 
-    def field_is_required(self, field: Any, total: bool) -> bool:
+    def field_is_required(self, field: object, total: bool) -> bool:
         return False
 
-    def field_title_should_be_set(self, schema: Any) -> bool:
+    def field_title_should_be_set(self, schema: object) -> bool:
         return False
 
     def nullable_schema(self, schema: Any) -> Schema:
