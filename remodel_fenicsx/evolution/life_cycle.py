@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.solver.continuation import Work
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.evolution.stepper import Stepper, Watcher
+    from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -44,7 +48,7 @@ class Remodels:
     fastest: float = 0.0
     depends_on_path = False
     tissue: Any = None
-    watchers: Sequence[Callable[[Any, Any], Any]] = ()
+    watchers: Sequence[Callable[[Scene, Stepper], Watcher | None]] = ()
 
     def begin_with(self, values: Callable[[str], Array]) -> None:
         """Take what files of an earlier run have, by name, (elements, points, ...)."""
