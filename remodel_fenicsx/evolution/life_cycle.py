@@ -72,10 +72,10 @@ class Remodels:
         """Free PETSc's objects."""
 
     # ------------------------------------------------------------ error in time
-    def row(self) -> Any:
+    def row(self) -> object:
         """Return the values of the solved state."""
 
-    def better(self) -> Any:
+    def better(self) -> object:
         """Return, after a step, values by a better rule; None where there are none."""
 
     def set(self, values: Any) -> None:
@@ -85,11 +85,11 @@ class Remodels:
         """Return values as components."""
         return np.asarray(values)
 
-    def moved(self, values: Any, change: Array) -> Any:
+    def moved(self, values: Any, change: Array) -> object:
         """Return values after a change of their components."""
         return values
 
-    def passed(self, values: Any, time: float, residual: float) -> Any:
+    def passed(self, values: Any, time: float, residual: float) -> object:
         """Return what the present state makes of values up to a time."""
         return values
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from dolfinx.fem import Function
     from mpi4py import MPI
 
+    from remodel_fenicsx.evolution.homeostasis import Homeostasis
     from remodel_fenicsx.scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -359,7 +360,7 @@ class Stepper:
         watchers: Sequence[Watcher] = (),
         is_last: bool = False,
         rejected: Step | None = None,
-        way: Any = None,
+        way: Homeostasis | None = None,
         judge: Callable[[Step], object] = lambda step: None,
     ) -> Step:
         """One step: equilibrium with the loads of `time`, and remodeling.

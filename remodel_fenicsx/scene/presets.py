@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.model.chains import Chain
@@ -16,6 +16,9 @@ from remodel_fenicsx.model.laws import COMPLEX_STEP, LAWS
 from remodel_fenicsx.schema.settings import COUPLINGS, Properties, in_region
 from remodel_fenicsx.schema.tables import fault, quoted
 from remodel_fenicsx.schema.text import merged, put
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 # ---------------------------------------------------------------- without a preset
 
@@ -40,7 +43,7 @@ def _printed_method(
     end: float,
     material: dict[str, float],
     cells: dict[str, object],
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, object]:
     """The paper's method on one of its bodies, every choice spelled out; how systems are solved is none of them."""
     common_material = {
         "lame_lambda": 27.293,
@@ -118,14 +121,14 @@ _MEASURED_COLLAGEN = {
 }
 
 
-def _consistent(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _consistent(scene: dict[str, object]) -> dict[str, object]:
     changes = {"law": "tensor", "frame": "material", "coupling": "extrapolated"}
     found = merged(scene, {"material": {"repulsion": "log"}, "remodeling": changes})
     del found["remodeling"]["pairing"]
     return found
 
 
-PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "kuhl-holzapfel-2007": _PAPER,
     "consistent": {shape: _consistent(scene) for shape, scene in _PAPER.items()},
     "sun-2002": {shape: merged(scene, _MEASURED_COLLAGEN) for shape, scene in _PAPER.items()},
@@ -223,6 +226,7 @@ def profile_for(name: str, scene: Any) -> Profile:
 # the model's own (docs/which_numbers.md).
 
 Values = Mapping[str, Any]
+S = TypeVar("S", bound="BaseModel")
 
 
 def aligned_stiffness(chain: Chain, end_to_end_length: float, contour_length: float) -> float:
@@ -281,7 +285,7 @@ def check_exclusive(own: Values) -> None:
                 raise fault(rule, f"{key}.{experiment.key}", value)
 
 
-def with_own_numbers(part: Any, properties: Callable[[Any], Properties]) -> Any:
+def with_own_numbers(part: S, properties: Callable[[S], Properties]) -> S:
     """A scene, or a region, with the model's own numbers in place of those of experiments."""
     for table, key, replaces, own in EXPERIMENTS:
         keys = getattr(part, table)
@@ -314,6 +318,6 @@ def place_of(name: str) -> str:
     return in_region(name and quoted(str(name)))
 
 
-def _of(part: Values, table: str, key: str) -> Any:
+def _of(part: Values, table: str, key: str) -> object:
     keys = part.get(table)
     return keys.get(key) if isinstance(keys, Mapping) else None

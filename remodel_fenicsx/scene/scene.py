@@ -286,7 +286,7 @@ class Scene(Table):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _on_its_preset(cls, values: Any, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
+    def _on_its_preset(cls, values: object, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
         """The scene's keys over those of profile, preset and shape; numbers in place of values with units."""
         if not isinstance(values, dict):
             return handler(values)
@@ -598,7 +598,7 @@ class Scene(Table):
 # ---------------------------------------------------------------- values as they were read
 
 
-def _in_present_format(values: Mapping[str, object]) -> dict[str, Any]:
+def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
     """The values with the present format number; a newer one is refused before the keys that are new in it are."""
     written = values.get("format")
     if not isinstance(written, int) or isinstance(written, bool) or written < 1:
@@ -619,14 +619,14 @@ def _with_turnover(values: Mapping[str, object]) -> Mapping[str, object]:
     return {**values, "remodeling": {**remodeling, "turnover": turned}}
 
 
-def _without_columns(values: Mapping[str, object], names: tuple[str, ...]) -> dict[str, Any]:
+def _without_columns(values: Mapping[str, object], names: tuple[str, ...]) -> dict[str, object]:
     output = values.get("output")
     if not isinstance(output, Mapping) or not isinstance(asked := output.get("columns"), list | tuple):
         return dict(values)
     return {**values, "output": {**output, "columns": [name for name in asked if name not in names]}}
 
 
-def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:
+def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
     """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
     for name, part in presets.parts_of(values):
         cells = part.get("cells")
@@ -639,7 +639,7 @@ def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+def _beside(values: dict[str, object], folder: Path) -> dict[str, object]:
     """The keys of a file in this folder, with the places of the files that they name."""
     for name, part in presets.parts_of(values):
         cells = part.get("cells")
@@ -704,7 +704,7 @@ def _units(values: Mapping[str, object], shape: type[Shape]) -> dict[str, str | 
     return units
 
 
-def _with_numbers_of_loads(values: Mapping[str, object], shape: type[Shape]) -> dict[str, Any]:
+def _with_numbers_of_loads(values: Mapping[str, object], shape: type[Shape]) -> dict[str, object]:
     """The values with numbers in place of units of loads, whose dimensions the shape knows."""
     loads = values.get("loads")
     if not isinstance(loads, Mapping):
@@ -851,7 +851,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
 CHOSEN_BY_RUNS = ("model.kinematics", "mesh.formulation")
 
 
-def _chosen_anew(values: dict[str, Any], chosen: set[str]) -> Scene:
+def _chosen_anew(values: dict[str, object], chosen: set[str]) -> Scene:
     """The scene, with "auto" in place of what a run had chosen and what does not go with the rest any more."""
     try:
         return scene_from_dict(values)
