@@ -33,6 +33,7 @@ from remodel_fenicsx.system.environment import (
 from remodel_fenicsx.system.files import positive, refusal_in_words, wall_time, write_new
 
 if TYPE_CHECKING:
+    from remodel_fenicsx.studies.page import Answer
     from remodel_fenicsx.scene.scene import Scene
 
 presets, scenes = Late("remodel_fenicsx.scene.presets"), Late("remodel_fenicsx.scene.scene")  # no help needs them
@@ -61,13 +62,13 @@ MAIN_EPILOG = (
 Option = tuple[list[str], dict[str, Any]]  # arguments of `ArgumentParser.add_argument`
 Do = Callable[[argparse.Namespace], int | None]
 Needs = Sequence[Callable[[], str | None]]
-KINDS: dict[str, Callable[[str], Any]] = {
+KINDS: dict[str, Callable[[str], object]] = {
     **dict.fromkeys(("DATA", "DIR", "FILE", "FOLDER", "SCENE"), Path),
     **{"K": int, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
 }
 
 
-def option(line: str, **settings: Any) -> Option:
+def option(line: str, **settings: object) -> Option:
     """From a line as in the help: "-q --quiet", "--jobs N" or what has a place of its own, two spaces, its meaning."""
     usage, _, text = line.partition("  ")
     *names, value = usage.split()
@@ -541,7 +542,7 @@ def _schema(options: argparse.Namespace) -> None:
     _say(text)
 
 
-def _answer(study: Callable[..., tuple[Path, Any]], *wishes: Any) -> int:
+def _answer(study: Callable[..., tuple[Path, Answer]], *wishes: object) -> int:
     """Do a study; say what it has found, where, and which of its runs have failed."""
     with _stopping("all that is recorded is kept, the same command goes on"):
         folder, found = study(*wishes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -22,6 +22,12 @@ from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.state import State, UnitCells
 from remodel_fenicsx.system.files import typed
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Function
+
+    from remodel_fenicsx.model.residual_stress import Closing
+    from remodel_fenicsx.model.tensors import Array
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +91,13 @@ def on_mesh_alone(scene: Scene, domain: Domain) -> Any:
     return FreeLength(kinematics, scene.geometry) if scene.has_free_length else kinematics
 
 
-def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells, domain: Domain) -> State:
+def unloaded_state(
+    scene: Scene,
+    unknown: Function,
+    kinematics: Any,
+    cells: UnitCells,
+    domain: Domain,
+) -> State:
     """Unknowns of the body with its supports, and with loads that are zero."""
     shape, loading = scene.geometry, Loading(domain, unknown, kinematics)
     shape.support(loading, scene.supports.ends, scene.loads)
@@ -97,7 +109,7 @@ def unloaded_state(scene: Scene, unknown: Any, kinematics: Any, cells: UnitCells
 
 def natural_gradient(
     scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes, fibres: Fibres = NO_FIBRES
-) -> tuple[Any, Any]:
+) -> tuple[Array, Closing | None]:
     """G (elements, points, 3, 3) of a body whose tissue is free of stress elsewhere; what closes to it, if anything."""
     from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,24 +15,30 @@ from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.energy import TURNED_OVER
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Cells, Turnover, in_region
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from remodel_fenicsx.body.fibres import FibreFile
+
 log = logging.getLogger(__name__)
 
-Fibres = Mapping[str, Mapping[str, Any]]  # measured: by region and name, a row for each element of the mesh
+Fibres = Mapping[str, Mapping[str, Array]]  # measured: by region and name, a row for each element of the mesh
 # what files of fibres may have beside the fibres, as it is at the start of a run
-UNCHANGED: Mapping[str, Any] = {NATURAL_GRADIENT: np.eye(3), "content": 1.0, "natural_length": 1.0, GROWTH: 1.0}
+UNCHANGED: Mapping[str, ArrayLike] = {NATURAL_GRADIENT: np.eye(3), "content": 1.0, "natural_length": 1.0, GROWTH: 1.0}
 
 
-def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
+def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Array]]:
     """Measured fibres by region and name, a row for each element of the mesh, on all ranks. Collective."""
     if not scene.measured_cells:
         return {}
     points, elements = domain.gather_mesh()
     regions = domain.gather_elements(domain.element_region)
 
-    def read() -> dict[str, dict[str, Any]] | None:
+    def read() -> dict[str, dict[str, Array]] | None:
         if points is None or elements is None or regions is None:
             return None
         found = {}
@@ -45,7 +51,7 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Any]]:
     return domain.comm.bcast(agreed(domain.comm, read)) or {}
 
 
-def _with_prestretch(measured: dict[str, Any], key: str, scene: Scene) -> dict[str, Any]:
+def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict[str, Array]:
     """Measured fibres, with prestretch, content and natural length where the scene begins with those of the file."""
     wanted, held = scene.natural.fibres, [name for name in UNCHANGED if name in measured]
     changed = [name for name in held if not np.allclose(measured[name], np.reshape(UNCHANGED[name], -1))]
@@ -60,7 +66,7 @@ def _with_prestretch(measured: dict[str, Any], key: str, scene: Scene) -> dict[s
     return {name: values for name, values in measured.items() if wanted or name not in held}
 
 
-def _check_growth(growth: Any, key: str, turnover: Turnover) -> None:
+def _check_growth(growth: Array, key: str, turnover: Turnover) -> None:
     """Whether tissue that has grown in an earlier run can go on as the scene says."""
     if turnover.start:
         raise SceneError(f"{key}: has {GROWTH} of an earlier run; remodeling.turnover.from must be 0 with it")
@@ -69,7 +75,7 @@ def _check_growth(growth: Any, key: str, turnover: Turnover) -> None:
         raise SceneError(f"{key}: has {GROWTH} of an earlier run, {growth.min():.3g} at the least; {volume}")
 
 
-def read_fibres(cells: Cells, region: str) -> Any:
+def read_fibres(cells: Cells, region: str) -> FibreFile:
     from remodel_fenicsx.body.fibres import read_fibre_file  # few scenes have one
 
     try:
@@ -81,7 +87,7 @@ def read_fibres(cells: Cells, region: str) -> Any:
     return file
 
 
-def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str, Any]:
+def _fibres_of(cells: Cells, region: str, corners: Array, chosen: Flags) -> dict[str, Array]:
     key, file = f"{in_region(region)}cells.fibres", read_fibres(cells, region)
     try:
         rows, farthest = file.rows_of(corners, chosen)
@@ -93,7 +99,7 @@ def _fibres_of(cells: Cells, region: str, corners: Any, chosen: Any) -> dict[str
     return {name: values[rows] for name, values in file.measured.items()}
 
 
-def in_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Any:
+def in_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Array:
     """An array of files of fibres at the points, (elements, points, ...); `UNCHANGED` where they have none."""
     plain = np.asarray(UNCHANGED[name])
     found = np.tile(plain, (*quadrature.shape, *(1 for _ in plain.shape)))

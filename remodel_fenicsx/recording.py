@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -120,7 +120,7 @@ class Recording(RecordedRun):
     def plot(
         self, time: float | None = None, name: str = "fibre_angle_deformed", *, layers: int | None = None,
         cut: str | None = None, elements: ArrayLike | None = None, chains: bool = True,
-        plotter: pyvista.Plotter | None = None, **options: Any,
+        plotter: pyvista.Plotter | None = None, **options: object,
     ) -> pyvista.Plotter:  # fmt: skip
         """Put the deformed body at a recorded time into a plotter of PyVista: `recording.plot().show()`.
 

@@ -316,7 +316,7 @@ def with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     return scene.with_values(changes) if changes else scene, files
 
 
-def _kept_files(scene: Scene) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _kept_files(scene: Scene) -> tuple[dict[str, object], dict[str, bytes]]:
     changes, files = scene.geometry.kept_files()
     for region, cells in scene.measured_cells.items():
         key, path = f"{in_region(region)}cells.fibres", Path(cells.fibres or "")

@@ -180,7 +180,7 @@ def _way(scene: Scene, stepper: Stepper) -> Any:
         return FixedSteps(stepper, time.end, time.step)
     from remodel_fenicsx.evolution.time_steps import StepControl, TimeError
 
-    if time.chooses:
+    if time.chooses and time.tolerance is not None:
         return StepControl(stepper, time.tolerance, time.step, stops)
     if not time.is_equilibrium:
         return FixedSteps(stepper, time.end, time.step, TimeError(stepper).measure)
@@ -199,11 +199,11 @@ def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
     """Who follows the steps, in their order: a row has the eigenvalues, and warnings come after it."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
-    found = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
+    found: list[Watcher | None] = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
     found += [kind.make(scene, stepper) for kind in WATCHERS.values()]
     found += [make(scene, stepper) for part in stepper.remodels for make in part.watchers]
     for case in stepper.each_case[1:]:
-        own = [EquilibriumStability(case, unstable)]
+        own: list[Watcher | None] = [EquilibriumStability(case, unstable)]
         own += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
         found += [case.watched(watcher) for watcher in own if watcher is not None]
     return [watcher for watcher in found if watcher is not None]

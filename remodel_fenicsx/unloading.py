@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import dolfinx.fem
 import dolfinx.fem.petsc
@@ -34,6 +34,9 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import mandel_vector
 from remodel_fenicsx.system.terminal import Line, unsaid
+
+if TYPE_CHECKING:
+    from ufl.core.expr import Expr
 
 log = logging.getLogger(__name__)
 
@@ -149,7 +152,7 @@ LOADED_AGAIN = 1e-9  # relative: how far the loaded numbers may be from those of
 MOST_LOADINGS = 30  # runs for one share of the loads
 LOAD_STEPS = 10  # of a run to the end of the ramps
 # cells that stay; what says how to remodel goes with a law
-PASSIVE: dict[str, Any] = {
+PASSIVE: dict[str, object] = {
     "remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {},
     "remodeling.exponent": 2.0, "remodeling.threshold": 0.0, "time.tolerance": None,
 }  # fmt: skip
@@ -166,11 +169,11 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
 
     def find(share: float, correction: Any) -> Any:
         """How far logarithms are from what inverse elastostatics says, from how far they were; the numbers too."""
-        first: Any = np.log(_inverse(scene, given, share))
+        first: Array = np.log(_inverse(scene, given, share))
 
         words, how = "", {"alpha": 1.0, "line_search": None, "maxiter": MOST_LOADINGS, "f_tol": LOADED_AGAIN}
 
-        def error(numbers: Any) -> Any:
+        def error(numbers: Array) -> Array:
             nonlocal runs, found, words
             runs, found = runs + 1, np.exp(numbers)
             said(f"run {runs}{words}, {100 * share:g} % of the loads")
@@ -209,7 +212,7 @@ def _inverse(scene: Scene, given: Array, share: float) -> Array:
 def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
     """Radii and length under a share of the loads, as a run has them."""
     end = scene.end_of_ramps or 1.0
-    changes: dict[str, Any] = {"output.columns": [], "output.times": [], "output.fields": False}
+    changes: dict[str, object] = {"output.columns": [], "output.times": [], "output.fields": False}
     if scene.natural.cells == AS_GIVEN:
         changes |= PASSIVE | {"time.end": end, "time.step": end / LOAD_STEPS}
     else:
@@ -236,7 +239,7 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
 
 def _with_numbers(scene: Scene, numbers: Array) -> Scene:
     """The scene of an unloaded tube of these radii, from the lumen outwards, and this length."""
-    changes: dict[str, Any] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
+    changes: dict[str, object] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
     changes |= {"geometry.inner_radius": float(numbers[0]), "geometry.outer_radius": float(numbers[-2])}
     changes |= {"geometry.length": float(numbers[-1])}
     for name, radius in zip(_outer_radii(scene), numbers[1:-1], strict=False):
@@ -264,7 +267,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
     file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
     given: Array = comm.bcast(None if file is None else file.points)
     path = folder / UNLOADED_MESH
-    changes: dict[str, Any] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
+    changes: dict[str, object] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
     changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
     if shape.regions:
         numbers: dict[str, int] = comm.bcast(regions)
@@ -308,7 +311,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
     return scene.with_values(changes)
 
 
-def _warn(scene: Scene, wall: Any = None) -> None:
+def _warn(scene: Scene, wall: object = None) -> None:
     for words in too_soft(scene, wall):
         log.warning("%s", words)
 
@@ -370,7 +373,7 @@ def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | 
     return found
 
 
-def _tangents(simulation: Simulation, move: Any) -> list[Any]:
+def _tangents(simulation: Simulation, move: dolfinx.fem.Function) -> list[ufl.Form]:
     """Derivative of the residual by the unloaded places, UFL forms to be added up; `move` is zero."""
     # Compiled one by one: in one kernel they take the compiler minutes.
     state, unknown = simulation.state, simulation.unknown
@@ -382,7 +385,7 @@ def _tangents(simulation: Simulation, move: Any) -> list[Any]:
     energies = state.dilatation.energies(equilibrium.tissue, F, [state.cells.ufl_cell], weight)
     forms = [second_derivative(energy, unknown, test, trial, move) for energy in energies]
 
-    def larger(density: Any) -> Any:
+    def larger(density: Expr) -> Expr:
         return ufl.derivative(density, unknown, test) * ufl.div(trial)
 
     forms += [map_integrands(larger, energy) for energy in energies]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -402,8 +402,8 @@ class Extrapolated(Staggered):
         targets = state.cells.quadrature.function("targets", (2, size))
         memory = state.cells.quadrature.values(targets, (2, size)).reshape(-1, 2, size)
         # of all points in one row, the function's own memory: the last target, and the one before
-        self._newest: Any
-        self._older: Any
+        self._newest: NDArray[np.void]
+        self._older: NDArray[np.void]
         self._newest, self._older = np.moveaxis(memory.view(TARGET)[..., 0], 1, 0)
         self._newest["time"] = self._older["time"] = NEVER
         state.remember(targets)
@@ -476,7 +476,7 @@ def how_many(state: State, points: Flags) -> int:
     return int(over_ranks(state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM))
 
 
-def known(records: Any) -> Target:
+def known(records: NDArray[np.void]) -> Target:
     """The target that records of `TARGET` hold; zero where there was none."""
     return Target(records["direction"], records["switch"])
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.solver.continuation import Work
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.evolution.stepper import Stepper, Watcher
+    from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -44,7 +48,7 @@ class Remodels:
     fastest: float = 0.0
     depends_on_path = False
     tissue: Any = None
-    watchers: Sequence[Callable[[Any, Any], Any]] = ()
+    watchers: Sequence[Callable[[Scene, Stepper], Watcher | None]] = ()
 
     def begin_with(self, values: Callable[[str], Array]) -> None:
         """Take what files of an earlier run have, by name, (elements, points, ...)."""
@@ -68,10 +72,10 @@ class Remodels:
         """Free the objects that PETSc has made."""
 
     # ------------------------------------------------------------ time discretisation error
-    def row(self) -> Any:
+    def row(self) -> object:
         """Return the values of the solved state."""
 
-    def better(self) -> Any:
+    def better(self) -> object:
         """Return, after a step, values by a better rule; None where there are none."""
 
     def set(self, values: Any) -> None:
@@ -81,11 +85,11 @@ class Remodels:
         """Return values as components."""
         return np.asarray(values)
 
-    def moved(self, values: Any, change: Array) -> Any:
+    def moved(self, values: Any, change: Array) -> object:
         """Return values after a change of their components."""
         return values
 
-    def passed(self, values: Any, time: float, residual: float) -> Any:
+    def passed(self, values: Any, time: float, residual: float) -> object:
         """Return what the present state makes of values up to a time."""
         return values
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Staggered
@@ -16,6 +16,9 @@ from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Work
 from remodel_fenicsx.state import State
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Function
 
 
 class FurtherCase:
@@ -28,7 +31,7 @@ class FurtherCase:
         load_values: Callable[[float], LoadValues],
         stepper: Stepper,
         solver: Solver,
-        kappa: Any = None,
+        kappa: float | Function | None = None,
     ):
         self.number, self.state, self.load_values = number, state, load_values
         state.label = f"load case {number}: "
@@ -82,7 +85,7 @@ def join(
     load_values: Sequence[Callable[[float], LoadValues]],
     weights: Sequence[float],
     solver: Solver,
-    kappa: Any = None,
+    kappa: float | Function | None = None,
 ) -> None:
     """Let further load cases drive the cells of a stepper too; weights are of all, the first one's first."""
     given = enumerate(zip(states, load_values, strict=True), start=2)

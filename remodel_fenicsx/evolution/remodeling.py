@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -25,6 +25,9 @@ from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state import Numbers, State, stress_rounding
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Function
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -59,7 +62,7 @@ class RemodelingPass(Remodels):
         state: State,
         tissue: Tissue,
         settings: Remodeling,
-        kappa: Any = None,
+        kappa: float | Function | None = None,
         beside: Sequence[Remodels] = (),
     ):
         self.state, self.settings, self.beside = state, settings, list(beside)  # beside: what else remodels
@@ -100,7 +103,7 @@ class RemodelingPass(Remodels):
         """Whether cells stay where tension is below a threshold."""
         return self.settings.threshold > 0.0
 
-    def set_kappa(self, kappa: Any) -> None:
+    def set_kappa(self, kappa: float | Function) -> None:
         """A number, or a DG0 Function."""
         self.kappa: Any = kappa
         self.slowest = self.fastest = kappa

@@ -10,7 +10,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +26,13 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
 from remodel_fenicsx.solver.newton import GuardedNewton
 from remodel_fenicsx.state import Numbers, State
 from remodel_fenicsx.system.interrupts import Paused
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Function
+    from mpi4py import MPI
+
+    from remodel_fenicsx.evolution.homeostasis import Homeostasis
+    from remodel_fenicsx.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -194,7 +201,7 @@ class WarnsOnce(Watcher):
         self._numbers = Numbers(self.state, self.name, {"said": 0} | dict(self.initial))
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> WarnsOnce | None:
+    def of(cls, scene: Scene, stepper: Stepper) -> WarnsOnce | None:
         """For a scene's stepper, or another load case (`WATCHERS`); None where there is nothing to watch.
 
         Parameters
@@ -290,13 +297,13 @@ class Stepper:
         solver: Solver,
         load_values: Callable[[float], LoadValues],
         coupling: Maker | None = None,
-        kappa: Any = None,
+        kappa: float | Function | None = None,
     ):
         self.state, self.load_values, self._solver = state, load_values, solver
         beside: list[Remodels] = []
-        for name, make in BESIDE.items():
+        for name, maker in BESIDE.items():
             if getattr(remodeling, name).is_on:
-                beside.append(resolved(make)(state, tissue, remodeling))
+                beside.append(resolved(maker)(state, tissue, remodeling))
                 tissue = beside[-1].tissue
         self.tissue = state.parameters(tissue).tissue
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, beside)
@@ -353,7 +360,7 @@ class Stepper:
         watchers: Sequence[Watcher] = (),
         is_last: bool = False,
         rejected: Step | None = None,
-        way: Any = None,
+        way: Homeostasis | None = None,
         judge: Callable[[Step], object] = lambda step: None,
     ) -> Step:
         """One step: equilibrium with the loads of `time`, and remodeling.
@@ -437,7 +444,7 @@ class Stepper:
         for number, time in enumerate(remaining, start=1):
             yield self.advance(time, watchers, is_last=number == len(remaining), judge=judge)
 
-    def take(self, load_values: Callable[[float], LoadValues], kappa: Any) -> None:
+    def take(self, load_values: Callable[[float], LoadValues], kappa: float | Function) -> None:
         """Replace loads and rates."""
         self.load_values = load_values
         self.remodeling.set_kappa(kappa)
@@ -542,7 +549,7 @@ REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall
 class Pause(Watcher):
     """Raises `Paused` after a step, on all ranks, if somebody asked for it or the next step would come too late."""
 
-    def __init__(self, comm: Any, folder: Path, asked: Callable[[], bool], deadline: float | None = None):
+    def __init__(self, comm: MPI.Comm, folder: Path, asked: Callable[[], bool], deadline: float | None = None):
         self.comm, self.folder, self.asked, self.deadline = comm, folder, asked, deadline
         self._last = clock.monotonic()
         self._seconds = 0.0  # of a step with all that is written of it

@@ -81,7 +81,7 @@ class TimeError:
         step.time_error = found.row
         return found
 
-    def _better(self, part: Remodels) -> Any:
+    def _better(self, part: Remodels) -> object:
         return self.stepper.coupling.better if part is self.stepper.remodeling else part.better()
 
     # ------------------------------------------------------------ rows that lag behind

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from remodel_fenicsx.schema.settings import Remodeling, Turnover
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.solver.diagnosis import Refusal
 from remodel_fenicsx.state import Earlier, Numbers, State
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -92,7 +95,7 @@ class Slowing:
 
     INITIAL = dict.fromkeys(("early_time", "early_rate", "late_time", "late_rate"), 0.0)
 
-    def __init__(self, numbers: Any):
+    def __init__(self, numbers: Numbers | dict[str, float]):
         self.numbers = numbers
 
     def goes_on(self, elapsed: float, rate: float) -> bool:
@@ -300,7 +303,7 @@ class GrowthWithoutRest(WarnsOnce):
         self.held_from, self._slowing = held_from, Slowing(self._numbers)
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> GrowthWithoutRest:
+    def of(cls, scene: Scene, stepper: Stepper) -> GrowthWithoutRest:
         return cls(stepper, scene.end_of_ramps)
 
     def due(self, step: Step) -> bool:

@@ -111,7 +111,7 @@ def add_body(
     name: str,
     with_chains: bool = True,
     **options: Any,
-) -> Any:
+) -> pyvista.Actor:
     """Put a deformed body and its chains, as far as they were recorded, into a plotter."""
     looks: dict[str, Any] = {"scalars": name, "show_edges": True, "edge_color": "#777777", **LIGHT}
     if name in ANGLES:
@@ -195,7 +195,7 @@ def main(file: str) -> None:
     np.save(f"{file}.npy", [_drawn(job, sheet, extent) for sheet in job.sheets])
 
 
-def _drawn(job: Job, sheet: Sequence[tuple[str, Any]], bounds: Array) -> Pixels:
+def _drawn(job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], bounds: Array) -> Pixels:
     """Draw bodies of one scale beside each other."""
     columns = min(len(sheet), MOST_COLUMNS)
     rows = math.ceil(len(sheet) / columns)

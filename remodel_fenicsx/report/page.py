@@ -68,7 +68,7 @@ ANGLE_STEPS = 252  # of a byte for 0 to 90 degrees: 14 for each of the 18 colour
 NO_ANGLE = 255
 
 
-def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]:
+def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, object]]]:
     """The block, and what tells the page where each array is in it."""
     block, table = bytearray(), {}
     for name, array in arrays.items():
@@ -94,7 +94,7 @@ def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, Any]]]
 class Array(NamedTuple):
     """Numbers that the page unpacks into a typed array."""
 
-    values: NDArray[Any]
+    values: NDArray[np.generic]
     differences: bool = False
 
 
@@ -103,7 +103,7 @@ class Card(NamedTuple):
 
     name: str
     html: str
-    data: Mapping[str, Any] = MappingProxyType({})
+    data: Mapping[str, object] = MappingProxyType({})
     arrays: Mapping[str, Array] = MappingProxyType({})
 
 
@@ -158,7 +158,7 @@ class ShownBody:
                 rows[name].append(values.astype(np.float32))
         return cls(whole, times, volume, {name: np.stack(values) for name, values in rows.items()}, is_deformed)
 
-    def arrays(self) -> tuple[dict[str, Array], dict[str, Any]]:
+    def arrays(self) -> tuple[dict[str, Array], dict[str, object]]:
         """The same in few bytes, and the numbers that lead back."""
         moved = self.series["position"]
         least = moved.min(axis=(0, 1))
@@ -407,7 +407,7 @@ def stress(run: ReportedRun) -> Card | None:
     if body is None or "wall_stress" not in body.series or len(body.whole.depth) < 2:
         return None
     through, unit = run.recording.scene.geometry.depth_in_words[0], unit_of(run.recording.scene, "stress")
-    laplace: Any = np.full(len(body.times), np.nan)
+    laplace: NDArray[np.float64] = np.full(len(body.times), np.nan)
     if {"pressure", "inner_radius", "outer_radius"} <= set(history):
         inner, outer = history["inner_radius"], history["outer_radius"]
         laplace = np.interp(body.times, history["time"], history["pressure"] * inner / (outer - inner))
@@ -438,7 +438,7 @@ def content(run: ReportedRun) -> Card | None:
 
 def _by_layer(
     run: ReportedRun, body: ShownBody, values: NDArray[np.float32], names: Sequence[str], label: str
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """What a drawing over the depth needs of values (times, layers, names)."""
     through, start, end = run.recording.scene.geometry.depth_in_words
     return {
@@ -552,7 +552,7 @@ def _keys(keys: Table, *but: str) -> str:
     return _as_text(keys.model_dump(exclude_none=True, exclude=set(but)))
 
 
-def _as_text(value: Any) -> str:
+def _as_text(value: object) -> str:
     """A value of a scene."""
     if isinstance(value, dict):
         return ", ".join(f"{words(str(name))} {_as_text(one)}" for name, one in value.items() if one not in ({}, ()))
@@ -689,7 +689,7 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
 
 
-def as_json(values: Any) -> str:
+def as_json(values: object) -> str:
     """JSON that no reader of HTML takes for an end of its script."""
     text = json.dumps(values, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

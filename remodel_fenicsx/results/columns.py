@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import basix.ufl
 import dolfinx.fem
@@ -27,6 +27,7 @@ from remodel_fenicsx.schema.tables import SceneError, shown
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 NO_LUMEN = 1e-9  # of the body's size cubed: what a flat inner face encloses by rounding
 
 
@@ -63,7 +64,7 @@ class Observer(Watcher):
         self.columns = tuple(columns)
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
-        self.tools: dict[Any, Any] = {}
+        self.tools: dict[object, Any] = {}
         self.others = [Observer(shape, case, ()) for case in stepper.each_case[1:]]
 
     # ------------------------------------------------------------ as a watcher
@@ -136,7 +137,7 @@ class Measurement:
 
     def __init__(self, observer: Observer, step: Step):
         self.step, self.observer = step, observer
-        self._of_step: dict[Any, Any] = {}
+        self._of_step: dict[object, Any] = {}
         self.domain, self.quadrature, self.state = observer.domain, observer.quadrature, observer.state
 
     @property
@@ -169,7 +170,7 @@ class Measurement:
         ):  # the pass asks for it too
             return stepper.remodeling.driving_tensor()[1].reshape(*self.quadrature.shape, 3, 3)
 
-        def compiled() -> tuple[PointStresses, Any]:
+        def compiled() -> tuple[PointStresses, jit.PointValues]:
             stresses = PointStresses(self.state, stepper.tissue)
             return stresses, jit.expression(stresses.ufl.cauchy, self.quadrature.points)
 
@@ -317,13 +318,13 @@ class Measurement:
 
         return self if number == 1 else self.tool_of_step(("case", number), measured)  # type: ignore[no-any-return]
 
-    def tool(self, key: Any, make: Callable[[], Any]) -> Any:
+    def tool(self, key: object, make: Callable[[], T]) -> T:
         """What a column needs for every step, a compiled form say: made once, by make(), and kept under a key."""
         if key not in self.observer.tools:
             self.observer.tools[key] = make()
         return self.observer.tools[key]
 
-    def tool_of_step(self, key: Any, make: Callable[[], Any]) -> Any:
+    def tool_of_step(self, key: object, make: Callable[[], T]) -> T:
         """What several columns of one step share: made once for the step."""
         if key not in self._of_step:
             self._of_step[key] = make()
@@ -404,7 +405,7 @@ class _SupportForce:
             )
         normal = domain.of_parts(face, "normal")
         self._form = potential and jit.form(-ufl.derivative(potential(self._unknown), self._unknown, normal))
-        self._nodes: list[tuple[Any, Array]] = []
+        self._nodes: list[tuple[NDArray[np.int32], Array]] = []
         for part, facets in domain.facets_of_parts(face) if potential is None else ():
             nodes = dolfinx.fem.locate_dofs_topological(self._unknown.function_space, 2, facets)
             self._nodes.append((nodes[nodes < state.number_of_owned_unknowns // 3], part.normal))
@@ -450,7 +451,7 @@ class _EndForceForms:
         tissue, elastic = state.kinematics.stress_free_weight(mesh), state.kinematics.elastic
         # a function where a number would do: UFL differentiates by functions only, and some kinematics prescribe F_zz
         element = basix.ufl.element("DG", mesh.topology.cell_name(), 0)
-        change: Any = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element))
+        change: dolfinx.fem.Function = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element))
         one, size = (dolfinx.fem.Constant(mesh, np.float64(value)) for value in (1.0, length))
         along = ufl.as_tensor([[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)])
         longer = F + change * along

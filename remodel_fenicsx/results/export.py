@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -255,7 +255,7 @@ FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
 }
 
 
-def _rows(pattern: str, *parts: NDArray[Any]) -> str:
+def _rows(pattern: str, *parts: NDArray[np.generic]) -> str:
     """A line for each row of the parts (n, ...); numbers have commas between and are read back to the last bit."""
     texts = [[",".join(map(repr, row.ravel().tolist())) for row in part] for part in parts]
     return "\n".join(pattern.format(n, *row) for n, row in enumerate(zip(*texts, strict=True), start=1))

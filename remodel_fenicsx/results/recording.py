@@ -25,6 +25,7 @@ from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, open_own, p
 
 if TYPE_CHECKING:
     import h5py
+    import pandas
 
     from remodel_fenicsx.scene.scene import Scene
 
@@ -83,7 +84,7 @@ class RecordingError(RemodelError, ValueError):
 class HistoryColumns(dict[str, Array]):
     """The columns of a history by name, each (rows,); a value that was not computed is NaN."""
 
-    def frame(self) -> Any:
+    def frame(self) -> pandas.DataFrame:
         """The columns as a pandas DataFrame, one row per recorded step."""
         try:
             import pandas

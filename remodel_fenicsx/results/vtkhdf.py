@@ -24,6 +24,7 @@ from remodel_fenicsx.system.files import ClosedAtEnd, part_of
 from remodel_fenicsx.system.interrupts import held_back
 
 if TYPE_CHECKING:
+    from collections.abc import Buffer
     import h5py
 
 Array = NDArray[Any]
@@ -52,7 +53,7 @@ class PatientFile(io.FileIO):
 
     fault: OSError | None = None
 
-    def write(self, data: Any) -> int:
+    def write(self, data: Buffer) -> int:
         view = memoryview(data)
         try:
             while view:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.model.chains import Chain
@@ -17,12 +17,15 @@ from remodel_fenicsx.schema.settings import COUPLINGS, Properties, in_region
 from remodel_fenicsx.schema.tables import fault, quoted
 from remodel_fenicsx.schema.text import merged, put
 
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
 # ---------------------------------------------------------------- without a preset
 
 DEFAULT_LAW = "tensor"
 
 
-def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def default_method(values: Mapping[str, object]) -> dict[str, dict[str, object]]:
     """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has."""
     remodeling = values.get("remodeling")
     law = remodeling.get("law", DEFAULT_LAW) if isinstance(remodeling, Mapping) else DEFAULT_LAW
@@ -35,8 +38,12 @@ def default_method(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _printed_method(
-    geometry: dict[str, Any], loads: dict[str, Any], end: float, material: dict[str, Any], cells: dict[str, Any]
-) -> dict[str, dict[str, Any]]:
+    geometry: dict[str, float],
+    loads: dict[str, object],
+    end: float,
+    material: dict[str, float],
+    cells: dict[str, object],
+) -> dict[str, object]:
     """The paper's method on one of its bodies, every choice spelled out; how systems are solved is none of them."""
     common_material = {
         "lame_lambda": 27.293,
@@ -67,7 +74,7 @@ def _printed_method(
     }
 
 
-def _load(value: float, end_of_ramp: float) -> dict[str, Any]:
+def _load(value: float, end_of_ramp: float) -> dict[str, object]:
     return {"value": value, "ramp": [[0.0, 0.0], [end_of_ramp, 1.0]]}
 
 
@@ -114,14 +121,14 @@ _MEASURED_COLLAGEN = {
 }
 
 
-def _consistent(scene: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _consistent(scene: dict[str, object]) -> dict[str, object]:
     changes = {"law": "tensor", "frame": "material", "coupling": "extrapolated"}
     found = merged(scene, {"material": {"repulsion": "log"}, "remodeling": changes})
     del found["remodeling"]["pairing"]
     return found
 
 
-PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "kuhl-holzapfel-2007": _PAPER,
     "consistent": {shape: _consistent(scene) for shape, scene in _PAPER.items()},
     "sun-2002": {shape: merged(scene, _MEASURED_COLLAGEN) for shape, scene in _PAPER.items()},
@@ -145,7 +152,7 @@ PRESET_NOTES = {
 class Profile:
     """How much accuracy a run shall have: settings, with the error and cost that were measured on the artery."""
 
-    values: dict[str, Any]
+    values: dict[str, object]
     degrees: float
     percent: float
     seconds: float
@@ -169,7 +176,7 @@ class Profile:
             )
         return settings
 
-    def settings(self, scene: Any) -> dict[str, Any]:
+    def settings(self, scene: Any) -> dict[str, object]:
         """Its values for a scene, by dotted key."""
         found = dict(self.values)
         if self.is_for_means and (part := for_means(scene)) != AUTO:
@@ -177,15 +184,15 @@ class Profile:
         return found
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+def nested(values: Mapping[str, object]) -> dict[str, Any]:
     """Values by dotted key as tables of a scene."""
-    tables: dict[str, Any] = {}
+    tables: dict[str, object] = {}
     for key, value in values.items():
         put(tables, key, value)
     return tables
 
 
-def _values(refinement: int, degree: int, tolerance: float) -> dict[str, Any]:
+def _values(refinement: int, degree: int, tolerance: float) -> dict[str, object]:
     values = {"model.kinematics": AUTO, "mesh.refinement": refinement, "mesh.degree": degree, "mesh.formulation": AUTO}
     return values | {"time.tolerance": tolerance}
 
@@ -219,6 +226,7 @@ def profile_for(name: str, scene: Any) -> Profile:
 # the model's own (docs/which_numbers.md).
 
 Values = Mapping[str, Any]
+S = TypeVar("S", bound="BaseModel")
 
 
 def aligned_stiffness(chain: Chain, end_to_end_length: float, contour_length: float) -> float:
@@ -277,7 +285,7 @@ def check_exclusive(own: Values) -> None:
                 raise fault(rule, f"{key}.{experiment.key}", value)
 
 
-def with_own_numbers(part: Any, properties: Callable[[Any], Properties]) -> Any:
+def with_own_numbers(part: S, properties: Callable[[S], Properties]) -> S:
     """A scene, or a region, with the model's own numbers in place of those of experiments."""
     for table, key, replaces, own in EXPERIMENTS:
         keys = getattr(part, table)
@@ -287,7 +295,7 @@ def with_own_numbers(part: Any, properties: Callable[[Any], Properties]) -> Any:
     return part
 
 
-def without_coupling(base: dict[str, Any], over: Mapping[str, Any]) -> None:
+def without_coupling(base: dict[str, Any], over: Mapping[str, object]) -> None:
     """Take out of the values a coupling that extrapolates where what lies over them has a law without a target."""
     law, coupling = str(_of(over, "remodeling", "law")), str(_of(base, "remodeling", "coupling"))
     if law in LAWS and LAWS[law].target is None and coupling in COUPLINGS and COUPLINGS[coupling].needs_a_target:
@@ -310,6 +318,6 @@ def place_of(name: str) -> str:
     return in_region(name and quoted(str(name)))
 
 
-def _of(part: Values, table: str, key: str) -> Any:
+def _of(part: Values, table: str, key: str) -> object:
     keys = part.get(table)
     return keys.get(key) if isinstance(keys, Mapping) else None

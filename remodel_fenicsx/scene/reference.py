@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -15,6 +15,9 @@ from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene.scene import FORMAT, Scene
 from remodel_fenicsx.schema.tables import allowed, choices, description, meaning, sections, shown
 from remodel_fenicsx.schema.units import STRESS, schema_with_unit
+
+if TYPE_CHECKING:
+    from pydantic_core import core_schema
 
 
 PAGE_WIDTH = 98  # characters of a line of a page
@@ -30,16 +33,16 @@ Schema = dict[str, Any]
 class _Keys(GenerateJsonSchema):
     """No key is required, for a preset may lie under it; nothing is null, which TOML does not have."""
 
-    def field_is_required(self, field: Any, total: bool) -> bool:
+    def field_is_required(self, field: object, total: bool) -> bool:
         return False
 
-    def field_title_should_be_set(self, schema: Any) -> bool:
+    def field_title_should_be_set(self, schema: object) -> bool:
         return False
 
-    def nullable_schema(self, schema: Any) -> Schema:
+    def nullable_schema(self, schema: core_schema.NullableSchema) -> Schema:
         return self.generate_inner(schema["schema"])
 
-    def default_schema(self, schema: Any) -> Schema:
+    def default_schema(self, schema: core_schema.WithDefaultSchema) -> Schema:
         own = isinstance(schema.get("default"), (str, bool, int, float, tuple))
         return super().default_schema(schema) if own else self.generate_inner(schema["schema"])
 

@@ -147,7 +147,7 @@ def borne(tissue: Tissue, is_loaded: bool) -> float:
     return float(modulus * (1 - stretch**-2) * (stretch if is_loaded else 1))
 
 
-def too_soft(scene: Scene, wall: Any = None) -> Iterator[str]:
+def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
     """A line where the pressure inside stretches the wall until its chains nearly lock."""
     log_of_radii = scene.geometry.log_of_radii(wall)
     if log_of_radii is None or "pressure" not in scene.loads:
@@ -217,7 +217,7 @@ FORGOTTEN_AFTER = (
 # ---------------------------------------------------------------- the scene
 
 
-def _name(value: Any) -> Any:
+def _name(value: object) -> object:
     if not isinstance(value, str) or not re.fullmatch(r"\w(?:[\w .+-]{0,98}[\w+-])?", value):
         raise fault("must be a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first")
     return value
@@ -286,7 +286,7 @@ class Scene(Table):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _on_its_preset(cls, values: Any, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
+    def _on_its_preset(cls, values: object, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
         """The scene's keys over those of profile, preset and shape; numbers in place of values with units."""
         if not isinstance(values, dict):
             return handler(values)
@@ -310,7 +310,7 @@ class Scene(Table):
             base = merged(base, presets.PRESETS[preset][shape])
         presets.without_coupling(base, own)
 
-        def made(settings: Mapping[str, Any]) -> Scene:
+        def made(settings: Mapping[str, object]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
             _check_sizes(values, "")
             with scene_units(_units(values, SHAPES[shape])):
@@ -509,7 +509,7 @@ class Scene(Table):
             parts.append(f"turnover with rates = {turnover.rates!r} and volume = {turnover.volume:g}")
         return "; ".join(parts)
 
-    def warnings(self, wall: Any = None) -> list[str]:
+    def warnings(self, wall: object = None) -> list[str]:
         """What is allowed but hardly meant, each on one line; of a wall on a mesh with the areas of its faces."""
         found: dict[str, None] = {}
         properties = self.properties()
@@ -566,7 +566,7 @@ class Scene(Table):
             "length overshoot in each step; set a shorter time.step or time.tolerance",
         ]
 
-    def with_values(self, changes: Mapping[str, Any]) -> Scene:
+    def with_values(self, changes: Mapping[str, object]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
 
         Every value of the copy is its own: changing `preset` alone changes nothing.
@@ -598,7 +598,7 @@ class Scene(Table):
 # ---------------------------------------------------------------- values as they were read
 
 
-def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
+def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
     """The values with the present format number; a newer one is refused before the keys that are new in it are."""
     written = values.get("format")
     if not isinstance(written, int) or isinstance(written, bool) or written < 1:
@@ -609,7 +609,7 @@ def _in_present_format(values: Mapping[str, Any]) -> dict[str, Any]:
     return {**_without_columns(_with_turnover(values), COLUMNS_THAT_WENT), "format": FORMAT}
 
 
-def _with_turnover(values: Mapping[str, Any]) -> Mapping[str, Any]:
+def _with_turnover(values: Mapping[str, object]) -> Mapping[str, object]:
     """Turnover as it was run: none without a time; by tension and without room where 0.3.0 wrote neither."""
     remodeling: Any = values.get("remodeling")
     turnover = remodeling.get("turnover") if isinstance(remodeling, Mapping) else None
@@ -619,14 +619,14 @@ def _with_turnover(values: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**values, "remodeling": {**remodeling, "turnover": turned}}
 
 
-def _without_columns(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+def _without_columns(values: Mapping[str, object], names: tuple[str, ...]) -> dict[str, object]:
     output = values.get("output")
     if not isinstance(output, Mapping) or not isinstance(asked := output.get("columns"), list | tuple):
         return dict(values)
     return {**values, "output": {**output, "columns": [name for name in asked if name not in names]}}
 
 
-def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:
+def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
     """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
     for name, part in presets.parts_of(values):
         cells = part.get("cells")
@@ -639,7 +639,7 @@ def _with_measured_cells(values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+def _beside(values: dict[str, object], folder: Path) -> dict[str, object]:
     """The keys of a file in this folder, with the places of the files that they name."""
     for name, part in presets.parts_of(values):
         cells = part.get("cells")
@@ -657,7 +657,7 @@ def _words(region: str) -> str:
     return f"{region}: " if region else ""
 
 
-def _follow(values: dict[str, Any], changed: Mapping[str, Any], is_whole: bool) -> None:
+def _follow(values: dict[str, Any], changed: Mapping[str, object], is_whole: bool) -> None:
     """Take out what no longer fits to changed values; of a scene that has all values, a choice may be the run's own."""
     tables = (values.get("output"), "times"), (values.get("time"), "end")
     times, end = (table.get(key) if isinstance(table, dict) else None for table, key in tables)
@@ -669,7 +669,7 @@ def _follow(values: dict[str, Any], changed: Mapping[str, Any], is_whole: bool) 
         presets.without_replaced(values, changed)
 
 
-def _check_sizes(value: Any, key: str) -> None:
+def _check_sizes(value: object, key: str) -> None:
     if isinstance(value, Mapping):
         for name, inner in value.items():
             _check_sizes(inner, f"{key}.{name}" if key else str(name))
@@ -677,12 +677,12 @@ def _check_sizes(value: Any, key: str) -> None:
         raise fault(NUMBER_TOO_LARGE, key, value)
 
 
-def _check_name(key: str, name: Any, names: Iterable[str]) -> None:
+def _check_name(key: str, name: object, names: Iterable[str]) -> None:
     if not isinstance(name, str) or name not in names:
         raise fault("allowed are " + ", ".join(map(repr, names)), key, name)
 
 
-def _known_shape(geometry: Any) -> str:
+def _known_shape(geometry: object) -> str:
     """The shape that is asked for. Without it nothing else can be judged: preset, loads and units depend on it."""
     if not isinstance(geometry, Mapping):
         raise fault("must be a table", "geometry", geometry)
@@ -692,7 +692,7 @@ def _known_shape(geometry: Any) -> str:
     return str(geometry["shape"])
 
 
-def _units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, str | None]:
+def _units(values: Mapping[str, object], shape: type[Shape]) -> dict[str, str | None]:
     """The units that a scene chooses, by their keys."""
     units: dict[str, str | None] = {}
     for key, table, known in ((STRESS_UNIT, Material, tuple(STRESS_UNITS)), (LENGTH_UNIT, shape, LENGTH_UNITS)):
@@ -704,7 +704,7 @@ def _units(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, str | Non
     return units
 
 
-def _with_numbers_of_loads(values: Mapping[str, Any], shape: type[Shape]) -> dict[str, Any]:
+def _with_numbers_of_loads(values: Mapping[str, object], shape: type[Shape]) -> dict[str, object]:
     """The values with numbers in place of units of loads, whose dimensions the shape knows."""
     loads = values.get("loads")
     if not isinstance(loads, Mapping):
@@ -717,7 +717,7 @@ def _with_numbers_of_loads(values: Mapping[str, Any], shape: type[Shape]) -> dic
     return {**values, "loads": found}
 
 
-def _check_load_names(shape: str, loads: Any) -> None:
+def _check_load_names(shape: str, loads: object) -> None:
     """A load that the shape does not have, before anything is said about what is missing in it."""
     kind = SHAPES[shape]
     names = kind.loads
@@ -730,7 +730,7 @@ def _check_load_names(shape: str, loads: Any) -> None:
             raise fault(rule, key, load)
 
 
-def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, Any]) -> None:
+def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object]) -> None:
     key = f"loads.{quoted(name)}"
     if not isinstance(load.get("face"), str):
         raise fault("missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face"))
@@ -746,7 +746,7 @@ def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, Any]) 
         )
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     """Tables as dicts of the values that were set, so that they merge as the same keys in TOML do."""
     if isinstance(value, BaseModel):
         kind = {"shape": value.name} if isinstance(value, Shape) else {}
@@ -836,7 +836,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     changes = dict(parse_override(override) for override in overrides)
     chosen = set(CHOSEN_BY_RUNS) - set(changes) if changes and "format" in read else set()
 
-    def made(settings: Mapping[str, Any]) -> Scene:
+    def made(settings: Mapping[str, object]) -> Scene:
         values = merged(read, presets.nested(settings))
         for key, value in changes.items():
             put(values, key, value)
@@ -851,7 +851,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
 CHOSEN_BY_RUNS = ("model.kinematics", "mesh.formulation")
 
 
-def _chosen_anew(values: dict[str, Any], chosen: set[str]) -> Scene:
+def _chosen_anew(values: dict[str, object], chosen: set[str]) -> Scene:
     """The scene, with "auto" in place of what a run had chosen and what does not go with the rest any more."""
     try:
         return scene_from_dict(values)
@@ -865,7 +865,7 @@ def _chosen_anew(values: dict[str, Any], chosen: set[str]) -> Scene:
         return scene
 
 
-def _with_profile(name: str, made: Callable[[Mapping[str, Any]], Scene]) -> Scene:
+def _with_profile(name: str, made: Callable[[Mapping[str, object]], Scene]) -> Scene:
     """The scene that is made with a profile's settings: they depend on its cells and loads."""
     scene = made(presets.PROFILES[name].values if name in presets.PROFILES else {})  # refuses a name that is none
     settings = presets.profile_for(name, scene).settings(scene)
@@ -904,7 +904,7 @@ def _ramp_times(load: Load | None) -> list[float]:
     return [] if load is None else [time for time, _ in load.ramp]
 
 
-def leaves(table: Mapping[str, Any], free: Sequence[str], key: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(table: Mapping[str, object], free: Sequence[str], key: str = "") -> Iterator[tuple[str, object]]:
     """(dotted key, value) of all values but those that are free."""
     for name, value in table.items():
         path = f"{key}.{name}" if key else name

@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -469,7 +469,7 @@ class Cells(Table):
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
-def _nothing_is_missing(scene: Any) -> str | None:
+def _nothing_is_missing(scene: object) -> str | None:
     """Of scenes as they are."""
     return None
 
@@ -533,7 +533,7 @@ IMPLICIT = "implicit"
 IN_ITS_PLACE = "take 'extrapolated' with remodeling.law = 'tensor', or 'staggered' with smaller steps"
 
 
-def _refuse_implicit(*parts: Any) -> Any:
+def _refuse_implicit(*parts: object) -> NoReturn:
     text = f"this run can only be continued by version 0.4.0; {IN_ITS_PLACE}"
     raise SceneError(f"remodeling.coupling = {IMPLICIT!r}: {text}")
 
@@ -844,7 +844,7 @@ class Region(Table):
         )
 
 
-def _set(table: Table) -> dict[str, Any]:
+def _set(table: Table) -> dict[str, object]:
     return {name: value for name, value in table if value is not None}
 
 
@@ -940,10 +940,10 @@ class OnFace(NamedTuple):
     kind: str = "pressure"
 
 
-def faces_of(loads: Mapping[str, Any]) -> dict[str, OnFace]:
+def faces_of(loads: Mapping[str, object]) -> dict[str, OnFace]:
     """Of the further loads among a scene's by name, tables as they were read or as they are."""
 
-    def said(load: Any, key: str) -> Any:
+    def said(load: object, key: str) -> Any:
         return load.get(key) if isinstance(load, Mapping) else getattr(load, key, None)
 
     found = {name: (said(load, "face"), said(load, "kind")) for name, load in loads.items()}
@@ -1032,7 +1032,7 @@ class Time(Table):
 # ---------------------------------------------------------------- solver and output
 
 
-def _are_options(options: dict[str, Any]) -> dict[str, Any]:
+def _are_options(options: dict[str, str | float | bool]) -> dict[str, str | float | bool]:
     """A fault names the option."""
     for name, value in options.items():
         if not re.fullmatch(r"[A-Za-z]\w*", name):

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import NoneType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -30,10 +30,16 @@ from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, SchemaV
 
 from remodel_fenicsx.errors import RemodelError, printable, shortened
 
+if TYPE_CHECKING:
+    from typing import SupportsIndex, TypeGuard
+
+    from pydantic.json_schema import JsonSchemaValue
+
 LONGEST_VALUE = 60  # characters of a value in an error
 # annotation of a tuple: what is a list in TOML becomes one
 IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
+T = TypeVar("T")
 
 
 class SceneError(RemodelError, ValueError):
@@ -80,7 +86,7 @@ class Table(BaseModel):
     )
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """With the meaning of each key, and without what scripts alone need."""
         found = handler(schema)
         table = handler.resolve_ref_schema(found)
@@ -93,7 +99,7 @@ class Table(BaseModel):
             table["additionalProperties"] = handler(cls.further.__pydantic_core_schema__)
         return found
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[object, ...]:
         if self.widened is None:
             return super().__reduce_ex__(protocol)
         return _unpickled, (self.widened, self.__getstate__())
@@ -110,13 +116,13 @@ class Table(BaseModel):
         __init__.__pydantic_base_init__ = True
 
 
-def with_key(name: str, kind: Any, **field: Any) -> Any:
+def with_key(name: str, kind: object, **field: Any) -> type[Table]:
     """A class of tables with a key that is a word of Python."""
     fields: Any = {name: (kind, Field(**field))}
     return create_model(f"_With_{name}", __base__=Table, **fields)
 
 
-def _of_python(value: Any) -> Any:
+def _of_python(value: Any) -> object:
     """A value with numpy's numbers and arrays, at any depth, as Python's own."""
     if hasattr(value, "dtype") and hasattr(value, "tolist"):
         return value.tolist()
@@ -129,22 +135,22 @@ def _of_python(value: Any) -> Any:
 class OneOf:
     """Annotation of a field whose value is one of a registry's keys, those registered later included."""
 
-    registry: Collection[Any]
-    also: tuple[Any, ...] = ()
+    registry: Collection[object]
+    also: tuple[object, ...] = ()
     removed: Mapping[str, str] | None = None
 
     @property
-    def choices(self) -> list[Any]:
+    def choices(self) -> list[object]:
         """All that is allowed."""
         return [*self.also, *(name for name in self.registry if name not in (self.removed or ()))]
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"enum": self.choices}
 
-    def _check(self, value: Any) -> Any:
+    def _check(self, value: Any) -> object:
         if self.removed and value in self.removed and value not in self.registry:
             raise fault(self.removed[value])
         if value is not None and value not in (*self.also, *self.registry):
@@ -159,10 +165,10 @@ class VariantOf:
     registry: Mapping[str, type[BaseModel]]
     tag: str
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(self._table, handler(source))
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """The keys of any variant, which an editor completes, and those that each has."""
         known: dict[str, Any] = {}
         chosen = []
@@ -173,7 +179,7 @@ class VariantOf:
         known[self.tag]["enum"] = list(self.registry)
         return {"type": "object", "properties": known, "required": [self.tag], "allOf": chosen}
 
-    def _table(self, value: Any) -> Any:
+    def _table(self, value: object) -> object:
         if not isinstance(value, Mapping):
             return value
         name = value[self.tag]
@@ -181,17 +187,25 @@ class VariantOf:
         return SchemaValidator(only).validate_python(dict(value))  # its faults name the variant after the field
 
 
+class OwnNumber(Protocol):
+    """A number that a part brings."""
+
+    default: float
+    above: float | None
+    meaning: str
+
+
 @dataclass(frozen=True)
 class KeysOfParts:
     """Annotation of a field that is a table: with the keys too that the parts chosen in it bring (`parameters`)."""
 
-    registries: Mapping[str, Mapping[str, Any]]  # by the key that names the part
+    registries: Mapping[str, Mapping[str, object]]  # by the key that names the part
     optional: bool = False  # whether the keys may be left out, as those of regions
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(self, source: type[Table], handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(functools.partial(self._table, source), handler(source))
 
-    def _table(self, table: type[Table], value: Any) -> Any:
+    def _table(self, table: type[Table], value: object) -> object:
         if not isinstance(value, Mapping):
             return value
         chosen = {key: value.get(key, table.model_fields[key].default) for key in self.registries}
@@ -207,7 +221,7 @@ class KeysOfParts:
 
 
 @functools.cache
-def _widened(table: type[Table], own: tuple[tuple[str, Any], ...], optional: bool) -> type[Table]:
+def _widened(table: type[Table], own: tuple[tuple[str, OwnNumber], ...], optional: bool) -> type[Table]:
     """A table with further numbers: one class, so that scenes with them can be equal."""
     kind = float | None if optional else float
     fields: dict[str, Any] = {
@@ -219,7 +233,7 @@ def _widened(table: type[Table], own: tuple[tuple[str, Any], ...], optional: boo
     return wide
 
 
-def _unpickled(widened: tuple[type[Table], tuple[tuple[str, Any], ...], bool], state: Any) -> Table:
+def _unpickled(widened: tuple[type[Table], tuple[tuple[str, OwnNumber], ...], bool], state: dict[str, object]) -> Table:
     """A table whose class is made, and so has no place from which it could be imported."""
     kind = _widened(*widened)
     made = kind.__new__(kind)
@@ -227,13 +241,13 @@ def _unpickled(widened: tuple[type[Table], tuple[tuple[str, Any], ...], bool], s
     return made
 
 
-def fault(rule: str, key: str = "", value: Any = _MISSING) -> PydanticCustomError:
+def fault(rule: str, key: str = "", value: object = _MISSING) -> PydanticCustomError:
     """Error to raise in a validator."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
     return PydanticCustomError("fault", "{rule}", context)
 
 
-def named(registry: Mapping[str, Any], fits: Callable[[Any], Any]) -> str:
+def named(registry: Mapping[str, T], fits: Callable[[T], object]) -> str:
     """The names in a registry of the parts that fit, for an error."""
     return ", ".join(repr(name) for name, part in registry.items() if fits(part))
 
@@ -246,7 +260,7 @@ def listed(names: Iterable[str], wrong: str, most: int = 24) -> str:
     return f"{', '.join(difflib.get_close_matches(wrong, names, most, 0.0))} and {len(names) - most} more"
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Whether a value is a finite number that a float can hold; true and false are not."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
@@ -327,7 +341,7 @@ def quoted(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else shown(key)
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """A value as a scene writes it, on one line, cut where it is long."""
     try:
         text = _toml_text(value)
@@ -336,7 +350,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
 
 
-def _toml_text(value: Any) -> str:
+def _toml_text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -376,12 +390,12 @@ def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str
 # ---------------------------------------------------------------- what a field allows
 
 
-def is_table(annotation: Any) -> bool:
+def is_table(annotation: object) -> bool:
     """Whether an annotation is a table class."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
-def free_names(table: Any) -> type[BaseModel] | None:
+def free_names(table: object) -> type[BaseModel] | None:
     """The class of the tables that a table may have under any name beside its fields, or None."""
     return getattr(table, "further", None)
 
@@ -391,7 +405,7 @@ def variant_of_field(field: FieldInfo) -> VariantOf | None:
     return next((entry for entry in field.metadata if isinstance(entry, VariantOf)), None)
 
 
-def choices(field: FieldInfo) -> list[Any]:
+def choices(field: FieldInfo) -> list[object]:
     """The values of a field that has a closed list of them, else an empty list."""
     if variant := variant_of_field(field):
         return list(variant.registry)
@@ -401,7 +415,7 @@ def choices(field: FieldInfo) -> list[Any]:
     return list(get_args(_kind(field))) if get_origin(_kind(field)) is Literal else []
 
 
-def _kind(field: FieldInfo) -> Any:
+def _kind(field: FieldInfo) -> object:
     """The annotation of a field that may be left out as that of one that may not."""
     kinds = [kind for kind in get_args(field.annotation) if kind is not NoneType]
     return kinds[0] if get_args(field.annotation) == (*kinds, NoneType) and len(kinds) == 1 else field.annotation
@@ -417,7 +431,7 @@ def allowed(field: FieldInfo) -> str:
         fields: dict[str, FieldInfo] = getattr(field.annotation, "model_fields", {})
         required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
-    nouns: dict[Any, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
+    nouns: dict[object, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
     limits = [(word, getattr(entry, name, None)) for entry in field.metadata for name, word in words.items()]
     bounds = [f"{word} {limit}" for word, limit in limits if limit is not None]

@@ -67,7 +67,7 @@ def _marks(text: str) -> str:
     return f'; {found[0]} is no quote of TOML: type " in its place' if found else ""
 
 
-def _depth_exceeds(value: Any, most: int) -> bool:
+def _depth_exceeds(value: object, most: int) -> bool:
     """Whether tables and lists lie in more than so many others."""
     if not isinstance(value, (dict, list)):
         return False
@@ -75,7 +75,7 @@ def _depth_exceeds(value: Any, most: int) -> bool:
     return most == 0 or any(_depth_exceeds(entry, most - 1) for entry in entries)
 
 
-def parse_override(text: str) -> tuple[str, Any]:
+def parse_override(text: str) -> tuple[str, object]:
     """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a string: a bare word, a number with a unit."""
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
@@ -95,7 +95,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word{_marks(value)}")
 
 
-def put(values: dict[str, Any], key: str, value: Any) -> None:
+def put(values: dict[str, object], key: str, value: object) -> None:
     """Put a value at a dotted key, making the tables on the way."""
     *parents, name = (part.strip() for part in key.split("."))
     for depth, parent in enumerate(parents):
@@ -107,7 +107,7 @@ def put(values: dict[str, Any], key: str, value: Any) -> None:
     values[name] = value
 
 
-def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merged(base: Mapping[str, object], over: Mapping[str, object]) -> dict[str, Any]:
     """Nested dicts laid over each other, table by table; a list or a value of `over` replaces that of `base`."""
     result = dict(base)
     for name, value in over.items():
@@ -127,7 +127,7 @@ def toml_text(table: BaseModel, header: str = "") -> str:
     return tomlkit.dumps(document)
 
 
-def _fill(container: Any, table: BaseModel | Mapping[str, Any]) -> None:
+def _fill(container: Any, table: BaseModel | Mapping[str, object]) -> None:
     fields = type(table).model_fields if isinstance(table, BaseModel) else {}
     # TOML wants a table's own values before the tables in it
     for name, value in sorted(dict(table).items(), key=lambda item: _is_of_tables(item[1])):
@@ -156,7 +156,7 @@ def _wrapped(text: str) -> list[str]:
     return textwrap.wrap(text, COMMENT_WIDTH)
 
 
-def _is_of_tables(value: Any) -> bool:
+def _is_of_tables(value: object) -> bool:
     """Whether it is a table or a list of tables."""
     return isinstance(value, (BaseModel, dict)) or (isinstance(value, tuple) and isinstance((*value, 0)[0], BaseModel))
 

@@ -22,6 +22,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from remodel_fenicsx.schema.tables import fault, shown
 
 if TYPE_CHECKING:  # it takes half a second to start, and most scenes have no units
+    from pydantic.json_schema import JsonSchemaValue
     import pint
 
 STRESS_UNIT, LENGTH_UNIT = "material.stress_unit", "geometry.length_unit"
@@ -78,10 +79,10 @@ class Dimension:
     example: str
     powers: tuple[tuple[str, int], ...]
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(self.number, handler(source))
 
-    def number(self, value: Any, key: str = "") -> Any:
+    def number(self, value: object, key: str = "") -> Any:
         """The number that a text stands for, in the units of the scene that is validated.
 
         Parameters
@@ -121,11 +122,11 @@ class Dimension:
             raise fault(NUMBER_TOO_LARGE, key, value)
         return float(_registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude)
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"anyOf": [handler(schema), schema_with_unit(self)]}
 
 
-def schema_with_unit(dimension: Dimension) -> dict[str, Any]:
+def schema_with_unit(dimension: Dimension) -> JsonSchemaValue:
     """JSON schema of a number with a unit."""
     return {"type": "string", "pattern": rf"^\s*{QUANTITY}\s*$", "examples": [dimension.example]}
 

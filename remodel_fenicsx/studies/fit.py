@@ -14,7 +14,7 @@ from functools import cached_property, partial
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -44,6 +44,12 @@ from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_r
 from remodel_fenicsx.system.terminal import hold_log, open_log, unsaid
 from remodel_fenicsx.unloading import PASSIVE
 from remodel_fenicsx.watch.warnings import WarnsOnce
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from scipy.optimize import OptimizeResult
+
+    from remodel_fenicsx.body.shape import Column
 
 log = logging.getLogger(__name__)
 
@@ -245,7 +251,7 @@ def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
         raise SceneError(f"{place}: {error}") from error
 
 
-def _all_columns(scene: Scene) -> tuple[Any, ...]:
+def _all_columns(scene: Scene) -> tuple[Column, ...]:
     return scene.columns(column.name for column in scene.geometry.columns_on_request)
 
 
@@ -344,7 +350,7 @@ class Kept(dict[Any, tuple[Simulation, Snapshot]]):
         super().__init__()
         self.keys_of_scene = keys
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         return Kept, (self.keys_of_scene,)  # another process builds its own
 
     def simulation(self, scene: Scene, table: Measured, has_own_cells: bool) -> Simulation:
@@ -472,7 +478,7 @@ class Problem:
         scales, models = self.scales_of(x), list[dict[str, Array]]()
         with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
             models = self.models(x, self.kept)
-        parts: list[Any] = []
+        parts: list[ArrayLike] = []
         for table, model in zip_longest(self.tables, models):
             for name, sd in table.sd.items():
                 off = model[name] - scales.get(name, 1.0) * table.columns[name] if model else UNSOLVED * sd
@@ -653,7 +659,7 @@ def minimised(
     held: int | None = None,
     near: tuple[Array, Array] | None = None,
     enough: float = ENOUGH,
-) -> Any:
+) -> OptimizeResult:
     """SciPy's least squares from a start, logarithms."""
     # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells what
     # residuals do: differences are made only where they pay
@@ -684,7 +690,7 @@ def minimised(
     )
 
 
-def result_of(problem: Problem, found: Sequence[Any]) -> Fit:
+def result_of(problem: Problem, found: Sequence[OptimizeResult]) -> Fit:
     """The best of several minima, with bands."""
     logarithms: Array = min(found, key=lambda one: float(one.cost)).x
     jacobian = problem.jacobian(logarithms, central=True)
@@ -792,7 +798,7 @@ class Fit(Answer):
         """What limits the bands."""
         return "noise" if self.inflation == 1.0 else "model"
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> dict[str, ArrayLike]:
         """A row for each unknown."""
         lower, upper = np.exp(self.band)
         table = {"key": self.keys, "value": self.values, "lower": lower, "upper": upper, "open": self.open}

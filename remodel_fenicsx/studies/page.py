@@ -12,7 +12,7 @@ import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import matplotlib
 import numpy as np
@@ -31,7 +31,7 @@ from remodel_fenicsx.system.files import write_whole
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
 DOTS_PER_INCH = 200
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
-STYLE: dict[str, Any] = {
+STYLE: dict[str, object] = {
     "axes.prop_cycle": matplotlib.rcsetup.cycler(color=COLOURS),
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
@@ -184,7 +184,7 @@ def add_head(figure: Figure, title: str, verdict: str) -> None:
     figure.suptitle("\n".join(lines), x=0.08 / wide, ha="left", fontsize=8, parse_math=False)
 
 
-def _cell(value: Any) -> str:
+def _cell(value: str | SupportsFloat) -> str:
     return str(value) if isinstance(value, (str, int, np.integer)) else f"{float(value):.7g}"
 
 

@@ -155,7 +155,7 @@ class Sweep(Answer):
             return "No column of the last row differs between the runs."
         return f"At the end of {len(self.histories)} runs: {'; '.join(parts)}."
 
-    def _at(self, run: Any, but: str = "") -> str:
+    def _at(self, run: int | np.integer, but: str = "") -> str:
         return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items() if key != but)
 
     def figure(self) -> Figure:
@@ -364,7 +364,7 @@ def scenes_of_seeds(scene: Scene, seeds: int) -> tuple[dict[str, dict[str, Numbe
     points: dict[str, dict[str, Number]] = {f"seed-{n}": {"cells.seed": n} for n in range(first, first + seeds)}
     random = [name for name, properties in scene.properties().items() if properties.cells.initial == "random"]
     # with its profile isotropic cells would have steps of a tolerance, not the seeds'
-    isotropic: dict[str, Any] = {f"{in_region(name)}cells.initial": ISOTROPIC for name in random} | {"profile": None}
+    isotropic: dict[str, object] = {f"{in_region(name)}cells.initial": ISOTROPIC for name in random} | {"profile": None}
     every = points | {ISOTROPIC: isotropic}
     named = {name: {"output.fields": False, "name": name, **change} for name, change in every.items()}
     return points, {name: scene.with_values(values) for name, values in named.items()}

@@ -115,7 +115,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[Any]:
+def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[str]:
     """remodel-fenicsx ARGUMENTS; -P: no module is taken from the working folder, which may be somebody else's."""
     command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", *arguments]
     if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
@@ -231,13 +231,13 @@ def _guard(file: str) -> None:
     own = tuple({*map(os.path.realpath, sysconfig.get_paths().values()), str(Path(__file__).resolve().parents[1])})
     own += tuple(os.path.realpath(folder) for folder in sys.path if folder)
 
-    def elsewhere(*_: Any, **__: Any) -> None:
+    def elsewhere(*_: object, **__: object) -> None:
         raise UnreadableFile(ELSEWHERE)
 
     sys.modules["h5py"] = types.ModuleType("h5py")  # it opens files by itself
     sys.modules["h5py"].File = elsewhere  # type: ignore[attr-defined]
 
-    def watch(event: str, arguments: tuple[Any, ...]) -> None:
+    def watch(event: str, arguments: tuple[object, ...]) -> None:
         if event in ("socket.connect", "subprocess.Popen", "os.system", "os.exec", "os.posix_spawn"):
             raise UnreadableFile("refers to something outside of itself")
         if event == "open" and isinstance(arguments[0], (str, bytes)):

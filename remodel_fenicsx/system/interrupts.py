@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any
 
 from remodel_fenicsx.errors import PAUSED, RemodelError
 from remodel_fenicsx.system.files import typed
@@ -105,7 +104,7 @@ def _is_main_thread() -> bool:
 
 @contextmanager
 def handled(
-    handler: Callable[[int, FrameType | None], object], numbers: Iterable[int], where: Callable[[Any], bool]
+    handler: Callable[[int, FrameType | None], object], numbers: Iterable[int], where: Callable[[object], bool]
 ) -> Iterator[None]:
     """Within, a function gets these signals, where who has got them so far is one of those that are asked for."""
     chosen = [number for number in numbers if where(signal.getsignal(number))] if _is_main_thread() else []

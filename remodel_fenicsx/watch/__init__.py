@@ -7,9 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 from remodel_fenicsx._lazy import resolved
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.evolution.stepper import Stepper, Watcher
+    from remodel_fenicsx.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,10 @@ class WatcherKind:
     >>> del WATCHERS["counter"]
     """
 
-    maker: Callable[[Any, Any], Any] | str
+    maker: Callable[[Scene, Stepper], Watcher | None] | str
     each_case: bool = False
 
-    def make(self, scene: Any, stepper: Any) -> Any:
+    def make(self, scene: Scene, stepper: Stepper) -> Watcher | None:
         """The watcher of a scene's stepper, or of another load case; None where there is nothing to watch.
 
         Parameters

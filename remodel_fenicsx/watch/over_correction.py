@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -14,6 +14,9 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.state import Earlier
+
+if TYPE_CHECKING:
+    from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -69,7 +72,7 @@ class OverCorrection(WarnsOnce):
         self.rested = RestedCells(stepper) if stepper.remodeling.law.of_absolute_time else None
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> OverCorrection | None:
+    def of(cls, scene: Scene, stepper: Stepper) -> OverCorrection | None:
         return cls(stepper) if stepper.remodeling.law.remodels and not scene.time.is_equilibrium else None
 
     def started(self, step: Step) -> None:
@@ -156,11 +159,12 @@ class OverCorrection(WarnsOnce):
     # ------------------------------------------------------------ words
     def _in_words(self, swing: Swing, cells: Array, times: Array) -> str:
         change = np.linalg.norm(self._at_points(_weights(times) @ cells[: ORDER + 1]), axis=-1)
+        most = self.quadrature.shown_place_of_largest(change)
         return (
             "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
-            f"changes by {swing.cells:.2g} r0^2 (root mean square; most at "
-            f"{self.quadrature.shown_place_of_largest(change)}), the displacement by {swing.body:.2g} of its size; "
-            f"each pass multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
+            f"changes by {swing.cells:.2g} r0^2 (root mean square; most at {most}), "
+            f"the displacement by {swing.body:.2g} of its size; each pass "
+            f"multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
             f"{self._advice(swing.cells_factor)} "
             "(docs/theory.md, Stability of the pass)"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -19,6 +19,11 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
 from remodel_fenicsx.solver.linear import negative_pivots, uneven
 from remodel_fenicsx.state import Earlier, Numbers
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
+
+    from remodel_fenicsx.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -116,7 +121,7 @@ class EquilibriumStability(Watcher):
             self._unloaded = of_the_unloaded_body(self.inertia)
         return self._unloaded
 
-    def _say(self, level: int, *message: Any) -> None:
+    def _say(self, level: int, *message: object) -> None:
         if self.state.comm.rank == 0:
             log.log(level, *message)
 
@@ -145,7 +150,7 @@ class Signs:
         """The eigenvalues have been counted: from now on what differs from the present signs is news."""
         self._pivots["at_look"] = self._pivots["now"]
 
-    def _curvature(self, factorisation: Any) -> float:
+    def _curvature(self, factorisation: PETSc.PC) -> float:
         """Of the remembered vector after one more inverse iteration."""
         vector, image = factorisation.getOperators()[0].createVecs()
         first = not self._vector.known
@@ -202,7 +207,7 @@ class BucklingWarning(WarnsOnce):
         self.strut = strut
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> BucklingWarning | None:
+    def of(cls, scene: Scene, stepper: Stepper) -> BucklingWarning | None:
         strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
         return None if strut is None else cls(stepper, strut)  # a whole body buckles by itself
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import dolfinx.fem
 import dolfinx.la
@@ -21,6 +21,11 @@ from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.model.tensors import cofactor
 from remodel_fenicsx.system import NOTICE
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
+
+    from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -50,7 +55,7 @@ MOST_HELD = 0.99  # part of a motion that elements hold back, in the sum of a ge
 REMEDY = f"set mesh.element = 'hexahedron' and mesh.formulation = {NOT_LOCKING!r}"
 
 
-def remedy(scene: Any) -> str:
+def remedy(scene: Scene) -> str:
     """What a scene may set whose elements lock, in words."""
     if needs := scene.needs_all_points():
         return f"set mesh.degree = 2 or a larger mesh.refinement, for {needs} needs mesh.formulation = 'displacement'"
@@ -78,7 +83,7 @@ class LockingWarning(WarnsOnce):
         self.response = VolumeResponse(stepper, self.stiffnesses[0])
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> LockingWarning | None:
+    def of(cls, scene: Scene, stepper: Stepper) -> LockingWarning | None:
         if stepper.state.kinematics.homogeneous:  # there are no elements that could hold it back
             return None
         return cls(stepper, FORMULATIONS[scene.mesh.formulation].locks, remedy(scene))
@@ -186,7 +191,7 @@ class PressureNoise(WarnsOnce):
         self.ratio = self.quadrature.maximum(lame / points.lame_mu.reshape(self.quadrature.shape))
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> PressureNoise | None:
+    def of(cls, scene: Scene, stepper: Stepper) -> PressureNoise | None:
         remodeling, locks = stepper.remodeling, FORMULATIONS[scene.mesh.formulation].locks
         turns = remodeling.law.remodels and remodeling.driver.is_stress and not stepper.state.kinematics.homogeneous
         return cls(stepper, remedy(scene)) if locks and turns else None
@@ -244,7 +249,7 @@ class VolumeResponse:
         return lacking
 
     @staticmethod
-    def _refine(answer: Any, forces: Any, factors: Any) -> None:
+    def _refine(answer: PETSc.Vec, forces: PETSc.Vec, factors: PETSc.PC) -> None:
         """One step of iterative refinement, with the matrix that was factorised: factors may have few digits."""
         left, better = forces.duplicate(), forces.duplicate()
         factors.getOperators()[0].mult(answer, left)
@@ -262,7 +267,7 @@ class VolumeResponse:
         F = states[..., 2:].reshape(*changes.shape, 3, 3)
         return (self.stiffness * changes / states[..., 1])[..., None, None] * cofactor(F)
 
-    def _assemble(self, stress: Array, forces: Any) -> None:
+    def _assemble(self, stress: Array, forces: PETSc.Vec) -> None:
         """Nodal forces of a stress, zero where displacements are prescribed."""
         quadrature, (function, form) = self.quadrature, self._form
         quadrature.owned(quadrature.values(function, (3, 3)))[:] = stress
@@ -274,7 +279,7 @@ class VolumeResponse:
         forces.array[:] = np.where(np.isnan(prescribed), local.array, 0.0)[:number]
 
     @cached_property
-    def _form(self) -> tuple[Any, Any]:
+    def _form(self) -> tuple[dolfinx.fem.Function, dolfinx.fem.Form]:
         """P as a function of the points, and its virtual work, compiled."""
         state, quadrature = self.state, self.quadrature
         function = quadrature.function("stress_in_vain", (3, 3))
@@ -283,7 +288,7 @@ class VolumeResponse:
         weight = state.kinematics.stress_free_weight(quadrature.mesh)
         return function, jit.form(ufl.inner(function, variation) * weight * quadrature.dx)
 
-    def _part_of_the_way(self, first: Any, resisted: float) -> float:
+    def _part_of_the_way(self, first: PETSc.Vec, resisted: float) -> float:
         """Of the missing motion, its component along the way: each direction of space counts by what it lacks."""
         state, change, ahead = self.state, self.state.unknown.copy(), first.duplicate()
         change.x.array[: state.number_of_owned_unknowns] = first.array_r
@@ -386,7 +391,7 @@ class RadialChains(WarnsOnce):
         self.radial_share = radial_share
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> RadialChains:
+    def of(cls, scene: Scene, stepper: Stepper) -> RadialChains:
         return cls(stepper, scene.geometry.radial_share)
 
     def look(self, step: Step) -> str:
@@ -419,7 +424,7 @@ class FrontsInLayers(WarnsOnce):
         }
 
     @classmethod
-    def of(cls, scene: Any, stepper: Any) -> FrontsInLayers | None:
+    def of(cls, scene: Scene, stepper: Stepper) -> FrontsInLayers | None:
         return cls(stepper, scene.geometry) if scene.geometry.angle_layers else None
 
     def due(self, step: Step) -> bool:
