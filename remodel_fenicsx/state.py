@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import dolfinx.fem
 import numpy as np
@@ -25,6 +25,9 @@ from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_of, structure_tens
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import MATRICES, TURNED_OVER, Tissue, mixed
 from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS, Properties
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 Array = NDArray[np.float64]
 
@@ -218,7 +221,7 @@ class State:
 
     def __init__(
         self,
-        unknown: Any,
+        unknown: dolfinx.fem.Function,
         kinematics: Kinematics,
         cells: UnitCells,
         loading: Loading,
@@ -241,7 +244,7 @@ class State:
         self.tell: Callable[[str], object] = lambda words: None  # of a step that is solved in parts
         self.settle_cells()
         solved = self.equilibrium_cells
-        self._functions: dict[str, Any] = {}
+        self._functions: dict[str, dolfinx.fem.Function] = {}
         self._arrays: dict[str, NDArray[np.float64]] = {}  # the functions' own memory
         for function in (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes):
             self._add(function)
@@ -252,7 +255,7 @@ class State:
         loading.set(dict.fromkeys(loading.values, 0.0))
 
     @property
-    def comm(self) -> Any:
+    def comm(self) -> MPI.Intracomm:
         """Communicator of the mesh."""
         return self.cells.quadrature.mesh.comm
 
@@ -263,7 +266,7 @@ class State:
         return int(space.index_map.size_local * space.index_map_bs)
 
     @cached_property
-    def _dof_of_node(self) -> Any:
+    def _dof_of_node(self) -> NDArray[np.int64]:
         return dof_of_node(self.loading.domain.mesh, self.kinematics.nodal_space(self.unknown))
 
     def gathered_displacement(self) -> NDArray[np.float64] | None:
@@ -313,7 +316,7 @@ class State:
         values = values.reshape(quadrature.shape)
         return values if self._initial is None else values / np.linalg.det(quadrature.values(self._initial, (3, 3)))
 
-    def functions(self) -> dict[str, Any]:
+    def functions(self) -> dict[str, dolfinx.fem.Function]:
         """Every dolfinx function of the state by its name, those of further load cases with their mark ("@2")."""
         shared = {self.cells.dimensions.name, self.cells.axes.name}
         found = dict(self._functions)
@@ -342,10 +345,10 @@ class State:
         for case in self.each_case().values():
             case.time, case.number = time, number
 
-    def _add(self, function: Any) -> None:
+    def _add(self, function: dolfinx.fem.Function) -> None:
         self._functions[function.name], self._arrays[function.name] = function, function.x.array
 
-    def remember(self, function: Any, count: str | None = None) -> None:
+    def remember(self, function: dolfinx.fem.Function, count: str | None = None) -> None:
         """From now on a dolfinx function (with a name of its own) is part of the state.
 
         For what a coupling carries from step to step: transactions restore it, checkpoints hold it.
@@ -435,7 +438,13 @@ class Numbers:
 class Earlier:
     """The last values of a field, as functions of the state."""
 
-    def __init__(self, state: State, name: str, make: Callable[[], Any], count: int):
+    def __init__(
+        self,
+        state: State,
+        name: str,
+        make: Callable[[], dolfinx.fem.Function],
+        count: int,
+    ):
         self._functions = []
         for age in range(count):
             function = make()
@@ -491,7 +500,7 @@ def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
     return float(np.finfo(np.float64).eps * numbers.stiffness(length))
 
 
-def by_region(domain: Domain, values: Mapping[str, float]) -> Any:
+def by_region(domain: Domain, values: Mapping[str, float]) -> dolfinx.fem.Function:
     """A DG0 Function with the value of each region of a domain by its name; "" is for those that have none."""
     found = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
     places = found.function_space.dofmap.list.reshape(-1)
@@ -558,7 +567,10 @@ class Parameters:
 NEVER_LOCKED = 1e12  # link lengths: contour length of chains that are not there; infinity times zero is no number
 
 
-def parameters_of(properties: Mapping[str, Properties], domain: Domain) -> tuple[Tissue, Any]:
+def parameters_of(
+    properties: Mapping[str, Properties],
+    domain: Domain,
+) -> tuple[Tissue, float | dolfinx.fem.Function]:
     """Tissue and kappa of a scene's regions: numbers where these agree, DG0 Functions where they differ."""
     tissues, kappas = _tissues(properties), {name: one.kappa for name, one in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import dolfinx.fem
 import dolfinx.la
@@ -33,6 +33,11 @@ from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.tables import SceneError
 
+if TYPE_CHECKING:
+    from dolfinx.fem import DirichletBC, Function, FunctionSpace
+    from dolfinx.mesh import Mesh
+    from ufl.core.expr import Expr
+
 spatial = Late("scipy.spatial")  # few bodies need it
 Facets = NDArray[np.int32]
 
@@ -43,7 +48,12 @@ SQUARE_TO_RADIAL = 10.0
 TINY = 1e-12  # of a squared length of about one: no direction is divided by zero
 
 
-def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outlets: Sequence[str]) -> list[Any]:
+def _fields(
+    domain: Domain,
+    quadrature: Quadrature,
+    inlets: Sequence[str],
+    outlets: Sequence[str],
+) -> list[Function]:
     """Radial and axial direction, lengths from inner and outer face, inlet and outlet: functions. Collective."""
     mesh, degree = domain.mesh, quadrature.element_degree
     inner, outer, starts, ends = (facets_of(domain, names) for names in (["inner"], ["outer"], inlets, outlets))
@@ -60,18 +70,18 @@ def _fields(domain: Domain, quadrature: Quadrature, inlets: Sequence[str], outle
     return [radial, axial, *through, *along]
 
 
-def slopes(mesh: Any, degree: int, dx: Any) -> Positive:
+def slopes(mesh: Mesh, degree: int, dx: ufl.Measure) -> Positive:
     """The form of harmonic functions. Collective."""
     trial, test = _arguments(lagrange(mesh, degree, ()).function_space)
     return Positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
 
 
-def harmonic(stiffness: Positive, low: Facets, high: Facets) -> Any:
+def harmonic(stiffness: Positive, low: Facets, high: Facets) -> Function:
     """The harmonic function that is 0 on some facets and 1 on others. Collective."""
     return stiffness.solve(None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)])
 
 
-def _radial(phi: Any, degree: int, dx: Any, thickness: float) -> Any:
+def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Function:
     """Projected unit gradients of the harmonic function."""
     mesh, slope, (trial, test) = phi.function_space.mesh, ufl.grad(phi), _arguments(phi.function_space)
     least, way = (dolfinx.fem.Constant(mesh, number) for number in (np.float64(LEAST_SLOPE / thickness), np.zeros(3)))
@@ -83,7 +93,13 @@ def _radial(phi: Any, degree: int, dx: Any, thickness: float) -> Any:
     return found
 
 
-def _axial(radial: Any, dx: Any, starts: Facets, ends: Facets, thickness: float) -> Any:
+def _axial(
+    radial: Function,
+    dx: ufl.Measure,
+    starts: Facets,
+    ends: Facets,
+    thickness: float,
+) -> Function:
     """The smoothest field: least integral of |grad a|^2 + k (a . r)^2 / thickness^2 with the ends' normals."""
     space, normal = radial.function_space, _unit(radial)
     weight = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2))
@@ -93,22 +109,29 @@ def _axial(radial: Any, dx: Any, starts: Facets, ends: Facets, thickness: float)
     return smooth.solve(None, [_normal_to_ends(radial, starts, ends)], multigrid=True)
 
 
-def _length(form: Positive, direction: Any, dx: Any, facets: Facets, sign: float, multigrid: bool = False) -> Any:
+def _length(
+    form: Positive,
+    direction: Expr,
+    dx: ufl.Measure,
+    facets: Facets,
+    sign: float,
+    multigrid: bool = False,
+) -> Function:
     """The function, 0 on facets, whose gradient is nearest to a direction: along it alone, or as a vector."""
     test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(form.space.mesh, np.float64(sign))
     flux = factor * ufl.inner(direction, ufl.grad(test)) * dx
     return form.solve(flux, [_held(form.space, facets, 0.0)], multigrid)
 
 
-def _arguments(space: Any) -> tuple[Any, Any]:
+def _arguments(space: FunctionSpace) -> tuple[ufl.Argument, ufl.Argument]:
     return ufl.TrialFunction(space), ufl.TestFunction(space)
 
 
-def _unit(vector: Any) -> Any:
+def _unit(vector: Expr) -> Expr:
     return vector / ufl.sqrt(ufl.inner(vector, vector) + TINY)
 
 
-def _held(space: Any, facets: Facets, value: float) -> Any:
+def _held(space: FunctionSpace, facets: Facets, value: float) -> DirichletBC:
     dofs = dolfinx.fem.locate_dofs_topological(space, space.mesh.topology.dim - 1, facets)
     held = dolfinx.fem.Constant(space.mesh, np.float64(value))
     return dolfinx.fem.dirichletbc(held, dofs, space)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from numbers import Real
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, cast, Generic, TYPE_CHECKING, TypeVar
 
 import dolfinx.fem
 import dolfinx.fem.petsc
@@ -28,6 +28,13 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import lagrange
 from remodel_fenicsx.fem.solver_methods import ProblemOptions, multigrid_options
 
+if TYPE_CHECKING:
+    from dolfinx.fem import Constant, DirichletBC, Form, Function, FunctionSpace
+    from dolfinx.mesh import Mesh
+    from ufl.core.expr import Expr
+
+    from remodel_fenicsx.fem.quadrature import Quadrature
+
 
 # ---------------------------------------------------------------- a linear equation with a positive definite form
 
@@ -35,7 +42,7 @@ TOLERANCE = 1e-12  # relative, of the linear solve: what comes of it has ten dig
 ITERATION_LIMIT = 20_000  # lines of a thousand elements need some thousands
 
 
-def factorised(matrix: Any) -> Any:
+def factorised(matrix: PETSc.Mat) -> PETSc.KSP:
     """A solver by factors, of a matrix that need not be symmetric."""
     solver = PETSc.KSP().create(matrix.comm)
     solver.setOperators(matrix)
@@ -45,7 +52,7 @@ def factorised(matrix: Any) -> Any:
     return solver
 
 
-def rigid_motions(space: Any, matrix: Any) -> Any:
+def rigid_motions(space: FunctionSpace, matrix: PETSc.Mat) -> PETSc.NullSpace:
     """Those of the space of a vector, which multigrid must know of its matrix."""
     place = matrix.createVecRight()
     place.array[:] = space.tabulate_dof_coordinates()[: place.getLocalSize() // 3].ravel()
@@ -54,7 +61,7 @@ def rigid_motions(space: Any, matrix: Any) -> Any:
     return motions
 
 
-def degree_one(space: Any) -> tuple[Any, Any]:
+def degree_one(space: FunctionSpace) -> tuple[FunctionSpace, PETSc.Mat]:
     """The same functions of degree 1, and the matrix that interpolates them. Collective."""
     below = lagrange(space.mesh, 1, tuple(space.value_shape)).function_space
     prolongation = dolfinx.fem.petsc.interpolation_matrix(below, space)
@@ -65,7 +72,13 @@ def degree_one(space: Any) -> tuple[Any, Any]:
 class DegreeOne:
     """Multigrid for elements of degree 2 whose next level is `degree_one`: all others then cost little. Collective."""
 
-    def __init__(self, pc: Any, next_level: tuple[Any, Any], matrix: Any, elastic: bool):
+    def __init__(
+        self,
+        pc: PETSc.PC,
+        next_level: tuple[FunctionSpace, PETSc.Mat],
+        matrix: PETSc.Mat,
+        elastic: bool,
+    ):
         below, self._prolongation = next_level
         self._coarse = matrix.PtAP(self._prolongation)
         self._coarse.setBlockSize(below.dofmap.bs)
@@ -84,7 +97,7 @@ class DegreeOne:
         coarse.setType("preonly")
         self._options.apply(coarse.getPC())
 
-    def renew(self, matrix: Any) -> None:
+    def renew(self, matrix: PETSc.Mat) -> None:
         """The next level of another matrix."""
         matrix.PtAP(self._prolongation, result=self._coarse)
 
@@ -101,17 +114,22 @@ class SolveStopped(ArithmeticError):
 class Positive:
     """A positive definite form: its matrix, which several solves share. Collective."""
 
-    def __init__(self, bilinear: Any):
+    def __init__(self, bilinear: ufl.Form):
         form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
         self._matrix = create_matrix(form)
         assemble_matrix(self._matrix, [form], [])
 
     @cached_property
-    def _degree_one(self) -> tuple[Any, Any]:
+    def _degree_one(self) -> tuple[FunctionSpace, PETSc.Mat]:
         """For all solves. Collective."""
         return degree_one(self.space)
 
-    def solve(self, linear: Any, conditions: Sequence[Any] = (), multigrid: bool = False) -> Any:
+    def solve(
+        self,
+        linear: ufl.Form | None,
+        conditions: Sequence[DirichletBC] = (),
+        multigrid: bool = False,
+    ) -> Function:
         """The function u with bilinear(u, v) = linear(v) for all v; linear is 0 where it is None. Collective."""
         # Conjugate gradients, with no memory for factors. Multigrid is for where what is held is far away; it cannot be
         # where all is held.
@@ -181,7 +199,7 @@ def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
 # ---------------------------------------------------------------- parameters of kernels
 
 
-def coefficient(mesh: Any, name: str, value: Any) -> Any:
+def coefficient(mesh: Mesh, name: str, value: float | Constant | Function) -> Constant | Function:
     """The value as forms take it, so that another value compiles nothing."""
     if isinstance(value, Real) and not isinstance(value, (bool, np.bool_)):
         value = dolfinx.fem.Constant(mesh, PETSc.ScalarType(float(value)))
@@ -208,7 +226,7 @@ def coefficient(mesh: Any, name: str, value: Any) -> Any:
     return own
 
 
-def point_values(value: Any, quadrature: Any) -> NDArray[np.float64]:
+def point_values(value: Constant | Function, quadrature: Quadrature) -> NDArray[np.float64]:
     """Values of a coefficient at the quadrature points, (elements, points); ghosts included."""
     if isinstance(value, dolfinx.fem.Function):
         dofs = value.function_space.dofmap.list.reshape(-1)
@@ -218,7 +236,7 @@ def point_values(value: Any, quadrature: Any) -> NDArray[np.float64]:
     return np.full(quadrature.shape, float(np.real(value.value)))
 
 
-def largest(value: Any, mesh: Any) -> float:
+def largest(value: Constant | Function, mesh: Mesh) -> float:
     """Largest value of a coefficient in the body, over all ranks."""
     if isinstance(value, dolfinx.fem.Function):
         owned = value.function_space.dofmap.index_map.size_local
@@ -233,7 +251,7 @@ def largest(value: Any, mesh: Any) -> float:
 class Remembered(Generic[T]):
     """The last value, as long as nothing has changed that it depends on."""
 
-    def __init__(self, comm: MPI.Intracomm | None, *expressions: Any):
+    def __init__(self, comm: MPI.Intracomm | None, *expressions: Expr):
         self._comm = comm
         terminals = {terminal for expression in expressions for terminal in traverse_unique_terminals(expression)}
         functions = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Function)]
@@ -277,7 +295,13 @@ def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
 # ---------------------------------------------------------------- the tangent of an energy
 
 
-def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any, other: Any = None) -> Any:
+def second_derivative(
+    energy: ufl.Form,
+    unknown: Function,
+    test: Expr,
+    trial: Expr,
+    other: Function | None = None,
+) -> ufl.Form:
     """Derivative of an energy by its unknowns, twice; its kernel takes a third of the time."""
     # An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d I_m D I_n. Left to
     # itself UFL puts test and trial function through every operation of W, and each of these is then 81 at a point in
@@ -286,7 +310,7 @@ def second_derivative(energy: Any, unknown: Any, test: Any, trial: Any, other: A
     return map_integrands(lambda density: _of_density(density, unknown, test, trial, other), energy)
 
 
-def _of_density(density: Any, unknown: Any, test: Any, trial: Any, other: Any) -> Any:
+def _of_density(density: Expr, unknown: Function, test: Expr, trial: Expr, other: Function) -> Expr:
     found = invariants(density, unknown)
     if not found:
         return ufl.derivative(ufl.derivative(density, unknown, test), other, trial)
@@ -303,14 +327,14 @@ def _of_density(density: Any, unknown: Any, test: Any, trial: Any, other: Any) -
     return total
 
 
-def invariants(density: Any, unknown: Any) -> list[Any]:
+def invariants(density: Expr, unknown: Function) -> list[Expr]:
     """Scalar products, determinants."""
     # The outermost ones; none at all where it depends on the unknown in another way too.
-    depends: set[Any] = set()
+    depends: set[Expr] = set()
     for part in unique_post_traversal(density):  # operands come before what is made of them
         if part == unknown or any(operand in depends for operand in part.ufl_operands):
             depends.add(part)
-    found: dict[Any, None] = {}
+    found: dict[Expr, None] = {}
     stack, seen = [density], set()
     while stack:
         part = stack.pop()
@@ -332,7 +356,7 @@ def invariants(density: Any, unknown: Any) -> list[Any]:
 SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's own, with the starts of its rows and the column numbers
 
 
-def create_matrix(form: Any) -> Any:
+def create_matrix(form: Form) -> PETSc.Mat:
     """An empty PETSc matrix with the pattern of a compiled bilinear form. Collective."""
     # Forms are assembled into a `dolfinx.la.MatrixCSR`. On one rank its memory is that of the matrix; on several ranks
     # the matrix takes its values as a whole. Either way none goes through PETSc's insertion, which takes as long as the
@@ -353,7 +377,11 @@ def create_matrix(form: Any) -> Any:
     return matrix
 
 
-def assemble_matrix(matrix: Any, forms: Sequence[Any], conditions: Sequence[Any]) -> None:
+def assemble_matrix(
+    matrix: PETSc.Mat,
+    forms: Sequence[Form],
+    conditions: Sequence[DirichletBC],
+) -> None:
     """The sum of compiled bilinear forms; zero in the rows and columns of conditions, one on their diagonal."""
     shared, starts, numbers = matrix.getAttr(SHARED)
     shared.set_value(0.0)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mpi4py import MPI
 
+if TYPE_CHECKING:
+    import numpy as np
+    from dolfinx.fem import FunctionSpace
+    from dolfinx.mesh import Mesh, MeshTags
+    from numpy.typing import NDArray
 
-def mesh_from_gmsh(model: Any, comm: MPI.Intracomm) -> tuple[Any, Any, Any]:
+
+def mesh_from_gmsh(model: Any, comm: MPI.Intracomm) -> tuple[Mesh, MeshTags, MeshTags]:
     """The dolfinx mesh, its cell tags and its facet tags of the Gmsh model that rank 0 holds."""
     # Tags are the numbers of physical groups; `model` is not looked at on other ranks.
     try:
@@ -19,13 +25,19 @@ def mesh_from_gmsh(model: Any, comm: MPI.Intracomm) -> tuple[Any, Any, Any]:
     return mesh, cell_tags, facet_tags
 
 
-def geometry_dofmap(mesh: Any) -> Any:
+def geometry_dofmap(mesh: Mesh) -> Any:
     """Geometry nodes of the local cells, (local cells, nodes per cell)."""
     geometry = mesh.geometry
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
 
 
-def space_with_dofs(space: Any, size: int, ghosts: Any, owners: Any, dofs: Any) -> Any:
+def space_with_dofs(
+    space: FunctionSpace,
+    size: int,
+    ghosts: NDArray[np.int64],
+    owners: NDArray[np.int32],
+    dofs: NDArray[np.int32],
+) -> FunctionSpace:
     """A function space like another one whose elements have other degrees of freedom, of block size 1."""
     import dolfinx.cpp
     import dolfinx.fem

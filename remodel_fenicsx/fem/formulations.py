@@ -7,15 +7,25 @@ scenes, which name formulations, are read without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Function
+    from ufl import Form
+    from ufl.core.expr import Expr
+
+    from remodel_fenicsx.fem.kinematics import Kinematics
+    from remodel_fenicsx.fem.quadrature import Quadrature
+    from remodel_fenicsx.model.cells import UnitCell
+    from remodel_fenicsx.model.energy import Stresses, Tissue
 
 ufl, basix = Late("ufl"), Late("basix")
 Array = NDArray[np.float64]
@@ -26,15 +36,26 @@ class Dilatation:
 
     jacobian: Any = None
 
-    def __init__(self, quadrature: Any):
+    def __init__(self, quadrature: Quadrature):
         self.quadrature = quadrature
 
-    def energies(self, tissue: Any, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
+    def energies(
+        self,
+        tissue: Tissue,
+        deformation_gradient: Expr,
+        cells: Sequence[UnitCell],
+        weight: Expr | float,
+    ) -> list[Form]:
         """UFL forms whose sum is the integral of W over the body; `weight` is the body's volume per unit of mesh."""
         # They are compiled one by one: FFCx mixes up values of two quadrature rules that meet in one kernel.
         return [tissue.strain_energy(deformation_gradient, cells) * weight * self.quadrature.dx]
 
-    def stresses(self, tissue: Any, deformation_gradient: Any, cells: Any) -> Any:
+    def stresses(
+        self,
+        tissue: Tissue,
+        deformation_gradient: Expr,
+        cells: Sequence[UnitCell],
+    ) -> Stresses:
         """Stresses (UFL) at the quadrature points, as the residual has them. They belong to the last `refresh`."""
         return tissue.stresses(deformation_gradient, cells)
 
@@ -94,7 +115,7 @@ class Formulation:
         """
         return np.inf
 
-    def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
+    def on(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> Dilatation:
         """The formulation for these unknowns at these points.
 
         Parameters
@@ -152,14 +173,20 @@ class Selective(Formulation):
         """By element, where there is a rule."""
         return self.pays.get(element, np.inf) if self.has(element, degree) else np.inf
 
-    def on(self, kinematics: Any, unknown: Any, quadrature: Any) -> Dilatation:
+    def on(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> Dilatation:
         """With J at the points of the rule."""
         degree = self.degrees[quadrature.element_kind, quadrature.element_degree]
         return _PartsApart(kinematics, unknown, quadrature, degree)
 
 
 class _PartsApart(Dilatation):
-    def __init__(self, kinematics: Any, unknown: Any, quadrature: Any, degree: int):
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        unknown: Function,
+        quadrature: Quadrature,
+        degree: int,
+    ):
         from remodel_fenicsx.fem import jit
 
         super().__init__(quadrature)
@@ -174,12 +201,23 @@ class _PartsApart(Dilatation):
         self.jacobian = quadrature.function("jacobian_of_the_formulation", ())
         self.refresh()
 
-    def energies(self, tissue: Any, deformation_gradient: Any, cells: Any, weight: Any) -> list[Any]:
+    def energies(
+        self,
+        tissue: Tissue,
+        deformation_gradient: Expr,
+        cells: Sequence[UnitCell],
+        weight: Expr | float,
+    ) -> list[Form]:
         distortional = tissue.distortional_energy(deformation_gradient, cells)
         volumetric = tissue.volumetric_energy(ufl.det(deformation_gradient))
         return [distortional * weight * self.quadrature.dx, volumetric * weight * self.dx]
 
-    def stresses(self, tissue: Any, deformation_gradient: Any, cells: Any) -> Any:
+    def stresses(
+        self,
+        tissue: Tissue,
+        deformation_gradient: Expr,
+        cells: Sequence[UnitCell],
+    ) -> Stresses:
         return tissue.stresses_of_parts(deformation_gradient, cells, self.jacobian)
 
     def refresh(self) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, chdir, contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import cffi
 import dolfinx.fem
@@ -35,6 +35,11 @@ from ufl.domain import extract_unique_domain
 
 from remodel_fenicsx.system.interrupts import held_back, stopping_at_once
 from remodel_fenicsx.system import NOTICE
+
+if TYPE_CHECKING:
+    from dolfinx.mesh import Mesh
+    from ufl import Form
+    from ufl.core.expr import Expr
 
 log = logging.getLogger(__name__)
 
@@ -105,12 +110,12 @@ with chdir("/"):
     ffcx.options.get_options()
 
 
-def jit_options(flags: list[str] = COMPILER_FLAGS) -> dict[str, Any]:
+def jit_options(flags: list[str] = COMPILER_FLAGS) -> dict[str, object]:
     """Options for compiled forms and expressions."""
     return {"cffi_extra_compile_args": flags, "cache_dir": cache_folder(), "timeout": TIMEOUT}
 
 
-def form(ufl_form: Any, name: str | None = None) -> Any:
+def form(ufl_form: Form, name: str | None = None) -> dolfinx.fem.Form:
     """Compile a UFL form, or take it from the cache.
 
     Parameters
@@ -150,7 +155,11 @@ def form(ufl_form: Any, name: str | None = None) -> Any:
         return dolfinx.fem.form(ufl_form, jit_options=jit_options(flags))
 
 
-def expression(ufl_expression: Any, points: Any, name: str | None = None) -> PointValues:
+def expression(
+    ufl_expression: Expr,
+    points: NDArray[np.float64],
+    name: str | None = None,
+) -> PointValues:
     """Compile a UFL expression for evaluation at reference points of shape (n, 3); otherwise like `form`."""
     flat = [ufl_expression[place] if place else ufl_expression for place in np.ndindex(ufl_expression.ufl_shape)]
     parts, sizes, comm = [], [], extract_unique_domain(ufl_expression).ufl_cargo().comm
@@ -167,11 +176,11 @@ def expression(ufl_expression: Any, points: Any, name: str | None = None) -> Poi
 class PointValues:
     """An expression at reference points of elements, compiled in parts of some components each (`expression`)."""
 
-    def __init__(self, parts: list[Any], sizes: list[int], points: int):
+    def __init__(self, parts: list[dolfinx.fem.Expression], sizes: list[int], points: int):
         self._parts, self._sizes, self._points = parts, sizes, points
         self.components = sum(sizes)
 
-    def eval(self, mesh: Any, elements: Any) -> NDArray[np.float64]:
+    def eval(self, mesh: Mesh, elements: NDArray[np.int32]) -> NDArray[np.float64]:
         """The components, in their order, at the points of each element: (elements, points, components)."""
         values = [
             part.eval(mesh, elements).reshape(len(elements), self._points, size)
@@ -188,7 +197,7 @@ def library(
     seconds: int = 2,
     include: Path | None = None,
     libraries: tuple[str, ...] = (),
-) -> Any:
+) -> ModuleType:
     """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does."""
     text = "\0".join([declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()])
     name = f"libremodel_{hashlib.sha256(text.encode()).hexdigest()[:40]}"

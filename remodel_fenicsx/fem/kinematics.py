@@ -8,12 +8,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Constant, Function, FunctionSpace
+    from dolfinx.mesh import Mesh
+    from ufl.core.expr import Expr
 
 ufl, basix_ufl, fem = Late("ufl"), Late("basix.ufl"), Late("dolfinx.fem")
 Array = NDArray[np.float64]
@@ -70,12 +75,12 @@ class Kinematics(ABC):
         """Kind of the mesh's elements where the scene asks for elements of the body of this kind."""
         return kind
 
-    def on(self, mesh: Any, body: Any) -> Kinematics:
+    def on(self, mesh: Mesh, body: Any) -> Kinematics:
         """The kinematics for the mesh of a body (`body.shape.Shape`)."""
         return self
 
     @abstractmethod
-    def unknown(self, mesh: Any, degree: int) -> Any:
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
         """A dolfinx function of the unknowns, zero, with elements of this degree.
 
         Parameters
@@ -87,30 +92,30 @@ class Kinematics(ABC):
         """
 
     @abstractmethod
-    def displacement(self, unknown: Any) -> Any:
+    def displacement(self, unknown: Function) -> Expr:
         """UFL 3-vector, linear in the unknown: so it is also the virtual displacement of a test function."""
 
     @abstractmethod
-    def deformation_gradient(self, unknown: Any) -> Any:
+    def deformation_gradient(self, unknown: Function) -> Expr:
         """F, UFL, always of shape (3, 3)."""
 
-    def elastic(self, deformation_gradient: Any) -> Any:
+    def elastic(self, deformation_gradient: Expr) -> Expr:
         """F_e, UFL, of an F: F itself where the mesh is free of stress."""
         return deformation_gradient
 
-    def elastic_gradient(self, unknown: Any) -> Any:
+    def elastic_gradient(self, unknown: Function) -> Expr:
         """F_e, UFL: what the tissue feels."""
         return self.elastic(self.deformation_gradient(unknown))
 
-    def stress_free_weight(self, mesh: Any) -> Any:
+    def stress_free_weight(self, mesh: Mesh) -> Expr | float:
         """Volume of the tissue, free of stress, per unit of mesh."""
         return self.weight(mesh)
 
-    def weight(self, mesh: Any) -> Any:
+    def weight(self, mesh: Mesh) -> Expr | float:
         """Volume of the body per unit of mesh, a number or UFL; one where the mesh is the body."""
         return 1
 
-    def subspace(self, space: Any, component: int) -> Any:
+    def subspace(self, space: FunctionSpace, component: int) -> Any:
         """The part of the unknown's space that a support of the displacement in x, y or z (0, 1, 2) holds, or None.
 
         Parameters
@@ -122,24 +127,24 @@ class Kinematics(ABC):
         """
         return space.sub(component)
 
-    def uniform_strain(self, component: int) -> Any:
+    def uniform_strain(self, component: int) -> Constant | None:
         """The Constant that is the engineering strain along x, y or z where it is prescribed as a whole, or None."""
         return None
 
-    def uniform_unknown(self, space: Any, component: int) -> Any:
+    def uniform_unknown(self, space: FunctionSpace, component: int) -> Any:
         """Where the strain along x, y or z is an unknown: its part of the space, and its value at strain 1. Or None."""
         return None
 
-    def shear(self) -> Any:
+    def shear(self) -> Constant | None:
         """The Constant that is F_xy where it is prescribed as a whole, from now on a part of F; or None."""
         return None
 
-    def nodal_space(self, unknown: Any) -> Any:
+    def nodal_space(self, unknown: Function) -> FunctionSpace:
         """A space, scalar or blocked, with the mesh's nodes in the order of `nodal_displacement`."""
         return unknown.function_space
 
     @abstractmethod
-    def nodal_displacement(self, unknown: Any) -> Array:
+    def nodal_displacement(self, unknown: Function) -> Array:
         """Displacement of the local nodes, (nodes, 3)."""
 
 
@@ -164,19 +169,19 @@ class FullKinematics(Kinematics):
     three_dimensional = True
     moves_rigidly = True
 
-    def unknown(self, mesh: Any, degree: int) -> Any:
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
         """A vector function, zero."""
         return lagrange(mesh, degree, (3,))
 
-    def displacement(self, unknown: Any) -> Any:
+    def displacement(self, unknown: Function) -> Expr:
         """The unknown itself."""
         return unknown
 
-    def deformation_gradient(self, unknown: Any) -> Any:
+    def deformation_gradient(self, unknown: Function) -> Expr:
         """F = I + grad u."""
         return ufl.Identity(3) + ufl.grad(unknown)
 
-    def nodal_displacement(self, unknown: Any) -> Array:
+    def nodal_displacement(self, unknown: Function) -> Array:
         """The unknown's own memory, (nodes, 3)."""
         return unknown.x.array.reshape(-1, 3)
 
@@ -196,7 +201,7 @@ class SectorKinematics(FullKinematics):
     moves_rigidly = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
 
-    def weight(self, mesh: Any) -> Any:
+    def weight(self, mesh: Mesh) -> Expr | float:
         """Four of them are the body."""
         return 4
 
@@ -217,11 +222,11 @@ class _Reduced(Kinematics):
         """Of fewer dimensions."""
         return self.element_kind
 
-    def on(self, mesh: Any, body: Any) -> Kinematics:
+    def on(self, mesh: Mesh, body: Any) -> Kinematics:
         """One of its own: its numbers belong to the mesh."""
         return type(self)(mesh, body)
 
-    def subspace(self, space: Any, component: int) -> Any:
+    def subspace(self, space: FunctionSpace, component: int) -> Any:
         """The component's own subspace, if it is a field."""
         own = self.components[component]
         return None if own is None else space.sub(own)
@@ -236,24 +241,24 @@ class AxisymmetricKinematics(_Reduced):
     components = (0, None, 1)
     cost = 0.3
 
-    def unknown(self, mesh: Any, degree: int) -> Any:
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
         """(u_r, u_z), zero."""
         return lagrange(mesh, degree, (2,))
 
-    def displacement(self, unknown: Any) -> Any:
+    def displacement(self, unknown: Function) -> Expr:
         """u_r e_x + u_z e_z."""
         return ufl.as_vector([unknown[0], 0.0, unknown[1]])
 
-    def deformation_gradient(self, unknown: Any) -> Any:
+    def deformation_gradient(self, unknown: Function) -> Expr:
         """With the circumferential stretch 1 + u_r/r."""
         r, _, _ = ufl.SpatialCoordinate(self.mesh)
         return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + _along(1, unknown[0] / r)
 
-    def weight(self, mesh: Any) -> Any:
+    def weight(self, mesh: Mesh) -> Expr | float:
         """2 pi r."""
         return _circumference(mesh)
 
-    def nodal_displacement(self, unknown: Any) -> Array:
+    def nodal_displacement(self, unknown: Function) -> Array:
         """Of the nodes in the half-plane, (nodes, 3)."""
         values = unknown.x.array.reshape(-1, 2)
         return np.stack([values[:, 0], np.zeros(len(values)), values[:, 1]], axis=1)
@@ -273,33 +278,33 @@ class RadialKinematics(_Reduced):
         if mesh is not None:
             self.axial_strain = _constant(mesh, 0.0)
 
-    def unknown(self, mesh: Any, degree: int) -> Any:
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
         """u_r, zero."""
         return lagrange(mesh, degree, ())
 
-    def displacement(self, unknown: Any) -> Any:
+    def displacement(self, unknown: Function) -> Expr:
         """u_r e_x: the ray lies in the plane z = 0."""
         return ufl.as_vector([unknown, 0.0, 0.0])
 
-    def deformation_gradient(self, unknown: Any) -> Any:
+    def deformation_gradient(self, unknown: Function) -> Expr:
         """Diagonal."""
         r, _, _ = ufl.SpatialCoordinate(self.mesh)
         stretches = _along(1, unknown / r) + _along(2, self.axial_strain)
         return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + stretches
 
-    def weight(self, mesh: Any) -> Any:
+    def weight(self, mesh: Mesh) -> Expr | float:
         """2 pi r times the length."""
         return self.axial_length * _circumference(mesh)
 
-    def uniform_strain(self, component: int) -> Any:
+    def uniform_strain(self, component: int) -> Constant | None:
         """The axial strain."""
         return self.axial_strain if component == 2 else None
 
-    def subspace(self, space: Any, component: int) -> Any:
+    def subspace(self, space: FunctionSpace, component: int) -> Any:
         """All of it is along x."""
         return space if component == 0 else None
 
-    def nodal_displacement(self, unknown: Any) -> Array:
+    def nodal_displacement(self, unknown: Function) -> Array:
         """Of the nodes on the ray, (nodes, 3)."""
         return unknown.x.array[:, None] * np.array([1.0, 0.0, 0.0])
 
@@ -313,43 +318,43 @@ class PointKinematics(_Reduced):
     components = (None, None, None)
     homogeneous = True
     cost = 0.2
-    _shear: Any = None
+    _shear: Constant | None = None
 
-    def unknown(self, mesh: Any, degree: int) -> Any:
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
         """Three numbers on the one element, zero."""
         self._nodes = lagrange(mesh, degree, ()).function_space
         element = basix_ufl.element("DG", mesh.topology.cell_name(), 0, shape=(3,))
         return fem.Function(fem.functionspace(mesh, element), name="displacement")
 
-    def displacement(self, unknown: Any) -> Any:
+    def displacement(self, unknown: Function) -> Expr:
         """u_i x_i / length."""
         x = ufl.SpatialCoordinate(self.mesh)
         return ufl.as_vector([unknown[i] * x[i] / self.axial_length for i in range(3)])
 
-    def deformation_gradient(self, unknown: Any) -> Any:
+    def deformation_gradient(self, unknown: Function) -> Expr:
         """Diagonal and constant."""
         stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
         F = sum(stretches, ufl.Identity(3))
         return F if self._shear is None else F + ufl.as_tensor([[0, self._shear, 0], [0, 0, 0], [0, 0, 0]])
 
-    def shear(self) -> Any:
+    def shear(self) -> Constant | None:
         """F_xy."""
         self._shear = _constant(self.mesh, 0.0) if self._shear is None else self._shear
         return self._shear
 
-    def uniform_unknown(self, space: Any, component: int) -> Any:
+    def uniform_unknown(self, space: FunctionSpace, component: int) -> Any:
         """The number along that axis."""
         return space.sub(component), self.body.axial_length
 
-    def weight(self, mesh: Any) -> Any:
+    def weight(self, mesh: Mesh) -> Expr | float:
         """Area of the section."""
         return self.section_area
 
-    def nodal_space(self, unknown: Any) -> Any:
+    def nodal_space(self, unknown: Function) -> FunctionSpace:
         """Continuous on the bar."""
         return self._nodes
 
-    def nodal_displacement(self, unknown: Any) -> Array:
+    def nodal_displacement(self, unknown: Function) -> Array:
         """Of the nodes of the bar, (nodes, 3)."""
         places: Array = self._nodes.tabulate_dof_coordinates()
         # a rank without the element has neither nodes nor numbers
@@ -369,14 +374,14 @@ KINEMATICS: dict[str, Kinematics] = {
 class _Around:
     """Kinematics as those of another field, `field`, but for what the class says."""
 
-    field: Any
+    field: Kinematics
 
     def __getattr__(self, name: str) -> Any:
         if name == "field":  # while it is copied it has none
             raise AttributeError(name)
         return getattr(self.field, name)
 
-    def elastic_gradient(self, unknown: Any) -> Any:
+    def elastic_gradient(self, unknown: Function) -> Expr:
         """F_e, UFL: what the tissue feels."""
         return self.elastic(self.deformation_gradient(unknown))
 
@@ -386,19 +391,25 @@ class NaturalConfiguration(_Around):
 
     # tissue that grows has another G in time; `initial` is that of the start, to whose volume all amounts belong
 
-    def __init__(self, kinematics: Any, gradient: Any, closing: Any = None, initial: Any = None):
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        gradient: Expr,
+        closing: Any = None,
+        initial: Expr | None = None,
+    ):
         self.field, self.gradient, self.closing = kinematics, gradient, closing
         self.initial, self.grows = (gradient, False) if initial is None else (initial, True)
 
-    def elastic(self, deformation_gradient: Any) -> Any:
+    def elastic(self, deformation_gradient: Expr) -> Expr:
         """F G."""
         return ufl.dot(deformation_gradient, self.gradient)
 
-    def stress_free_weight(self, mesh: Any) -> Any:
+    def stress_free_weight(self, mesh: Mesh) -> Expr | float:
         """The mesh's weight over det G of the start."""
         return self.field.weight(mesh) / ufl.det(self.initial)
 
-    def volume_ratio(self) -> Any:
+    def volume_ratio(self) -> Expr:
         """J_g, by what the tissue has grown; UFL."""
         return ufl.det(self.initial) / ufl.det(self.gradient)
 
@@ -414,7 +425,7 @@ class FreeLength(_Around):
     def __init__(self, kinematics: Kinematics, body: Any):
         self.field, self.body = kinematics, body
 
-    def unknown(self, mesh: Any, degree: int) -> Any:
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
         """(u, e), zero."""
         element = self.field.unknown(mesh, degree).function_space.ufl_element()
         number = basix_ufl.element("DG", mesh.topology.cell_name(), 0)
@@ -425,30 +436,30 @@ class FreeLength(_Around):
         self._length = _constant(mesh, self.body.axial_length)
         return unknown
 
-    def change_of_length(self, unknown: Any) -> Any:
+    def change_of_length(self, unknown: Function) -> Expr:
         """e, UFL; linear in the unknown."""
         return ufl.split(unknown)[1]
 
-    def displacement(self, unknown: Any) -> Any:
+    def displacement(self, unknown: Function) -> Expr:
         """u + e z/length e_z."""
         u, change = ufl.split(unknown)
         z = ufl.SpatialCoordinate(unknown.ufl_function_space().mesh)[2]
         return self.field.displacement(u) + ufl.as_vector([0.0, 0.0, change * z / self._length])
 
-    def deformation_gradient(self, unknown: Any) -> Any:
+    def deformation_gradient(self, unknown: Function) -> Expr:
         """The field's, and e/length along z."""
         u, change = ufl.split(unknown)
         return self.field.deformation_gradient(u) + _along(2, change / self._length)
 
-    def subspace(self, space: Any, component: int) -> Any:
+    def subspace(self, space: FunctionSpace, component: int) -> Any:
         """The field's."""
         return self.field.subspace(space.sub(0), component)
 
-    def nodal_space(self, unknown: Any) -> Any:
+    def nodal_space(self, unknown: Function) -> FunctionSpace:
         """The field's."""
         return self.field.nodal_space(self._nodal)
 
-    def nodal_displacement(self, unknown: Any) -> Array:
+    def nodal_displacement(self, unknown: Function) -> Array:
         """Displacement of the local nodes, (nodes, 3)."""
         self._nodal.x.array[:] = unknown.x.array[self._dofs]
         places: Array = self.nodal_space(unknown).tabulate_dof_coordinates()
@@ -456,7 +467,7 @@ class FreeLength(_Around):
         displacement[:, 2] += self.strain_of_length(unknown) * places[:, 2]
         return displacement
 
-    def strain_of_length(self, unknown: Any) -> float:
+    def strain_of_length(self, unknown: Function) -> float:
         """e/length; the same on every rank."""
         from mpi4py import MPI
 
@@ -465,7 +476,7 @@ class FreeLength(_Around):
         return float(unknown.function_space.mesh.comm.allreduce(here, MPI.MAX)) / self.body.axial_length
 
 
-def with_one_value(space: Any, component: int) -> Any:
+def with_one_value(space: FunctionSpace, component: int) -> FunctionSpace:
     """A mixed space in which a component, constant in each element, has one value for the whole mesh. Collective."""
     # The first rank with elements owns it, for all others it is a ghost.
     import dolfinx.la
@@ -499,7 +510,7 @@ def with_one_value(space: Any, component: int) -> Any:
     return compat.space_with_dofs(space, size, new_ghosts, owners.astype(np.int32), place[dofmap.list])
 
 
-def field_degree(space: Any) -> int:
+def field_degree(space: FunctionSpace) -> int:
     """Polynomial degree of a kinematics' unknown, of the field where there is a number beside it."""
     element = space.ufl_element()
     return int((element.sub_elements or [element])[0].degree)
@@ -508,23 +519,23 @@ def field_degree(space: Any) -> int:
 # ---------------------------------------------------------------- what they are made of
 
 
-def lagrange(mesh: Any, degree: int, shape: tuple[int, ...]) -> Any:
+def lagrange(mesh: Mesh, degree: int, shape: tuple[int, ...]) -> Function:
     """A continuous function "displacement", zero, with values of this shape."""
     element = basix_ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=shape)
     return fem.Function(fem.functionspace(mesh, element), name="displacement")
 
 
-def _constant(mesh: Any, value: float) -> Any:
+def _constant(mesh: Mesh, value: float) -> Constant:
     from petsc4py import PETSc
 
     return fem.Constant(mesh, PETSc.ScalarType(value))  # type: ignore[attr-defined]
 
 
-def _along(axis: int, value: Any) -> Any:
+def _along(axis: int, value: Expr) -> Expr:
     """value e (x) e along an axis, UFL."""
     return ufl.as_tensor([[value if i == j == axis else 0.0 for j in range(3)] for i in range(3)])
 
 
-def _circumference(mesh: Any) -> Any:
+def _circumference(mesh: Mesh) -> Expr:
     """2 pi r on the half-plane y = 0."""
     return 2 * np.pi * ufl.SpatialCoordinate(mesh)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import basix
 import basix.ufl
@@ -17,6 +17,11 @@ from numpy.typing import NDArray
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import of_all_ranks, over_ranks
 from remodel_fenicsx.fem.compat import geometry_dofmap
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Function, FunctionSpace
+    from dolfinx.mesh import Mesh
+    from ufl.core.expr import Expr
 
 # the rule that the element wants; UFL's estimate for this energy is huge
 DEGREES = {
@@ -78,9 +83,9 @@ class Quadrature:
     4.0
     """
 
-    def __init__(self, mesh: Any, element_degree: int, weight: Any = 1):
+    def __init__(self, mesh: Mesh, element_degree: int, weight: Expr | float = 1):
         self.mesh, self.element_degree = mesh, element_degree
-        self._spaces: dict[tuple[int, ...], Any] = {}
+        self._spaces: dict[tuple[int, ...], FunctionSpace] = {}
         self._complements: dict[int, NDArray[np.float64]] = {}
         self.element_kind = mesh.topology.cell_name()
         self.degree = DEGREES[self.element_kind, element_degree]
@@ -118,7 +123,7 @@ class Quadrature:
         """Volume measure at exactly these points."""
         return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": self.degree})
 
-    def function(self, name: str, value_shape: tuple[int, ...]) -> Any:
+    def function(self, name: str, value_shape: tuple[int, ...]) -> Function:
         """A dolfinx function with values of `value_shape` at the points.
 
         Parameters
@@ -133,11 +138,15 @@ class Quadrature:
             self._spaces[value_shape] = dolfinx.fem.functionspace(self.mesh, element)
         return dolfinx.fem.Function(self._spaces[value_shape], name=name)
 
-    def values(self, function: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
+    def values(self, function: Function, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
         """The function's own memory as an array ``(elements, points, *value_shape)``."""
         return function.x.array.reshape(*self.shape, *value_shape)
 
-    def evaluate(self, expression: Any, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
+    def evaluate(
+        self,
+        expression: jit.PointValues,
+        value_shape: tuple[int, ...],
+    ) -> NDArray[np.float64]:
         """Values ``(elements, points, *value_shape)`` of a compiled expression at the points."""
         return expression.eval(self.mesh, self.elements).reshape(*self.shape, *value_shape)
 

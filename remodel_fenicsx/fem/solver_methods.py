@@ -7,10 +7,13 @@ import itertools
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.schema.tables import SceneError
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
 
 AUTO = "auto"
 LAGGED = "lagged"  # whose factor may be of an earlier tangent (`solver.linear`)
@@ -45,10 +48,10 @@ class SolverMethod:
     >>> del SOLVER_METHODS["krylov"]
     """
 
-    options: Mapping[str, Any]
+    options: Mapping[str, object]
     meaning: str = ""
     linear: Callable[..., Any] | str = "remodel_fenicsx.solver.linear.EveryTangent"
-    on_several_ranks: Mapping[str, Any] = field(default_factory=dict)
+    on_several_ranks: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def make_linear(self) -> Callable[..., Any]:
@@ -110,7 +113,7 @@ REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent i
 # Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused
 SINGLE, DEFINITE = "positive definite in single precision", "positive definite"  # both by CHOLMOD
 SYMMETRIC, GENERAL = "symmetric", "general"  # by MUMPS
-FACTOR_OPTIONS: dict[str, Mapping[str, Any]] = {
+FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
     DEFINITE: {
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "cholmod",
@@ -148,7 +151,7 @@ def chosen(method: str, unknowns: int, reduced: bool, multigrid: bool = True) ->
     return "direct" if is_small(unknowns, reduced) else LAGGED
 
 
-def method_options(method: str, ranks: int, small: bool = False) -> dict[str, Any]:
+def method_options(method: str, ranks: int, small: bool = False) -> dict[str, object]:
     """PETSc options of a method on so many ranks; `small`: for a problem that `is_small`, on one rank."""
     options = dict(SOLVER_METHODS[method].options)
     if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":
@@ -160,12 +163,12 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, An
     return options
 
 
-def multigrid_options() -> dict[str, Any]:
+def multigrid_options() -> dict[str, object]:
     """PETSc options of the preconditioner of `iterative`."""
     return {name: value for name, value in SOLVER_METHODS["iterative"].options.items() if name[:2] in ("pc", "mg")}
 
 
-def factor_options(kind: str) -> dict[str, Any]:
+def factor_options(kind: str) -> dict[str, object]:
     """PETSc options of a preconditioner that factorises on one rank, a key of `FACTOR_OPTIONS`."""
     return {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}
 
@@ -212,7 +215,7 @@ _numbers = itertools.count(1)
 class ProblemOptions:
     """The options of one problem in PETSc's database, from its making to `close`."""
 
-    def __init__(self, own: Mapping[str, Any], options: Mapping[str, Any]):
+    def __init__(self, own: Mapping[str, object], options: Mapping[str, object]):
         from petsc4py import PETSc
 
         self.prefix, self._given = f"{USERS_PREFIX}{next(_numbers)}_", dict(options)
@@ -225,7 +228,7 @@ class ProblemOptions:
         for key in own.keys() - options.keys():
             self._database.hasName(self.prefix + key)  # asked for: PETSc does not call it left over
 
-    def apply(self, snes: Any) -> None:
+    def apply(self, snes: PETSc.SNES) -> None:
         """Give them to SNES, or to another of PETSc's solvers."""
         snes.setOptionsPrefix(self.prefix)
         try:

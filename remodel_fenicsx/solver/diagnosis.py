@@ -53,10 +53,10 @@ class Inertia:
 
     def __init__(self, equilibrium: Equilibrium):
         self.equilibrium = equilibrium
-        self._tangent: Any = None
+        self._tangent: PETSc.Mat | None = None
         self._symmetric: Any = None
-        self._factorised: Any = None
-        self._factorisation: Any = None
+        self._factorised: PETSc.Mat | None = None
+        self._factorisation: PETSc.PC | None = None
         self._is_unsymmetric = False
         self._definite = kept_factor(equilibrium.comm)
 
@@ -92,7 +92,7 @@ class Inertia:
         vector.destroy()
         return mode
 
-    def _lowest(self, number: int) -> tuple[list[float], Any]:
+    def _lowest(self, number: int) -> tuple[list[float], PETSc.Vec]:
         """Return at least `number` smallest real parts of eigenvalues, and the vector of the first."""
         from slepc4py import SLEPc
 
@@ -148,7 +148,7 @@ class Inertia:
         self._symmetric.axpy(2.0, self._tangent, same)
         self._symmetric.scale(0.5)
 
-    def _negative_of(self, matrix: Any, shift: float = 0.0) -> int:
+    def _negative_of(self, matrix: PETSc.Mat, shift: float = 0.0) -> int:
         """Eigenvalues below `shift` of a matrix that has the pattern of the tangent."""
         if self._factorised is None:
             self._factorised = matrix.copy()
@@ -173,7 +173,7 @@ class Inertia:
             raise FactorisationFailed(f"MUMPS stopped with INFOG(1) = {factor.getMumpsInfog(1)}")
         return int(factor.getInertia()[0])
 
-    def _without_prescribed(self, matrix: Any) -> Any:
+    def _without_prescribed(self, matrix: PETSc.Mat) -> PETSc.Mat:
         """A copy in which the prescribed unknowns have an eigenvalue of the size of the largest ones, not one."""
         matrix, diagonal = matrix.copy(), matrix.createVecRight()
         matrix.getDiagonal(diagonal)
@@ -185,7 +185,7 @@ class Inertia:
         diagonal.destroy()
         return matrix
 
-    def _lower_bound(self, matrix: Any) -> float:
+    def _lower_bound(self, matrix: PETSc.Mat) -> float:
         """Below all eigenvalues, but not by far; zero where none is negative."""
         if self._negative_of(matrix) == 0:
             return 0.0
@@ -198,7 +198,7 @@ class Inertia:
             shift *= SHIFT_FACTOR
         raise FactorisationFailed("no lower bound of the eigenvalues was found")
 
-    def _mode(self, eigenvalue: float, vector: Any) -> Mode:
+    def _mode(self, eigenvalue: float, vector: PETSc.Vec) -> Mode:
         state = self.equilibrium.state
         function = dolfinx.fem.Function(state.unknown.function_space)
         owned = vector.getLocalSize()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import dolfinx.fem
 import dolfinx.fem.petsc
@@ -27,6 +27,10 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, whole_structure_tensor
 from remodel_fenicsx.model.tensors import MANDEL, det, passes_through_zero
 from remodel_fenicsx.state import State
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Function
+    from ufl.core.expr import Expr
 
 Array = NDArray[np.float64]
 Shares = Callable[[], Sequence[UnitCell]]
@@ -76,12 +80,12 @@ class PointwiseRepulsion:
         values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
         return self.quadrature.integral(self.state.per_mesh_volume(values))
 
-    def residual(self, u: Any, F: Any, test: Any) -> Any:
+    def residual(self, u: Function, F: Expr, test: Expr) -> Expr:
         """Its virtual work per reference volume, UFL."""
         variation = ufl.derivative(F, u, test)
         return ufl.inner(ufl.dot(F, self.stress), variation)
 
-    def tangent(self, u: Any, F: Any, test: Any, trial: Any) -> Any:
+    def tangent(self, u: Function, F: Expr, test: Expr, trial: Expr) -> Expr:
         """Derivative of `residual`, UFL."""
         variation, increment = ufl.derivative(F, u, test), ufl.derivative(F, u, trial)
         geometric = ufl.inner(ufl.dot(increment, self.stress), variation)
@@ -113,7 +117,7 @@ class PointStresses:
             self._repulsion.update()
 
 
-def mandel_vector(tensor: Any) -> Any:
+def mandel_vector(tensor: Expr) -> Expr:
     """Six Mandel components of a symmetric UFL tensor."""
     return ufl.as_vector([tensor[i, j] if i == j else np.sqrt(2.0) * tensor[i, j] for i, j in MANDEL])
 
@@ -186,7 +190,7 @@ class Equilibrium:
         chains = [] if self.tissue.chain is None else [part for cell in shares for part in cell]
         length = 0.0 if self.tissue.locking_length is None else self.tissue.locking_length
         self._known: Remembered[Look] = Remembered(self.comm, F, *map(ufl.as_ufl, [*chains, length]))
-        self._energy_forms: list[Any] = []
+        self._energy_forms: list[dolfinx.fem.Form] = []
 
     # ------------------------------------------------------------ what users ask
     def extension(self) -> Extension:
@@ -216,7 +220,13 @@ class Equilibrium:
         extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
         return Look(extension, stretch.reshape(shape), states)
 
-    def keeps_reserve(self, before: Any, after: Any, share: float, nearer_than: float = 0.0) -> bool:
+    def keeps_reserve(
+        self,
+        before: Array,
+        after: Array,
+        share: float,
+        nearer_than: float = 0.0,
+    ) -> bool:
         """Whether every point of all ranks keeps a share of its 1 - r/L."""
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
         return not over_ranks(self.comm, lost, MPI.LOR)
@@ -261,17 +271,17 @@ class Equilibrium:
         self._energy_forms = [jit.form(energy) for energy in self.energies]
 
     # ------------------------------------------------------------ what a solver asks
-    def assemble_internal(self, vector: Any) -> None:
+    def assemble_internal(self, vector: PETSc.Vec) -> None:
         """Internal nodal forces of the present unknowns."""
         if self.pointwise is not None:
             self.pointwise.update()
         self._assemble(vector, self.internal_forms)
 
-    def assemble_external(self, vector: Any) -> None:
+    def assemble_external(self, vector: PETSc.Vec) -> None:
         """Minus the nodal forces of the loads."""
         self._assemble(vector, [] if self.external_form is None else [self.external_form])
 
-    def _assemble(self, vector: Any, forms: Sequence[Any]) -> None:
+    def _assemble(self, vector: PETSc.Vec, forms: Sequence[dolfinx.fem.Form]) -> None:
         with vector.localForm() as local:
             values = local.array_w
             values.fill(0.0)
@@ -279,7 +289,7 @@ class Equilibrium:
                 dolfinx.fem.assemble_vector(values, form)
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
-    def assemble_lifting(self, vector: Any, x: Any) -> None:
+    def assemble_lifting(self, vector: PETSc.Vec, x: PETSc.Vec) -> None:
         """What the tangent makes of the distance between prescribed values and x: K (u_prescribed - x)."""
         with vector.localForm() as local:
             local.set(0.0)
@@ -289,11 +299,11 @@ class Equilibrium:
             dolfinx.fem.petsc.apply_lifting(vector, [form], bcs=[conditions], x0=[x], alpha=-1.0)
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
-    def create_matrix(self) -> Any:
+    def create_matrix(self) -> PETSc.Mat:
         """An empty matrix with the pattern of the tangent."""
         return create_matrix(self.tangent_forms[0])
 
-    def assemble_tangent(self, matrix: Any) -> None:
+    def assemble_tangent(self, matrix: PETSc.Mat) -> None:
         """Derivative of the residual at the present unknowns, one on the diagonal where they are prescribed."""
         self._update_tangent()
         assemble_matrix(matrix, self.tangent_forms, self.state.loading.boundary_conditions)
@@ -309,7 +319,7 @@ class Equilibrium:
             condition.set(values)
         return values
 
-    def prescribed_gap(self, x: Any) -> float:
+    def prescribed_gap(self, x: PETSc.Vec) -> float:
         """Largest distance of a prescribed value from its target, over all ranks."""
         conditions = self.state.loading.boundary_conditions
         if not conditions:
@@ -323,6 +333,6 @@ class Equilibrium:
         return float(over_ranks(self.comm, float(np.abs(target).max(initial=0.0)), MPI.MAX))
 
 
-def _depends_on(form: Any, unknown: Any) -> bool:
+def _depends_on(form: ufl.Form, unknown: Function) -> bool:
     """Whether a form's derivative with respect to the unknown is not zero."""
     return unknown in form.coefficients()

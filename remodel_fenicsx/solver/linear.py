@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
@@ -16,6 +16,10 @@ from remodel_fenicsx import kernels
 from remodel_fenicsx.fem.assembly import DegreeOne, degree_one, rigid_motions
 from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
+
+if TYPE_CHECKING:
+    from mpi4py.MPI import Comm
+    from petsc4py.PETSc import Mat, PC, SNES, Vec
 
 
 # ---------------------------------------------------------------- quasi-Newton steps on a kept factor
@@ -29,9 +33,9 @@ CURVED = 1e-8  # cosine between a step and the change of the residual, below whi
 class _Pair:
     """A step s, the change z of the residual over it, and H z with the kept inverse H."""
 
-    step: Any
-    change: Any
-    image: Any
+    step: Vec
+    change: Vec
+    image: Vec
     curvature: float
 
     def destroy(self) -> None:
@@ -44,7 +48,7 @@ class Secants:
 
     def __init__(self) -> None:
         self._pairs: deque[_Pair] = deque()
-        self._last: tuple[Any, Any, Any] | None = None
+        self._last: tuple[Vec, Vec, Vec] | None = None
 
     def forget(self) -> None:
         """The factor is another one."""
@@ -60,7 +64,7 @@ class Secants:
                 vector.destroy()
         self._last = None
 
-    def improve(self, x: Any, residual: Any, step: Any) -> bool:
+    def improve(self, x: Vec, residual: Vec, step: Vec) -> bool:
         """Better the step H r (trial: x - step) in place; whether it was changed."""
         self._learn(x, residual, step)
         self._last = (x.copy(), residual.copy(), step.copy())
@@ -77,7 +81,7 @@ class Secants:
         right.destroy()
         return True
 
-    def _learn(self, x: Any, residual: Any, step: Any) -> None:
+    def _learn(self, x: Vec, residual: Vec, step: Vec) -> None:
         if self._last is None:
             return
         before = self._last
@@ -117,7 +121,7 @@ def worth(unknowns: int) -> float:
 class KeptFactor:
     """Factors of an earlier tangent, which PETSc takes as a preconditioner of Python's."""
 
-    comm: Any = PETSc.COMM_SELF
+    comm: Comm = PETSc.COMM_SELF
 
     def __init__(self) -> None:
         self.preconditioner: Any = None
@@ -127,7 +131,7 @@ class KeptFactor:
         self._single: kernels.SingleFactor | None = None
         self._soft: Any = None  # the softest motion that is known: a vector of length one
 
-    def apply(self, _: Any, x: Any, y: Any) -> None:
+    def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """PETSc asks for y, the inverse of the kept tangent times x; NaN where there is none: the solve then fails."""
         if self._kind == SINGLE and self._single is not None:
             if not self._single.solve(x.array_r, y.array_w):
@@ -144,7 +148,7 @@ class KeptFactor:
             return 0
         return None if self.preconditioner is None else negative_pivots(self.preconditioner)
 
-    def renew(self, matrix: Any) -> None:
+    def renew(self, matrix: Mat) -> None:
         """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
         symmetric = matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
         kinds, refused = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL], False
@@ -162,7 +166,7 @@ class KeptFactor:
         if refused and self._kind == SYMMETRIC and not self._was_indefinite():
             self._takes_single = False  # it refuses what is definite
 
-    def is_definite(self, matrix: Any) -> bool:
+    def is_definite(self, matrix: Mat) -> bool:
         """Whether a symmetric matrix is positive definite: CHOLMOD takes it."""
         taken = self._factorised(DEFINITE, matrix)
         matrix.setOption(PETSc.Mat.Option.SPD, False)  # of others' factors nothing is known
@@ -184,7 +188,7 @@ class KeptFactor:
             self._options.close()
         self.preconditioner, self._options, self._kind = None, None, ""
 
-    def _answers_in_single(self, matrix: Any) -> bool | None:
+    def _answers_in_single(self, matrix: Mat) -> bool | None:
         """Whether a factor in single precision answers soft motions well enough; None where there is no such factor."""
         starts, columns, values = matrix.getValuesCSR()
         looks = 1
@@ -217,7 +221,7 @@ class KeptFactor:
         """Whether the kept factor has negative pivots, which MUMPS counts of a symmetric tangent."""
         return self._kind == SYMMETRIC and self.preconditioner.getFactorMatrix().getMumpsInfog(12) > 0
 
-    def _factorised(self, kind: str, matrix: Any) -> bool:
+    def _factorised(self, kind: str, matrix: Mat) -> bool:
         if self._kind != kind:
             self._let_go()
             self._options = ProblemOptions(factor_options(kind), {})
@@ -241,7 +245,7 @@ class KeptFactor:
 class GatheredFactor:
     """The same on several ranks: the first one has the whole tangent and its factors."""
 
-    def __init__(self, comm: Any):
+    def __init__(self, comm: Comm):
         self.comm, self.first = comm, KeptFactor()
         self._whole: Any = None  # a matrix of all ranks, whose rows and columns are the first one's
         self._scatter: Any = None
@@ -253,25 +257,25 @@ class GatheredFactor:
         """As `negative_pivots` of the kept factors. Collective."""
         return self.comm.bcast(self.first.negative_pivots)  # type: ignore[no-any-return]
 
-    def apply(self, _: Any, x: Any, y: Any) -> None:
+    def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """As of `KeptFactor`. Collective."""
         self._scatter.scatter(x, self._right, mode=PETSc.ScatterMode.FORWARD)
         if self.comm.rank == 0:
             self.first.apply(_, self._right, self._answer)
         self._scatter.scatter(self._answer, y, mode=PETSc.ScatterMode.REVERSE)
 
-    def renew(self, matrix: Any) -> None:
+    def renew(self, matrix: Mat) -> None:
         """As of `KeptFactor`. Collective."""
         self._gather(matrix)
         if self.comm.rank == 0:
             self.first.renew(self._whole.getDiagonalBlock())
 
-    def is_definite(self, matrix: Any) -> bool:
+    def is_definite(self, matrix: Mat) -> bool:
         """As of `KeptFactor`. Collective."""
         self._gather(matrix)
         return bool(self.comm.bcast(self.comm.rank == 0 and self.first.is_definite(self._whole.getDiagonalBlock())))
 
-    def _gather(self, matrix: Any) -> None:
+    def _gather(self, matrix: Mat) -> None:
         if self._scatter is None:
             template = matrix.createVecRight()
             self._scatter, self._right = PETSc.Scatter.toZero(template)
@@ -290,7 +294,7 @@ class GatheredFactor:
         self._whole = self._scatter = self._right = self._answer = None
 
 
-def kept_factor(comm: Any) -> KeptFactor | GatheredFactor:
+def kept_factor(comm: Comm) -> KeptFactor | GatheredFactor:
     """Factors of a matrix of these ranks."""
     return KeptFactor() if comm.size == 1 else GatheredFactor(comm)
 
@@ -330,7 +334,7 @@ class EveryTangent:
     given_up = False  # whether this way leads to nothing
     keeps = False  # whether factors outlast a solve
 
-    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+    def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         self.equilibrium, self.snes, self.matrix, self.options = equilibrium, snes, matrix, options
         self.tangents = 0
         self._always = False  # whether what may be kept is made anew in every iteration
@@ -355,7 +359,7 @@ class EveryTangent:
         self.equilibrium.assemble_tangent(self.matrix)
         self.tangents += 1
 
-    def improve(self, x: Any, residual: Any, step: Any, is_exact: bool) -> bool:
+    def improve(self, x: Vec, residual: Vec, step: Vec, is_exact: bool) -> bool:
         """Improve the Newton step in place (the trial state is x - step); returns whether it was changed.
 
         `is_exact`: the residual at x is that of the prescribed values too.
@@ -393,7 +397,7 @@ class EveryTangent:
         preconditioner.setOperators(self.matrix)
         preconditioner.setUp()
 
-    def factorisation(self) -> Any | None:
+    def factorisation(self) -> PC | None:
         """PETSc's preconditioner with the factors of the last tangent; None where there are none."""
         preconditioner = self.snes.getKSP().getPC()
         has_factors = self.tangents and preconditioner.getType() in ("lu", "cholesky", "telescope")
@@ -406,7 +410,7 @@ class EveryTangent:
 class Multigrid(EveryTangent):
     """GMRES with levels: of degree 1 below degree 2, made anew with each tangent, or kept as PETSc's options say."""
 
-    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+    def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
         self._solver, self._space = snes.getKSP(), equilibrium.state.unknown.function_space
         self._far = self._solver.getTolerances()[0]  # of the method: as Newton's method needs it far away
@@ -461,7 +465,7 @@ class Lagged(EveryTangent):
     keeps = True
     _begins_anew = False  # whether each solve has factors of its own, renewed as soon as one iteration says so
 
-    def __init__(self, equilibrium: Equilibrium, snes: Any, matrix: Any, options: ProblemOptions):
+    def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
         self.factor = kept_factor(equilibrium.comm)
         self._own = "pc_type" not in options.given
@@ -509,7 +513,7 @@ class Lagged(EveryTangent):
         self._norms, self._due = self._norms[-1:], False
         self._spent, self._solves = self.worth, 0
 
-    def improve(self, x: Any, residual: Any, step: Any, is_exact: bool) -> bool:
+    def improve(self, x: Vec, residual: Vec, step: Vec, is_exact: bool) -> bool:
         if self._always or not is_exact or self._renewed_over(MOST_RENEWALS):
             self.secants.interrupt()
             return False
@@ -535,7 +539,7 @@ class Lagged(EveryTangent):
         rate = (self._norms[-1] / self._norms[-1 - over]) ** (1 / over)
         return bool(not rate < 1 or np.log(tolerance / self._norms[-1]) / np.log(rate) > self.worth)
 
-    def factorisation(self) -> Any | None:
+    def factorisation(self) -> PC | None:
         if not self._own:
             return super().factorisation()
         return self.snes.getKSP().getPC() if self.tangents else None
@@ -545,7 +549,7 @@ class Lagged(EveryTangent):
         self.secants.forget()
 
 
-def negative_pivots(factorisation: Any) -> int | None:
+def negative_pivots(factorisation: PC) -> int | None:
     """How many there are, on all ranks; 1 or 0, odd or even, where only the determinant is known; None: nothing is."""
     if factorisation.getType() == "python":
         return factorisation.getPythonContext().negative_pivots  # type: ignore[no-any-return]
@@ -565,14 +569,14 @@ def negative_pivots(factorisation: Any) -> int | None:
     return factorisation.comm.tompi4py().bcast(found)  # type: ignore[no-any-return]  # the first rank knows it
 
 
-def uneven(vector: Any) -> Any:
+def uneven(vector: Vec) -> Vec:
     """The vector, filled with what no symmetry leaves unchanged."""
     first, last = vector.getOwnershipRange()
     vector.array[:] = np.sin(1.0 + np.arange(first, last) * np.sqrt(2.0))
     return vector
 
 
-def _on_the_diagonal(factor: Any) -> int:
+def _on_the_diagonal(factor: Mat) -> int:
     """Of U in PETSc's own LU, which exchanges no rows: a symmetric matrix is L D L^T, with D its diagonal."""
     pivots = factor.createVecRight()
     factor.getDiagonal(pivots)

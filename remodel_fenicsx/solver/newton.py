@@ -267,7 +267,7 @@ class GuardedNewton:
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
         bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
         self.limits = Limits(equilibrium, bounded)
-        snes: Any = PETSc.SNES().create(equilibrium.comm)
+        snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()), self._matrix)
         snes.setLineSearchPreCheck(self._keep_admissible)
@@ -275,7 +275,7 @@ class GuardedNewton:
         self._options.apply(snes)
         self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
         snes.setConvergenceTest(self._converged)
-        self._snes: Any = snes
+        self._snes: PETSc.SNES = snes
         self._linear: EveryTangent = SOLVER_METHODS[method].make_linear(equilibrium, snes, self._matrix, self._options)
         if self._robust:
             self._linear.keep_nothing()
@@ -371,7 +371,7 @@ class GuardedNewton:
         slope.destroy()
         return values
 
-    def answer(self, equilibrium: Equilibrium, tangents: int) -> Any:
+    def answer(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system."""
         # `tangents` were assembled for that state: the last one counts, or where there is none a new one.
         self._pull(self._x)
@@ -383,7 +383,7 @@ class GuardedNewton:
             self._linear.renew()
         return self._linear_answer(self._residual)
 
-    def _linear_answer(self, residual: Any) -> Any:
+    def _linear_answer(self, residual: PETSc.Vec) -> Array:
         """Change of the unknowns that the tangent gives for a residual, ghosts included."""
         solver, direction = self._snes.getKSP(), self._x.duplicate()
         solver.setOperators(self._matrix)
@@ -394,7 +394,7 @@ class GuardedNewton:
         direction.destroy()
         return values
 
-    def factorisation(self) -> Any | None:
+    def factorisation(self) -> PETSc.PC | None:
         """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
         return self._linear.factorisation()
 
@@ -408,12 +408,12 @@ class GuardedNewton:
             log.warning("solver.petsc_options: without effect (misspelt?): %s", ", ".join(unused))
 
     # ------------------------------------------------------------ SNES
-    def _pull(self, x: Any) -> None:
+    def _pull(self, x: PETSc.Vec) -> None:
         """Copy the unknowns into a PETSc vector."""
         with x.localForm() as local:
             local.array[:] = self._values
 
-    def _push(self, x: Any) -> None:
+    def _push(self, x: PETSc.Vec) -> None:
         """Copy a PETSc vector into the unknowns, ghosts included."""
         if self.equilibrium.comm.size == 1:
             self._values[:] = x.array_r
@@ -422,7 +422,7 @@ class GuardedNewton:
         with x.localForm() as local:
             self._values[:] = local.array_r
 
-    def _assemble_residual(self, snes: Any, x: Any, residual: Any) -> None:
+    def _assemble_residual(self, snes: PETSc.SNES, x: PETSc.Vec, residual: PETSc.Vec) -> None:
         """R = internal forces - loads, zero where displacements are prescribed and met."""
         # Fills R with NaN where the state is not admissible: line searches that know NaN shorten their step, others
         # stop.
@@ -452,7 +452,7 @@ class GuardedNewton:
             return
         self.convergence.displacement = x.norm(PETSc.NormType.NORM_INFINITY)
 
-    def _keep_admissible(self, x: Any, step: Any) -> bool:
+    def _keep_admissible(self, x: PETSc.Vec, step: PETSc.Vec) -> bool:
         """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step."""
         # J > 0 all the way there: a step that turns two axes of an element has J > 0 at its end again. Near L each
         # point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's method
@@ -481,7 +481,12 @@ class GuardedNewton:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
 
-    def _converged(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
+    def _converged(
+        self,
+        snes: PETSc.SNES,
+        iteration: int,
+        norms: tuple[float, float, float],
+    ) -> int:
         """SNES asks after every iteration: `Convergence`, or no more iterations."""
         norm = norms[2]
         if not np.isfinite(norm):
