@@ -29,10 +29,12 @@ def arrays_msh(file: str) -> dict[str, Any]:
     if rest := _SECTION.sub(b"", data).split():
         words = b" ".join(rest[:9])[:40].decode("ascii", "replace")
         raise UnreadableFile(f"has {words!r} outside of its sections: is it cut off?")
-    head, *rows = dict(_SECTION.findall(data)).get(b"Elements", b"0").strip().splitlines()
-    if len(rows) != sum(map(int, head.split()[:2])):  # Gmsh passes over what is not announced
-        raise UnreadableFile("has other elements than $Elements announces")
-    is_old, number = version[1] == b"2.2", itertools.count(1)
+    is_old, number, sections = version[1] == b"2.2", itertools.count(1), dict(_SECTION.findall(data))
+    # lines of a section for each number at its head: Gmsh passes over what is not announced
+    for name, lines in {"Nodes": (1, 2), "Elements": (1, 1), "Entities": (1, 1, 1, 1)}.items():
+        head, *rows = sections.get(name.encode(), b"0").strip().splitlines()
+        if len(rows) != sum(count * int(number) for count, number in zip(lines, head.split(), strict=False)):
+            raise UnreadableFile(f"has other {name.lower()} than ${name} announces")
     if is_old:  # its elements have groups of their own, not by the parts of the body, and an order
         data = _TAGS.sub(lambda found: b"%d%b%b" % (next(number), found[1], found[2]), data)
         Path(file).write_bytes(data)  # in this process' memory

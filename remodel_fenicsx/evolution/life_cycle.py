@@ -104,7 +104,7 @@ class Remodels:
 
     def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
         """Return the change to its limit, or over a duration, (elements, points, ...)."""
-        return np.zeros(())
+        return np.zeros((0, 0))
 
     def size(self, change: Array) -> float:
         """Return the largest relative size of such a change."""

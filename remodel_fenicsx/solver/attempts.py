@@ -12,11 +12,11 @@ F = TypeVar("F", bound=Exception)
 
 
 class Attempt(NamedTuple):
-    """One way to the solution of a step: what it is, who makes it, and what the log says where the next one begins."""
+    """One way to the solution of a step: what it is, who makes it, and what is logged where it fails."""
 
     what: str
     where: str
-    fails: str
+    fails: str = ""
 
 
 FROM_EXPECTED = Attempt(
@@ -30,10 +30,8 @@ MADE_ANEW = Attempt(
     "EveryTangent.second_try",
     "the step is solved once more",
 )
-IN_PARTS = Attempt(
-    "in parts: first what has remodeled, then the loads, a failed part halved", "Change", "a smaller part is tried"
-)
-STEP_REFUSED = Attempt("the step is refused, with its kind and advice", "diagnosed", "")
+IN_PARTS = Attempt("in parts: first what has remodeled, then the loads, a failed part halved", "Change")
+STEP_REFUSED = Attempt("the step is refused, with its kind and advice", "diagnosed")
 SHORTER_STEP = Attempt(
     "with a tolerance: a step of a quarter, up to three times", "StepControl", "a shorter step is tried"
 )

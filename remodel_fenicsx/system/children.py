@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import importlib
 import io
@@ -20,7 +21,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from remodel_fenicsx.errors import UnreadableFile
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, RemodelError, UnreadableFile
 from remodel_fenicsx.system.environment import extensions_for_children
 from remodel_fenicsx.system.files import open_own, read_regular
 
@@ -148,10 +149,28 @@ ELSEWHERE = "its numbers stand in another file; allowed is a file that holds the
 LONGEST_REASON = 150  # characters of what is wrong
 DAMAGED = "cannot be read: "
 FOR_EVER, NO_LIMIT = 1e5, 10**15  # seconds, which the system takes ten times; bytes
+NO_ROOM = (errno.EFBIG, errno.ENOSPC, errno.EDQUOT)
 # as VTK adds to its words
+_HEAD = r"\S+ \S+ \( *[\d.]+s\) \[ *\w+\] ?\S+ ERR\| "
 _LOGGED = re.compile(
-    r"\x1b\[[0-9;]*m|\S+ \S+ \( *[\d.]+s\) .*?ERR\| (vtkCompositeDataPipeline.*|\w+ )?|\(0x[0-9a-f]+\):?"
+    rf"\x1b\[[0-9;]*m|{_HEAD}vtkCompositeDataPipeline.*|{_HEAD}(\w+ \(0x[0-9a-f]+\): )?|\(0x[0-9a-f]+\)"
 )
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # marks of its byte order
+_COUNTS = re.compile(r"(?i)^(number.*|dimensions|offset)$")
+_LINES = re.compile(
+    rb"(?im)^\s*(?:points|cells|cell_types|point_data|cell_data|offsets|connectivity)\b[^\n]{0,99}\s-\d"
+)
+
+
+class NoRoomError(RemodelError):
+    """A disk, or the largest file that the system allows, is full: not the fault of what is read."""
+
+    exit_code = BAD_ENVIRONMENT
+
+    def __init__(self) -> None:
+        super().__init__(
+            "there is no room for the numbers of a file: a full disk, or a limit of the size of files (ulimit -f)"
+        )
 
 
 def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], bytes]:
@@ -166,8 +185,11 @@ def made_apart(
 ) -> dict[str, NDArray[Any]]:
     """What a function makes of a file of that name with these bytes, in a process of its own with limits."""
     with os.fdopen(os.memfd_create("read"), "wb") as source, os.fdopen(os.memfd_create("found"), "rb") as found:
-        with open(source.fileno(), "wb", closefd=False) as copy:
-            copy.write(data)
+        try:
+            with open(source.fileno(), "wb", closefd=False) as copy:
+                copy.write(data)
+        except OSError as error:
+            raise NoRoomError from error
         words = [reader, str(source.fileno()), str(found.fileno()), str(int(seconds)), str(memory)]
         command = [sys.executable, "-P", "-W", "ignore", "-m", "remodel_fenicsx.system.children", *words]
         kept: dict[str, Any] = {"pass_fds": (source.fileno(), found.fileno()), "env": environment_of_child()}
@@ -177,6 +199,8 @@ def made_apart(
             )
         except subprocess.TimeoutExpired:
             raise UnreadableFile(f"takes more than {seconds:.3g} seconds to read") from None
+        if done.returncode == BAD_ENVIRONMENT:
+            raise NoRoomError
         said = _LOGGED.sub("", " ".join(done.stderr[-4000:].decode(errors="replace").split()))
         said = said.replace(f"/proc/self/fd/{source.fileno()}", name)
         if -done.returncode in (signal.SIGXCPU, signal.SIGKILL):
@@ -215,6 +239,8 @@ def read_as_child(reader: str, source: str, found: str, seconds: str, memory: st
 
         with os.fdopen(int(found), "wb") as target:
             np.savez(target, **arrays)
+    except OSError as error:
+        sys.exit(BAD_ENVIRONMENT if error.errno in NO_ROOM else str(error))
     except MemoryError:
         sys.exit(f"takes more than {int(memory) / 1e6:.0f} MB to read")
     except KeyError as error:  # a table of types, or what was found
@@ -224,10 +250,12 @@ def read_as_child(reader: str, source: str, found: str, seconds: str, memory: st
 
 
 def _guard(file: str) -> None:
-    """Refuse what readers would lose; from here on nothing but this file and Python's own is opened."""
+    """Refuse XML against the rules; from here on nothing but this file and Python's own is opened."""
     data = Path(file).read_bytes()
-    if b"<" in data.lstrip(b"\0 \t\r\n")[:4]:
+    if data.startswith(UTF_16) or b"<" in data.lstrip(b"\0 \t\r\n")[:4]:
         _check_xml(data)
+    if found := _LINES.search(data[: 10**6]):
+        raise UnreadableFile(f"has a number that is negative: {found[0].decode().strip()}")
     own = tuple({*map(os.path.realpath, sysconfig.get_paths().values()), str(Path(__file__).resolve().parents[1])})
     own += tuple(os.path.realpath(folder) for folder in sys.path if folder)
 
@@ -249,21 +277,28 @@ def _guard(file: str) -> None:
 
 
 def _check_xml(data: bytes) -> None:
-    """Refuse what is no XML in UTF-8, has several pieces, or something outside of itself."""
+    """Refuse what is no XML in UTF-8, has entities of its own, or something outside of itself."""
     from xml.etree import ElementTree
 
     start = data.find(b"<AppendedData")
     if start >= 0 and b'encoding="raw"' in data[start : start + 100]:  # numbers in bytes at its end are not looked at
         data = data[:start] + b"</VTKFile>"
+    if data.startswith(UTF_16):  # which expat would follow, whatever it is told
+        raise UnreadableFile("is no XML in UTF-8")
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise UnreadableFile("has a document type or entities; allowed is plain XML")
+    parser = ElementTree.XMLParser(encoding="utf-8")
     try:
-        root = ElementTree.fromstring(data, ElementTree.XMLParser(encoding="utf-8"))
+        parser.feed(data)
+        root = parser.close()
     except ElementTree.ParseError as error:
         raise UnreadableFile(f"is no XML in UTF-8: {error}") from None
     for element in root.iter():
-        if element.tag.endswith("}include") or element.get("Format", "XML") != "XML":
+        if element.tag.rpartition("}")[2] == "include" or element.get("Format", "XML") != "XML":
             raise UnreadableFile(ELSEWHERE)
+        for name, value in element.items():
+            if _COUNTS.match(name) and "-" in value:
+                raise UnreadableFile(f"has a number that is negative: {name} = {value!r}")
         if (kind := element.get("header_type", "UInt32")) not in ("UInt32", "UInt64"):
             raise UnreadableFile(f"header_type = {kind!r}; allowed are 'UInt32' and 'UInt64'")
     if len(list(root.iter("Piece"))) > 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import os
 import resource
 import struct
 import subprocess
@@ -39,6 +40,10 @@ def changed(path: Path, old: str, new: str) -> None:
     path.write_bytes(text.replace(old.encode(), new.encode(), 1))
 
 
+def utf16(path: Path) -> None:
+    path.write_bytes(path.read_text().replace("utf-8", "utf-16").encode("utf-16"))
+
+
 def in_hdf5(path: Path) -> None:
     """As UTF-16, which a look for words in the bytes does not see."""
     with h5py.File(path.with_suffix(".h5"), "w") as file:
@@ -47,6 +52,14 @@ def in_hdf5(path: Path) -> None:
     start, end = text.index("<DataItem"), text.index("</DataItem>")
     item = '<DataItem DataType="Float" Dimensions="4 3" Format="HDF" Precision="8">' + f"{path.stem}.h5:/points"
     path.write_bytes((text[:start] + item + text[end:]).encode("utf-16"))
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path.with_name("pipe"))
+    in_hdf5(path)
+    path.write_text(
+        path.read_text("utf-16").replace(f"{path.stem}.h5", "pipe").replace('Format="HDF"', "Format='Binary'")
+    )
 
 
 def block_size(path: Path) -> None:
@@ -87,31 +100,38 @@ def included(path: Path) -> None:
     changed(path, "<Domain>", '<Domain><xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>')
 
 
-def unknown(path: Path) -> None:
-    """A type that VTK does not have."""
-    text = path.read_text()
-    start = text.index(">", text.index('Name="types"')) + 1
-    path.write_text(f"{text[:start]}99{text[text.index('</DataArray>', start) :]}")
+def of_type(number: int) -> Callable[[Path], None]:
+    """By VTK's number of it."""
+
+    def change(path: Path) -> None:
+        text = path.read_text()
+        start = text.index(">", text.index('Name="types"')) + 1
+        path.write_text(f"{text[:start]}{number}{text[text.index('</DataArray>', start) :]}")
+
+    return change
 
 
 CASES: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "values in HDF5": (".xdmf", in_hdf5, "in another file"),
+    "utf-16": (".xdmf", utf16, "no XML in UTF-8"),
+    "values in HDF5": (".xdmf", in_hdf5, "no XML in UTF-8"),
+    "a pipe": (".xdmf", pipe, "in another file"),
     "an entity": (".xdmf", lambda path: changed(path, "<Xdmf", '<!DOCTYPE a [<!ENTITY b "c">]><Xdmf'), "document type"),
     "included": (".xdmf", included, "another"),
-    "a count of -1": (".vtk", lambda path: changed(path, "POINTS 4", "POINTS -1"), "cannot be read"),
+    "a count of -1 in XDMF": (".xdmf", lambda path: changed(path, 'Dimensions="4 3"', 'Dimensions="-1 3"'), "negative"),
+    "a count of -1 in VTK": (".vtk", lambda path: changed(path, "POINTS 4", "POINTS -1"), "negative"),
     "block size -8": (".vtu", block_size, "header_type = 'Int64'; allowed are"),
     "endless blocks": (".vtu", endless, "cannot be read"),
     "a bomb": (".vtu", bomb, "takes more than 1[0-9]{3} MB to read|cannot be read: "),
     "pieces": (".vtu", pieces, "several pieces; allowed is one: .*ParaView"),
-    "an unknown element": (".vtu", unknown, "missing or unknown: 99"),
-    "a long name": (".vtu", lambda path: changed(path, 'Name="connectivity"', f'Name="{"c" * 20000}"'), "cannot be"),
-}
+    "a polyhedron": (".vtu", of_type(42), "of type 'polyhedron'; allowed are"),
+    "an unknown element": (".vtu", of_type(99), "missing or unknown: 99"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_refused_in_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each by its own rule: what the library would say of it is another matter."""
-    if name == "a bomb":  # whose memory is looked at
+    if name in ("utf-16", "a bomb"):  # whose memory is looked at
         monkeypatch.setattr(guarded, "subprocess", subprocess)
     monkeypatch.setattr(guarded, "SECONDS", 3.0)
     ending, change, rule = CASES[name]
@@ -125,6 +145,15 @@ def test_it_is_refused_in_one_line(name: str, tmp_path: Path, monkeypatch: pytes
     assert len(words) < 300 and "\n" not in words and "Traceback" not in words, words
     assert time.monotonic() - began < guarded.WAITING * guarded.SECONDS
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < max(before + 1, 2 * 10**6)  # kB
+
+
+def test_a_long_complaint_is_cut(tmp_path: Path) -> None:
+    path = good(tmp_path / "mesh.vtu")
+    changed(path, 'Name="connectivity"', f'Name="{"c" * 20000}"')
+    changed(path, "<Cells>", f"<{'x' * 20000}/><Cells>")
+    with pytest.raises(UnreadableFile) as refusal:
+        read_mesh(path)
+    assert len(str(refusal.value)) < 300
 
 
 def test_what_a_reader_warns_of_is_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,6 +171,7 @@ def reader_that_warns(file: str) -> dict[str, object]:
 
 READERS = {
     "opens": "another file",
+    "opens_hdf5": "in another file",
     "connects": "outside of itself",
     "starts": "outside of itself",
     "never_ends": "takes more than 1 seconds",
@@ -171,6 +201,12 @@ def test_a_reader_that_waits_is_ended(tmp_path: Path, monkeypatch: pytest.Monkey
 def waits(file: str) -> dict[str, object]:
     time.sleep(100)
     return {}
+
+
+def opens_hdf5(file: str) -> dict[str, object]:
+    import h5py as imported
+
+    return {"read": np.array(imported.File("/etc/passwd"))}
 
 
 def opens(file: str) -> dict[str, object]:

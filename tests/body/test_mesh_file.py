@@ -50,10 +50,12 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(version: float, tmp_path: Pa
 
 
 @pytest.mark.parametrize("more", ["1 2 x", "1 2 3"])
-def test_more_lines_than_announced_in_format_4_are_refused(tmp_path: Path, more: str) -> None:
+@pytest.mark.parametrize("section", ["Nodes", "Elements", "Entities"])
+def test_more_lines_than_announced_in_format_4_are_refused(tmp_path: Path, section: str, more: str) -> None:
     source = write_tube(tmp_path / "tube.msh")
-    end = ("$EndElements", f"{more}\n$EndElements")
-    assert "has other elements than $Elements" in refusal(changed(tmp_path / "bad.msh", end, source=source))
+    end = (f"$End{section}", f"{more}\n$End{section}")
+    said = refusal(changed(tmp_path / "bad.msh", end, source=source))
+    assert f"has other {section.lower()} than ${section} announces" in said
 
 
 def test_parts_without_a_group_are_read_too(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, SceneError
+from remodel_fenicsx import Recording, SceneError, Simulation
 from remodel_fenicsx.results.checkpoint_file import CheckpointError
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.run_folder import choose_folder
@@ -175,13 +176,19 @@ FORGERIES = {
         if f"{key} {name}" not in ("scene text", "time true", "numbers table")
     },
     "no time": without("time"),
+    "no points": without("points"),
     "no function": without("function"),
     "loads NaN": put("loads", {"force": float("nan")}),
+    "numbers of lists": put("numbers", {"a": [1.0]}),
+    "functions twice": put("functions", lambda names: names[:1]),
     "another load": put("loads", {"other": 1.0}),
     "a later step": put("number", lambda number: number + 7),
+    "another time": put("time", lambda time: time + 0.5),
     "another scene": put("scene", lambda text: text.replace("kappa = ", "kappa = 9")),
+    "no scene": put("scene", "x = 1"),
     "a row less": array("function", lambda old: old[:-1]),
     "a column less": array("function", lambda old: old[:, :-1]),
+    "empty": array("function", lambda old: old[:0]),
     "NaN": array("function", lambda old: old * np.nan),
     "moved points": array("points", lambda old: old + 1.0),
     "other elements": array("elements", lambda old: old[:, ::-1]),
@@ -221,7 +228,26 @@ def other_archive(data: bytes) -> Callable[[Path], None]:
     return change
 
 
-@pytest.mark.parametrize("change", [bomb, pickled, other_archive(b"no archive"), other_archive(b"")])
+def empty_archive() -> bytes:
+    """A zip without files."""
+    whole = io.BytesIO()
+    zipfile.ZipFile(whole, "w").close()
+    return whole.getvalue()
+
+
+def headed(head: bytes) -> bytes:
+    """An archive with one array that begins so."""
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as archive:
+        archive.writestr("header.npy", b"\x93NUMPY\x02\x00" + len(head).to_bytes(4, "little") + head)
+    return whole.getvalue()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [other_archive(headed(b"(" * 9000 + b"\n")),
+     bomb, pickled, other_archive(b"no archive"), other_archive(empty_archive()), other_archive(b"")],
+)  # fmt: skip
 def test_another_archive_is_refused(change: Callable[[Path], None], folder: Path) -> None:
     change(folder)
     before = content(folder)
@@ -254,6 +280,8 @@ def linked(kind: str) -> Callable[[Path, Path], None]:
             group = file["VTKHDF/PointData"]
             if kind == "external link":
                 group["displacement"] = h5py.ExternalLink(str(victim), "/VTKHDF/PointData/displacement")
+            elif kind == "soft link":
+                group["displacement"] = h5py.SoftLink("/VTKHDF/Points")
             elif kind == "external storage":
                 storage = [(str(victim), 0, h5py.h5f.UNLIMITED)]
                 group.create_dataset("displacement", shape, "f4", maxshape=(None, 3), external=storage)
@@ -265,7 +293,7 @@ def linked(kind: str) -> Callable[[Path, Path], None]:
     return change
 
 
-@pytest.mark.parametrize("kind", ["external link", "external storage", "virtual"])
+@pytest.mark.parametrize("kind", ["external link", "soft link", "external storage", "virtual"])
 def test_fields_that_are_kept_elsewhere_are_refused(kind: str, folder: Path, victim: Path) -> None:
     linked(kind)(folder / "fields.vtkhdf", victim)
     before = content(folder)
@@ -278,11 +306,12 @@ def test_fields_that_are_kept_elsewhere_are_refused(kind: str, folder: Path, vic
 @pytest.mark.parametrize("name", ["fields.vtkhdf", "fields_chains.vtkhdf"])
 def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(name: str, folder: Path) -> None:
     """HDF5's own check sums, and times and offsets, which follow from the numbers of nodes, elements and steps."""
-    copy = shutil.copy(folder / name, folder.with_name("copy.vtkhdf"))
-    with h5py.File(copy, "r+") as file:
-        file["VTKHDF/Steps/PointDataOffsets/displacement"][2] = 7
-    with pytest.raises(ValueError, match="is damaged"):
-        check_series(Path(copy))
+    for place, wrong in (("Steps/Values", -1.0), ("Steps/PointDataOffsets/displacement", 7)):
+        copy = shutil.copy(folder / name, folder.with_name("copy.vtkhdf"))
+        with h5py.File(copy, "r+") as file:
+            file[f"VTKHDF/{place}"][2] = wrong
+        with pytest.raises(ValueError, match="is damaged"):
+            check_series(Path(copy))
     path = folder / name
     with h5py.File(path) as file:
         values = file["VTKHDF/PointData/displacement"]
@@ -294,6 +323,10 @@ def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(name: str, f
     with pytest.raises(RecordingError, match=f"{name}: is damaged"):
         resume(folder, LONGER, SELF)
     assert content(folder) == before
+    if name == "fields.vtkhdf":
+        with pytest.raises(RecordingError, match="is damaged"):
+            for recorded in Recording(folder).times:
+                Recording(folder).fields(recorded)
 
 
 # ---------------------------------------------------------------- a folder that goes, or that is nobody's
@@ -365,12 +398,15 @@ def test_a_pipe_in_a_folder_keeps_nobody_waiting(name: str, folder: Path) -> Non
 def test_a_scene_has_bounds(tmp_path: Path) -> None:
     path = tmp_path / "scene.toml"
     many = ".".join(["a"] * 200_000)
+    quoted = ".".join(['"1"'] * 5000)
     for text, words in {
         f"{many} = 1": f"a key of more than {MOST_PARTS} parts",
+        f"[{'.'.join(['1'] * 5000)}]": f"a key of more than {MOST_PARTS} parts",
+        f"x = {{ {quoted} = 1 }}": f"a key of more than {MOST_PARTS} parts",
         f"x = {'[' * 150}{']' * 150}": f"in more than {MOST_PARTS} others",
         "x = 1 #" + " " * LARGEST: "is larger than 1 MB",
     }.items():
-        path.write_text(text)
+        path.write_text(text[: LARGEST - 1] if "larger" not in words else text)
         with pytest.raises(SceneError, match=words):
             read_scene(path)
     times = ", ".join(f"{whole}.5" for whole in range(20_000))  # decimals are no keys
@@ -381,7 +417,8 @@ def test_a_scene_has_bounds(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [("run", "--set", ".".join(["a"] * 5000) + "=1"), ("ensemble", "--seeds", "1000000000")],
+    [("run", "--set", ".".join(["a"] * 5000) + "=1"), ("ensemble", "--seeds", "1000000000"),
+     ("stability", "--times", "1000000000"), ("trade", "--jobs", "1000000000")],
 )  # fmt: skip
 def test_numbers_on_the_command_line_have_bounds(words: tuple[str, ...], tmp_path: Path) -> None:
     done = run(words[0], demo("cube"), *words[1:], cwd=tmp_path)
@@ -393,12 +430,20 @@ def test_numbers_on_the_command_line_have_bounds(words: tuple[str, ...], tmp_pat
 # ---------------------------------------------------------------- Python
 def test_numpys_numbers_are_numbers() -> None:
     scene = preset_scene("kuhl-holzapfel-2007", "cube")
-    found = scene.with_values(
-        {"cells.seed": np.int64(3), "time.end": np.float32(3.0), "output.fields": np.bool_(False)}
-    )
-    assert found == scene.with_values({"cells.seed": 3, "time.end": 3.0, "output.fields": False})
+    values = {"cells.seed": np.int64(3), "time.end": np.float32(3.0), "cells.initial": np.array([0.6, 0.8, 0.0]),
+              "output.fields": np.bool_(False), "mesh.refinement": np.uint8(2)}  # fmt: skip
+    plain = {"cells.seed": 3, "time.end": 3.0, "cells.initial": [0.6, 0.8, 0.0], "output.fields": False,
+             "mesh.refinement": 2}  # fmt: skip
+    assert scene.with_values(values) == scene.with_values(plain)
+    assert tomllib.loads(scene.with_values(values).to_toml())["cells"]["seed"] == 3
     with pytest.raises(SceneError, match=r"cells\.seed = 1\.5"):
         scene.with_values({"cells.seed": np.float64(1.5)})
+
+
+@pytest.mark.parametrize("scene", ["scene.toml", None, Path("scene.toml"), {"geometry": {}}])
+def test_a_simulation_says_what_it_needs(scene: Any) -> None:
+    with pytest.raises(TypeError, match=r"not a Scene: .*read_scene\(PATH\)"):
+        Simulation(scene)
 
 
 def test_no_step_after_the_end() -> None:

@@ -236,3 +236,16 @@ def test_a_full_disk_loses_nothing(
     (disk / "filler").unlink()
     resume(folder, [], SELF)
     assert_same(folder, expected)
+
+
+READ_ONLY, REMOUNT = 1, 32  # flags of mount(2)
+
+
+def test_a_disk_that_cannot_be_written_is_exit_code_5(disk: Path, half: Path) -> None:
+    folder = shutil.copytree(half, disk / "run")
+    system_call("mount", b"tmpfs", str(disk).encode(), b"tmpfs", READ_ONLY | REMOUNT, None)
+    done = forked("remodel-fenicsx", "run", "--resume", folder, "--set", "time.end=9")
+    assert done.returncode == 5 and done.stdout == "", done.stderr
+    assert done.stderr.startswith("remodel-fenicsx: cannot write the results: ")
+    assert done.stderr.endswith("run.lock: Read-only file system\n")
+    assert done.stderr.count("\n") == 1

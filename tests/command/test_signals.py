@@ -165,3 +165,31 @@ def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: 
     assert process.returncode == 128 + signal.SIGTERM
     assert said == "remodel-fenicsx: stopped by SIGTERM; nothing is written\n"
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_limit_of_files_is_no_fault_of_a_surface(tmp_path: Path) -> None:
+    """Below the size of the surface, and below that of the mesh."""
+    points, triangles = tube()
+    file = tmp_path / "lumen.vtp"
+    pyvista.PolyData.from_regular_faces(points, triangles).save(file)
+    words = ["wall", str(file), "--thickness", "0.3", "--size", "0.3", "-o", str(tmp_path / "wall.msh")]
+    for blocks in (20, 200):
+        limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$0" "$@"', *COMMAND[:3], *words]
+        done = subprocess.run(limited, capture_output=True, text=True, timeout=100)
+        assert done.returncode == 5, done.stderr
+        assert "lumen.vtp" not in done.stderr and "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_rank_does_not_wait_for_a_second_signal(tmp_path: Path) -> None:
+    """mpirun gives its ranks a quarter of a second between SIGTERM and SIGKILL: all of it is for the checkpoint."""
+    program = """
+import os, signal, time
+from remodel_fenicsx.system.interrupts import StopRequest
+time.sleep = None
+with StopRequest() as stop:
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert stop.number == signal.SIGTERM
+"""
+    done = forked("python", program, variables={**os.environ, "OMPI_COMM_WORLD_SIZE": "2"})
+    assert done.returncode == 0, done.stderr
