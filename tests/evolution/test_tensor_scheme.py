@@ -223,3 +223,28 @@ def test_a_step_that_is_solved_twice_is_one_step() -> None:
 def test_late_tension_is_the_same_in_a_run_that_goes_on(tmp_path: Path) -> None:
     """What a point has had as targets, or that it has had none, is kept."""
     goes_on(pulled_cube([[1.0, 0.0], [2.0, 1.0]], 3.0).scene, tmp_path, 1.0, 2.0)
+
+
+def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Chains along z whose target came from y: the target ahead is negative along y, and so would be A."""
+    simulation = short_tube(4.0, coupling="extrapolated")
+    run(simulation)
+    coupling: Any = simulation.stepper.coupling
+    state, cells = simulation.state, simulation.cells
+    points = cells.dimension_values.shape[1]
+    dimensions, axes = cells.dimension_values.copy(), cells.axis_values.copy()
+    dimensions[0], axes[0] = [0.0, 0.0, 1.0], np.eye(3)
+    cells.set(dimensions, axes)
+    for targets, along in ((coupling._newest, [0.0, 0.0, 1.0]), (coupling._older, [0.0, 1.0, 0.0])):
+        targets["direction"][:points], targets["switch"][:points] = np.diag(along), 1.0
+    before, target = cells.structure_tensor(), coupling._extrapolated(state.time + 1.0)
+    with caplog.at_level("INFO"):
+        coupling._follow(target, state.time + 1.0)
+    assert f"time 5: {points} points follow the last stress" in caplog.text
+    A = cells.structure_tensor()
+    np.testing.assert_allclose(A[0], np.broadcast_to(np.diag([0.0, 0.0, 1.0]), A[0].shape), atol=1e-14)
+    share = -np.expm1(-KAPPA * target.switch)[:, None, None]
+    expected = before.reshape(-1, 3, 3) + share * (target.direction - before.reshape(-1, 3, 3))
+    np.testing.assert_allclose(A.reshape(-1, 3, 3)[points:], expected[points:], atol=1e-13)

@@ -1,4 +1,4 @@
-"""Turnover against balances of energy and mass."""
+"""Turnover against balances of energy and mass, and against its differential equations at a held stretch."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from tests.evolution.test_turnover_bodies import TURNOVER, grown
-from tests.runs import made
+from tests.runs import made, simulated
+from tests.values import isotropic, ramped
 
 KAPPA = 0.1
 HELD = 8.0  # from here on no load changes
@@ -91,3 +93,42 @@ def test_collagen_is_neither_made_nor_lost(coupling: str, order: int) -> None:
         left.append(found["content"] - found["production"])
     assert left[0] / left[1] == pytest.approx(2.0**order, rel=0.1)
     assert abs(2**order * left[1] - left[0]) < 4e-3 * found["content"] and found["content"] > 2.0
+
+
+# ---------------------------------------------------------------- a held stretch
+def held_stretch(force: float, step: float, coupling: str = "staggered") -> tuple[float, list[dict[str, float]]]:
+    """r/r0 of isotropic cells that do not turn, in a matrix so stiff that chains leave it as it is; rows."""
+    values = isotropic(
+        None, "point", geometry={"shape": "cube"}, loads=ramped(step, force=force * 1e8),
+        material={"lame_lambda": 1e8, "lame_mu": 1e8, "chain_density": 1e20, "repulsion": "log"},
+        remodeling={"law": "tensor", "kappa": 0.0, "coupling": coupling, "turnover": TURNOVER},
+        time={"end": 20.0 + step, "step": step}, output={"columns": ["content", "natural_length"]},
+    )  # fmt: skip
+    with simulated(values) as (simulation, rows):
+        F = simulation.state.deformation_gradient()[0]
+    return float(np.sqrt((F**2).sum() / 3)), rows
+
+
+@pytest.mark.parametrize("force", [1.2, 0.2], ids=["long chains", "short chains"])
+def test_a_held_stretch_turns_over_as_its_differential_equations(force: float) -> None:
+    """ln m and ln rho of a single point, integrated by scipy; of first order in the step."""
+    T, k, deposited, L = TURNOVER["time"], TURNOVER["gain"], TURNOVER["deposition_stretch"], 1.594
+
+    def tension(stretch: float) -> float:
+        return 1 / (1 - stretch / L) ** 2 / 4 - 1 / 4 + stretch / L  # of a wormlike chain, r0 = 1
+
+    def equation(_: float, y: np.ndarray) -> list[float]:
+        stretch = chains / np.exp(y[1])
+        growth = k / T * min(max(tension(stretch) / tension(deposited) - 1, -1), 1)
+        return [growth, (1 / T + max(growth, 0)) * (stretch / deposited - 1)]
+
+    errors = []
+    for step in (1.0, 0.5):
+        chains, rows = held_stretch(force, step)
+        # the rates of a row change the next one
+        expected = np.exp(solve_ivp(equation, (0, 20.0), [0.0, 0.0], rtol=1e-10, atol=1e-12).y[:, -1])
+        found = np.array([rows[-1][name] for name in ("content", "natural_length")])
+        errors.append(np.abs(found - expected))
+    assert np.all(np.abs(expected - 1) > 0.02)
+    np.testing.assert_allclose(errors[0] / errors[1], 2.0, atol=0.25)
+    assert np.all(errors[1] < 0.01)

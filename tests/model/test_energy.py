@@ -171,3 +171,18 @@ def test_stress_is_eq_7(points: Points, case: str, omega: int) -> None:
     size = np.max(np.abs(expected), axis=(1, 2))
     for stress in (cauchy, pushed):
         assert np.max(np.max(np.abs(stress - expected), axis=(1, 2)) / size) < 1e-12
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_objectivity_and_the_axes_as_the_only_directions(points: Points, case: str) -> None:
+    """W(QF) = W(F), sigma(QF) = Q sigma Q^T, S(QF) = S(F); W(F Q^T; Q n) = W(F; n) with the same sigma."""
+    F, l, n = random_state(case)  # noqa: E741
+    Q = random_rotations(np.random.default_rng(9), len(F))
+    back = np.swapaxes(Q, 1, 2)
+    turned, rested = points.evaluate(Q @ F, l, n), points.evaluate(F @ back, l, n @ back)
+    for omega, (energy, second, cauchy) in points.evaluate(F, l, n).items():
+        np.testing.assert_allclose(turned[omega][0], energy, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(turned[omega][1], second, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(turned[omega][2], Q @ cauchy @ back, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(rested[omega][0], energy, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(rested[omega][2], cauchy, rtol=1e-11, atol=1e-11)
