@@ -27,6 +27,8 @@ MATRICES
     Energies of the matrix by name (`material.matrix`): functions of F, lambda and mu; `Matrix` for all formulations.
 PAIRINGS
     Which principal value belongs to which dimension, by name (`remodeling.pairing`): functions like `principal`.
+REMODELS
+    What remodels beside the cells, by the name of its table in `[remodeling]`: `RemodelsKind`.
 REPULSIONS
     Forms of the repulsive energy by name (`material.repulsion`): `Repulsion`.
 SHAPES
@@ -97,7 +99,13 @@ from remodel_fenicsx.model.laws import LAWS as LAWS, Drive as Drive, Law as Law,
 from remodel_fenicsx.model.axes import AXES as AXES, LocalAxes as LocalAxes
 from remodel_fenicsx.model.spectral import PAIRINGS as PAIRINGS, principal as principal
 from remodel_fenicsx.model.tensors import ln as ln
-from remodel_fenicsx.schema.settings import COUPLINGS as COUPLINGS, CouplingKind as CouplingKind
+from remodel_fenicsx.schema.settings import (
+    COUPLINGS as COUPLINGS,
+    REMODELS as REMODELS,
+    CouplingKind as CouplingKind,
+    RemodelsKind as RemodelsKind,
+)
+from remodel_fenicsx.schema.tables import Table as Table
 from remodel_fenicsx.schema.units import (
     AREA as AREA,
     FORCE as FORCE,
@@ -113,6 +121,7 @@ from remodel_fenicsx.watch import WATCHERS as WATCHERS, WatcherKind as WatcherKi
 
 if TYPE_CHECKING:
     from remodel_fenicsx.evolution.coupling import Coupling as Coupling, Staggered as Staggered, Traits as Traits
+    from remodel_fenicsx.evolution.life_cycle import Remodels as Remodels
     from remodel_fenicsx.fem.jit import form as form
     from remodel_fenicsx.results.columns import Measurement as Measurement
     from remodel_fenicsx.scene.reference import markdown_reference as markdown_reference
@@ -123,6 +132,7 @@ _LATE = {
     **dict.fromkeys(("Coupling", "Staggered", "Traits"), "evolution.coupling"),
     "EveryTangent": "solver.linear",
     "Measurement": "results.columns",
+    "Remodels": "evolution.life_cycle",
     "WarnsOnce": "evolution.stepper",
     "form": "fem.jit",
     "markdown_reference": "scene.reference",

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from dolfinx.fem import Function
 from mpi4py import MPI
@@ -14,7 +13,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import LoadValues, values_of_loads
 from remodel_fenicsx.evolution.coupling import Maker
-from remodel_fenicsx.evolution.stepper import FixedSteps, Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import FixedSteps, Step, Stepper, Watcher, Way
 from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.initial import initial_states, meshed, natural_gradient
 from remodel_fenicsx.measured import in_files, measured_fibres
@@ -132,7 +131,7 @@ class Parts:
     domain: Domain
     stepper: Stepper
     observer: Observer
-    way: Any  # `FixedSteps`, `StepControl` or `Homeostasis`
+    way: Way  # `FixedSteps`, `StepControl` or `Homeostasis`
 
 
 def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: Maker | None = None) -> Parts:
@@ -173,7 +172,7 @@ def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
     return scene.remodeling.model_copy(update={"coupling": "relaxed"})
 
 
-def _way(scene: Scene, stepper: Stepper) -> Any:
+def _way(scene: Scene, stepper: Stepper) -> Way:
     """Who goes through time: in steps of one length, in chosen ones, or until all rests."""
     time, stops = scene.time, scene.stops()
     if not (time.is_equilibrium or time.chooses or TIME_ERROR in scene.output.columns):

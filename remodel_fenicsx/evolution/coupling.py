@@ -146,6 +146,8 @@ class Coupling(Protocol):
         What solved it; with forms of its own where cells belong to the unknowns.
     traits
         What is known of its errors in time.
+    tangents
+        How many were assembled in the last solve of the state itself.
 
     Examples
     --------
@@ -160,6 +162,7 @@ class Coupling(Protocol):
     equilibrium: Equilibrium
     newton: GuardedNewton
     traits: Traits
+    tangents: int
 
     @property
     def better(self) -> UnitCell | None:

@@ -11,12 +11,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
+from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.fem import assembly
@@ -181,7 +182,8 @@ class Homeostasis:
         Passes to the limit with Aitken's factor, each in equilibrium, while the change that they make falls.
         """
         state, factor = self.state, 1.0
-        coupling: Any = self.stepper.coupling
+        coupling = self.stepper.coupling
+        assert isinstance(coupling, Staggered)
         changes = self._to_the_limit(time, work.residual)
         for _ in range(TAIL_PASSES):
             left = self._size(changes)

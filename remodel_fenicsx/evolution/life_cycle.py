@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 from remodel_fenicsx.solver.continuation import Work
 
 if TYPE_CHECKING:
+    from remodel_fenicsx.model.energy import Tissue
     from remodel_fenicsx.evolution.stepper import Stepper, Watcher
     from remodel_fenicsx.scene.scene import Scene
 
 Array = NDArray[np.float64]
+
+Values: TypeAlias = Any  # type: ignore[explicit-any]
+"""Values of something that remodels, at all points, in the form that its class chooses."""
 
 
 class Remodels:
@@ -39,6 +43,14 @@ class Remodels:
         The tissue with what it brings.
     watchers
         Make watchers of its own, or None, of a scene and a stepper.
+
+    Examples
+    --------
+    demos/extensions/decaying_collagen.py has a whole one. Of a simulation:
+
+    >>> from remodel_fenicsx import Simulation, preset_scene
+    >>> [part.name for part in Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.remodels]
+    ['cells']
     """
 
     name = ""
@@ -47,7 +59,7 @@ class Remodels:
     slowest: float = 0.0
     fastest: float = 0.0
     depends_on_path = False
-    tissue: Any = None
+    tissue: Tissue | None = None
     watchers: Sequence[Callable[[Scene, Stepper], Watcher | None]] = ()
 
     def begin_with(self, values: Callable[[str], Array]) -> None:
@@ -72,28 +84,28 @@ class Remodels:
         """Free the objects that PETSc has made."""
 
     # ------------------------------------------------------------ time discretisation error
-    def row(self) -> object:
+    def row(self) -> Values:
         """Return the values of the solved state."""
 
-    def better(self) -> object:
+    def better(self) -> Values:
         """Return, after a step, values by a better rule; None where there are none."""
 
-    def set(self, values: Any) -> None:
+    def set(self, values: Values) -> None:
         """Replace the values at all points."""
 
-    def as_components(self, values: Any) -> Array:
+    def as_components(self, values: Values) -> Array:
         """Return values as components."""
         return np.asarray(values)
 
-    def moved(self, values: Any, change: Array) -> object:
+    def moved(self, values: Values, change: Array) -> Values:
         """Return values after a change of their components."""
         return values
 
-    def passed(self, values: Any, time: float, residual: float) -> object:
+    def passed(self, values: Values, time: float, residual: float) -> Values:
         """Return what the present state makes of values up to a time."""
         return values
 
-    def apart(self, values: Any, other: Any) -> float:
+    def apart(self, values: Values, other: Values) -> float:
         """Return a distance of two values over the body, degrees."""
         return 0.0
 

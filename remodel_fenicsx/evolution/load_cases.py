@@ -11,7 +11,7 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, Watcher
 from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.continuation import Work
@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from dolfinx.fem import Function
 
 
-class FurtherCase:
+class FurtherCase(LoadCaseSolver):
     """Hold a further load case: it is solved after the first one, and drives the same cells."""
+
+    coupling: Staggered
 
     def __init__(
         self,
@@ -49,7 +51,6 @@ class FurtherCase:
         return self.remodeling.drive(self.coupling.residual)
 
     def watched(self, watcher: Watcher) -> Watcher:
-        """Return a watcher of the stepper that sees each step as it is here."""
         return FurtherCaseWatcher(self, watcher)
 
     def seen(self, step: Step) -> Step:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import ufl
+from dolfinx.fem import Function
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -25,9 +25,6 @@ from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state import Numbers, State, stress_rounding
-
-if TYPE_CHECKING:
-    from dolfinx.fem import Function
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -87,7 +84,7 @@ class RemodelingPass(Remodels):
         tensor = ufl.as_ufl(self.driver.tensor(F, self.stresses.ufl))
         self._expression = jit.expression(tensor, self.quadrature.points)
         self._known: Remembered[Array] = Remembered(state.comm, tensor)
-        self._target: Any = self.law.target
+        self._target = self.law.target
         if self._target is tensor_target and not settings.has_set_point and not in_numpy():
             from remodel_fenicsx.kernels.tensor import TensorKernels
 
@@ -105,9 +102,9 @@ class RemodelingPass(Remodels):
 
     def set_kappa(self, kappa: float | Function) -> None:
         """A number, or a DG0 Function."""
-        self.kappa: Any = kappa
-        self.slowest = self.fastest = kappa
-        if isinstance(kappa, Real):
+        if not isinstance(kappa, Function):
+            self.kappa: Array | float = kappa
+            self.slowest = self.fastest = kappa
             return
         at_points = point_values(coefficient(self.quadrature.mesh, "kappa", kappa), self.quadrature)
         self.fastest = self.quadrature.maximum(at_points)
@@ -179,7 +176,7 @@ class RemodelingPass(Remodels):
                 log.warning(LOOSE_SOLVER, unbalanced, typical, most)
         noise = Noise(rounded + min(unbalanced, most), rounding)
         if self.law.target is not None and typical > self._numbers["stress"]:
-            self._numbers["stress"], self._numbers["floor"] = typical, floor_above(*noise)
+            self._numbers["stress"], self._numbers["floor"] = typical, float(floor_above(*noise))
         return noise
 
     def weakness(self) -> float:
@@ -211,6 +208,7 @@ class RemodelingPass(Remodels):
 
     def target(self, residual: float = 0.0) -> Target:
         """What the structure tensor tends to in the present state; of laws that have one."""
+        assert self._target is not None
         if self._averages_targets:
             return mean_target([self._target(drive) for drive in self._drives(residual)], self.state.weights)
         return self._target(self.drive(residual))

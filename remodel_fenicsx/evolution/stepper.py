@@ -10,12 +10,11 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.evolution.coupling import Coupling, Maker
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
@@ -35,11 +34,6 @@ if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
 log = logging.getLogger(__name__)
-
-BESIDE: dict[str, Callable[[State, Tissue, Remodeling], Remodels] | str] = {
-    "turnover": "remodel_fenicsx.evolution.turnover:TurnoverPass",
-}
-"""What remodels beside the cells, by the table of `[remodeling]` that switches it on; made of state and tissue."""
 
 SLOWNESS = 5  # steps between two looks of warnings, each of which costs up to a third of a step
 
@@ -195,7 +189,7 @@ class WarnsOnce(Watcher):
     initial: ClassVar[Mapping[str, float]] = {}
     level = logging.WARNING
 
-    def __init__(self, stepper: Stepper):
+    def __init__(self, stepper: LoadCaseSolver):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature = stepper.state.cells.quadrature
         self._numbers = Numbers(self.state, self.name, {"said": 0} | dict(self.initial))
@@ -257,7 +251,32 @@ class WarnsOnce(Watcher):
         step.findings.append((self.level, f"{step.moment}: {text}"))
 
 
-class Stepper:
+class LoadCaseSolver:
+    """A state with what solves it: that of a stepper, or of a further load case, which has the same cells.
+
+    Attributes
+    ----------
+    state, tissue, remodeling, coupling
+        The state, its tissue, what makes its drive, and what solves it.
+    load_values
+        Function of time: magnitudes of all loads.
+    each_case
+        This one and further load cases.
+    """
+
+    state: State
+    tissue: Tissue
+    remodeling: RemodelingPass
+    coupling: Coupling
+    load_values: Callable[[float], LoadValues]
+    each_case: list[LoadCaseSolver]
+
+    def watched(self, watcher: Watcher) -> Watcher:
+        """Return a watcher of the stepper that sees each step as it is here."""
+        return watcher
+
+
+class Stepper(LoadCaseSolver):
     """Advances a state in time; a step is all or nothing.
 
     Parameters
@@ -301,13 +320,12 @@ class Stepper:
     ):
         self.state, self.load_values, self._solver = state, load_values, solver
         beside: list[Remodels] = []
-        for name, maker in BESIDE.items():
-            if getattr(remodeling, name).is_on:
-                beside.append(resolved(maker)(state, tissue, remodeling))
-                tissue = beside[-1].tissue
+        for kind in remodeling.beside:
+            beside.append(kind.make(state, tissue, remodeling))
+            tissue = beside[-1].tissue or tissue
         self.tissue = state.parameters(tissue).tissue
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, beside)
-        self.each_case: list[Any] = [self]  # whose states have these cells: this one, and further load cases
+        self.each_case = [self]
         # cells that never change are coupled to nothing
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         if beside and name != remodeling.coupling and state.comm.rank == 0:
@@ -318,7 +336,7 @@ class Stepper:
                 remodeling.coupling,
             )
         make = coupling or COUPLINGS[name].make
-        self.coupling: Coupling = make(state, self.tissue, self.remodeling, solver)
+        self.coupling = make(state, self.tissue, self.remodeling, solver)
         self._closed = False
 
     @property
@@ -326,7 +344,7 @@ class Stepper:
         """What remodels: the cells, and what is beside them."""
         return [self.remodeling, *self.remodeling.beside]
 
-    def part(self, name: str) -> Any:
+    def part(self, name: str) -> Any:  # type: ignore[explicit-any]  # the name tells the class
         """Return what remodels under this name; None where nothing has it."""
         return next((part for part in self.remodels if part.name == name), None)
 
@@ -463,6 +481,16 @@ class Stepper:
         """Free PETSc's objects and options; the state stays, and takes no further step."""
         self._closed = True
         self.coupling.close()
+
+
+class Way(Protocol):
+    """A way through time."""
+
+    def remaining(self) -> list[float]:
+        """Return the times of the steps that are left, as far as they are known."""
+
+    def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
+        """Yield the committed steps from the present state to the end."""
 
 
 class FixedSteps:

@@ -8,13 +8,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.evolution.life_cycle import Remodels
-from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
+from remodel_fenicsx.evolution.life_cycle import Remodels, Values
+from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, Watcher
 from remodel_fenicsx.model.tensors import largest_change_of_length
 from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.solver.attempts import SHORTER_STEP, attempted, say
@@ -40,7 +39,7 @@ class Estimate:
     row: float
 
 
-Values = Sequence[Any]  # of all that remodels, each in a form of its own (`life_cycle.Remodels`)
+AllValues = Sequence[Values]  # of all that remodels, in its order
 
 
 class TimeError:
@@ -81,11 +80,11 @@ class TimeError:
         step.time_error = found.row
         return found
 
-    def _better(self, part: Remodels) -> object:
+    def _better(self, part: Remodels) -> Values:
         return self.stepper.coupling.better if part is self.stepper.remodeling else part.better()
 
     # ------------------------------------------------------------ rows that lag behind
-    def _lag(self, step: Step, rows: Values, betters: Values, duration: float) -> float:
+    def _lag(self, step: Step, rows: AllValues, betters: AllValues, duration: float) -> float:
         """Measure the distance to what a pass makes with the stress of a body that has remodeled so."""
         known, angle = betters, self._apart(rows, betters)
         with self.state.tentative():
@@ -100,7 +99,7 @@ class TimeError:
             last.push((part.as_components(better) - part.as_components(row)).ravel())
         return max(angle, strain)
 
-    def _expected(self, rows: Values, betters: Values, duration: float) -> Values:
+    def _expected(self, rows: AllValues, betters: AllValues, duration: float) -> AllValues:
         """Return what the last error lets expect; at first the better ones."""
         if not self._last[0].known:
             return betters
@@ -108,7 +107,7 @@ class TimeError:
         return [part.moved(row, longer * last.values[0].reshape(-1, part.components)) for part, last, row in parts]
 
     # ------------------------------------------------------------ errors that add up
-    def _added_up(self, step: Step, rows: Values, betters: Values, duration: float) -> Estimate:
+    def _added_up(self, step: Step, rows: AllValues, betters: AllValues, duration: float) -> Estimate:
         fading, numbers, strain = self._fading(step, rows, duration), self._numbers, 0.0
         answer, ends, left = self._answer(fading, duration), [], []
         if any(better is not None for better in betters):
@@ -124,7 +123,7 @@ class TimeError:
             left.append(numbers[name])
         return Estimate(answer * max(ends), max(left))
 
-    def _fading(self, step: Step, rows: Values, duration: float) -> float:
+    def _fading(self, step: Step, rows: AllValues, duration: float) -> float:
         """Return the rate at which errors fade: that at which all slows down while loads are held."""
         numbers, speed, shape = self._numbers, 0.0, self.quadrature.shape
         before, fading = numbers["speed"], numbers["fading"]
@@ -163,11 +162,11 @@ class TimeError:
         )
 
     # ------------------------------------------------------------ distances
-    def _apart(self, rows: Values, betters: Values) -> float:
+    def _apart(self, rows: AllValues, betters: AllValues) -> float:
         """Return the largest distance of what remodels, degrees."""
         return max(part.apart(*pair) for part, *pair in zip(self.remodels, rows, betters, strict=True))
 
-    def _strain(self, step: Step, remodeled: Values) -> tuple[float, bool]:
+    def _strain(self, step: Step, remodeled: AllValues) -> tuple[float, bool]:
         """Let the body answer what has remodeled: the largest change of a length, and whether that is a state."""
         cases = self.stepper.each_case
         before = [case.state.elastic_gradient() for case in cases]
@@ -177,7 +176,7 @@ class TimeError:
         found = [self._answered(*parts) for parts in zip(cases, before, tangents, strict=True)]
         return max(strain for strain, _ in found), all(admissible for _, admissible in found)
 
-    def _answered(self, case: Any, before: Array, tangents: int) -> tuple[float, bool]:
+    def _answered(self, case: LoadCaseSolver, before: Array, tangents: int) -> tuple[float, bool]:
         """Of one load case; `before`: its F_e."""
         state, equilibrium = case.state, case.coupling.equilibrium
         state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
@@ -187,7 +186,7 @@ class TimeError:
         return float(np.degrees(self.quadrature.maximum(changes))), admissible
 
 
-def _known(betters: Values, rows: Values) -> Values:
+def _known(betters: AllValues, rows: AllValues) -> AllValues:
     """Better values where there are any, those of the row elsewhere."""
     return [row if better is None else better for better, row in zip(betters, rows, strict=True)]
 
@@ -256,12 +255,13 @@ class StepControl:
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """From where the state is to the last stop; what is yielded is committed."""
         self.stepper.start(watchers)
-        while (stop := self._next_stop()) is not None:
-            yield self._accepted(stop, watchers)
+        while stops := self.remaining():
+            yield self._accepted(stops[0], watchers)
 
-    def _next_stop(self) -> float | None:
+    def remaining(self) -> list[float]:
+        """Return the stops that are left."""
         time = self.state.time
-        return next((stop for stop in self.stops if stop > time and not same_time(stop, time)), None)
+        return [stop for stop in self.stops if stop > time and not same_time(stop, time)]
 
     def _accepted(self, stop: float, watchers: Sequence[Watcher]) -> Step:
         """The next step, shortened until it is accepted."""
@@ -342,8 +342,7 @@ class StepControl:
 
     def _fastest_time(self) -> float:
         """In which chains may turn by `FASTEST` degrees."""
-        remodeling, time, fastest = self.stepper.remodeling, self.state.time, self.stepper.fastest
-        after = next(stop for stop in self.stops if stop > time and not same_time(stop, time))
+        remodeling, fastest, after = self.stepper.remodeling, self.stepper.fastest, self.remaining()[0]
         before = max([0.0, *(stop for stop in self.stops if stop < after)])
         if remodeling.law.remodels and not remodeling.law.asks_kappa:
             return min(after - before, remodeling.settings.rotation_time)

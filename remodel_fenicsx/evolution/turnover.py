@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
+from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.axes import GROWTH
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TurnoverRates
@@ -42,7 +43,8 @@ class Growth:
     def __init__(self, state: State, settings: Turnover):
         self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
         self.start = settings.start  # a way to rest says where it is, where that is asked for
-        kinematics: Any = state.kinematics
+        kinematics = state.kinematics
+        assert isinstance(kinematics, NaturalConfiguration)
         self._gradient = self.quadrature.values(kinematics.gradient, (3, 3))
         self._initial = self.quadrature.values(kinematics.initial, (3, 3))
         normal = state.cells.local_axes.axes[..., 2, :]
@@ -301,6 +303,7 @@ class GrowthWithoutRest(WarnsOnce):
     def __init__(self, stepper: Stepper, held_from: float):
         super().__init__(stepper)
         self.held_from, self._slowing = held_from, Slowing(self._numbers)
+        self.turnover = stepper.part(TurnoverPass.name)
 
     @classmethod
     def of(cls, scene: Scene, stepper: Stepper) -> GrowthWithoutRest:
@@ -311,8 +314,8 @@ class GrowthWithoutRest(WarnsOnce):
 
     def look(self, step: Step) -> str:
         """At the rates, while loads are held."""
-        turnover, elapsed = self.stepper.part("turnover"), step.time - self.held_from
-        rates, period = turnover.fastest_changes(), turnover.settings.time
+        elapsed, period = step.time - self.held_from, self.turnover.settings.time
+        rates = self.turnover.fastest_changes()
         rate = self.quadrature.maximum(rates)
         goes_on = self._slowing.goes_on(elapsed, rate)
         if not (goes_on and step.is_last and elapsed >= EARLY * period and rate * period >= FAR_FROM_REST):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,7 +194,7 @@ def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:
     return None
 
 
-def _row(name: str, fine: Any, what: str) -> str:
+def _row(name: str, fine: NDArray[np.bool_] | np.bool_, what: str) -> str:
     return f"{name} of row {int(np.argmin(fine)) + 1} {what}"
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.tensors import squared_stretch
 
 Array = NDArray[np.float64]
@@ -37,15 +38,15 @@ class UnitCell(NamedTuple):
     array([1., 2.])
     """
 
-    dimensions: Any
-    axes: Any
-    weight: Any = 1.0
+    dimensions: UflOrArray
+    axes: UflOrArray
+    weight: UflOrArray = 1.0
 
     def copy(self) -> UnitCell:
         """Arrays of its own."""
         return UnitCell(self.dimensions.copy(), self.axes.copy(), self.weight)
 
-    def squared_stretches(self, deformation_gradient: Any) -> list[Any]:
+    def squared_stretches(self, deformation_gradient: UflOrArray) -> list[UflOrArray]:
         """I_I = n_I . C n_I, the squared stretches along the three axes (eq. 5).
 
         Parameters

@@ -9,19 +9,31 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self, TypeAlias, TypeVar
+
+
+UflOrArray: TypeAlias = Any  # type: ignore[explicit-any]
+"""A UFL expression, an array over points or a number: what the formulas of the model take alike. UFL has no types."""
+
+Result = TypeVar("Result", covariant=True)
+
+
+class Formula(Protocol[Result]):
+    """A function of such values; parts with parameters of their own take these too, by keyword."""
+
+    def __call__(self, *values: UflOrArray, **parameters: UflOrArray) -> Result: ...
 
 
 BOLTZMANN_CONSTANT = 1.381e-23  # J/K, as printed in the paper
 
 
-def wormlike_energy(end_to_end_length: Any, contour_length: Any) -> Any:
+def wormlike_energy(end_to_end_length: UflOrArray, contour_length: UflOrArray) -> UflOrArray:
     """Energy of a wormlike chain over k theta / A_p (eq. 1)."""
     x = end_to_end_length / contour_length
     return contour_length / 4 * (2 * x**2 + 1 / (1 - x) - x)
 
 
-def wormlike_stiffness(end_to_end_length: Any, contour_length: Any) -> Any:
+def wormlike_stiffness(end_to_end_length: UflOrArray, contour_length: UflOrArray) -> UflOrArray:
     """Secant stiffness g(r) = 1/L + 1/(4 r (1-r/L)^2) - 1/(4 r) of eq. (7): d(wormlike_energy)/dr = g r."""
     # Written with the pole at r = 0 cancelled, so that short chains lose no digits.
     x = end_to_end_length / contour_length
@@ -54,7 +66,7 @@ class Parameter:
 
 
 NO_PARAMETERS: Mapping[str, Parameter] = MappingProxyType({})
-NO_VALUES: Mapping[str, Any] = MappingProxyType({})
+NO_VALUES: Mapping[str, UflOrArray] = MappingProxyType({})
 
 
 class WithParameters:
@@ -63,7 +75,7 @@ class WithParameters:
     functions: ClassVar[tuple[str, ...]]
     parameters: Mapping[str, Parameter]
 
-    def of(self, values: Mapping[str, Any]) -> Self:
+    def of(self, values: Mapping[str, UflOrArray]) -> Self:
         """The part with these values of its parameters: numbers, arrays or UFL.
 
         Parameters
@@ -111,14 +123,20 @@ class Chain(WithParameters):
     >>> del CHAINS["spring"]
     """
 
-    energy: Callable[[Any, Any], Any]
-    stiffness: Callable[[Any, Any], Any]
+    energy: Callable[[UflOrArray, UflOrArray], UflOrArray]
+    stiffness: Callable[[UflOrArray, UflOrArray], UflOrArray]
     locks: bool = True
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
-    values: Mapping[str, Any] = field(default=NO_VALUES, compare=False)
+    values: Mapping[str, UflOrArray] = field(default=NO_VALUES, compare=False)
     functions = ("energy", "stiffness")
 
-    def force(self, end_to_end_length: Any, contour_length: Any, persistence_length: Any, k_theta: Any = 1.0) -> Any:
+    def force(
+        self,
+        end_to_end_length: UflOrArray,
+        contour_length: UflOrArray,
+        persistence_length: UflOrArray,
+        k_theta: UflOrArray = 1.0,
+    ) -> UflOrArray:
         """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy (eq. 2).
 
         Parameters

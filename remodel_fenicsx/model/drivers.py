@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model import tensors
+from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.energy import Stresses
 
 ufl = Late("ufl")
@@ -46,13 +46,13 @@ class Driver:
     >>> del DRIVERS["kirchhoff"]
     """
 
-    tensor: Callable[[Any, Stresses], Any]
+    tensor: Callable[[UflOrArray, Stresses], UflOrArray]
     material: bool
     is_stress: bool = True
     over_corrects: bool = False
 
 
-def finger_tensor(deformation_gradient: Any, stresses: Stresses) -> Any:
+def finger_tensor(deformation_gradient: UflOrArray, stresses: Stresses) -> UflOrArray:
     """b = F F^T (UFL)."""
     return ufl.dot(deformation_gradient, deformation_gradient.T)
 

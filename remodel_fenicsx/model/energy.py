@@ -14,7 +14,7 @@ import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,21 @@ from numpy.typing import NDArray
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.chains import CHAINS, Chain, NO_PARAMETERS, NO_VALUES, Parameter, WithParameters
+from remodel_fenicsx.model.chains import (
+    CHAINS,
+    NO_PARAMETERS,
+    NO_VALUES,
+    Chain,
+    Formula,
+    Parameter,
+    UflOrArray,
+    WithParameters,
+)
 from remodel_fenicsx.model.tensors import component, det, is_array, ln, sqrt, squared_norm
 
 ufl = Late("ufl")
 Array = NDArray[np.float64]
-Term = Callable[..., Any]  # of F or J, lambda and mu; those of a matrix with parameters of its own take them too
+Term = Formula[UflOrArray]  # of F or J, lambda and mu
 TURNED_OVER = ("content", "natural_length")  # what turnover changes at every point
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")  # of every tissue
 
@@ -71,7 +80,7 @@ class Matrix:
         self.volumetric, self.others = volumetric, others
         self.parameters, self.values = parameters, NO_VALUES
 
-    def of(self, values: Mapping[str, Any]) -> Matrix:
+    def of(self, values: Mapping[str, UflOrArray]) -> Matrix:
         """The matrix with these values of its parameters.
 
         Parameters
@@ -84,12 +93,14 @@ class Matrix:
         found.others = tuple(partial(term, **values) for term in self.others)
         return found
 
-    def __call__(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+    def __call__(self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray) -> UflOrArray:
         """The whole energy."""
         volumetric = self.volumetric(det(deformation_gradient), lame_lambda, lame_mu)
         return sum((term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric)
 
-    def distortional(self, deformation_gradient: Any, lame_lambda: Any, lame_mu: Any) -> Any:
+    def distortional(
+        self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray
+    ) -> UflOrArray:
         """All but the volumetric part.
 
         Parameters
@@ -103,7 +114,9 @@ class Matrix:
         return sum(rest, first)
 
 
-def logarithmic_dilatation(jacobian: Any, lame_lambda: Any, lame_mu: Any, **own: Any) -> Any:
+def logarithmic_dilatation(
+    jacobian: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray, **own: UflOrArray
+) -> UflOrArray:
     """U = lambda/2 ln^2 J, the volumetric part of eq. (4a): its Kirchhoff pressure is lambda ln J."""
     return lame_lambda / 2 * ln(jacobian) ** 2
 
@@ -123,7 +136,7 @@ def mixed(matrices: Sequence[Matrix]) -> Matrix:
     numbers = {name: number for matrix in matrices for name, number in matrix.parameters.items()}
     numbers |= {share: Parameter(0.0, "Where it is this one: 1, else 0.") for share in shares}
 
-    def parts(values: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
+    def parts(values: Mapping[str, UflOrArray]) -> Iterator[tuple[UflOrArray, UflOrArray]]:
         for share, matrix in zip(shares, matrices, strict=True):
             yield values[share], matrix.of({name: values[name] for name in matrix.parameters})
 
@@ -146,7 +159,7 @@ that formulations other than "displacement" can take are a `Matrix`."""
 # "The consistent variant"). `length` is the simplest function of A; it has no shear stiffness from isotropic cells.
 
 
-def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+def squared_end_to_end_length(deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
     """r^2 = sum_I l_I^2 n_I . C n_I, the squared end-to-end length of the chains (paper, eq. 5).
 
     Parameters
@@ -176,7 +189,7 @@ def squared_end_to_end_length(deformation_gradient: Any, cells: Sequence[UnitCel
     )
 
 
-def axes_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
+def axes_sum(deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
     """M = sum_I l_I^2 ln(n_I . C n_I), of which the paper's repulsive energy is made (eq. 4c).
 
     Parameters
@@ -210,13 +223,15 @@ def axes_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_le
     )
 
 
-def length_sum(deformation_gradient: Any, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
+def length_sum(
+    deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to_end_length: UflOrArray
+) -> UflOrArray:
     """M = r0^2 ln(r^2 / r0^2), r^2 = A : C; UFL or arrays."""
     squared = squared_end_to_end_length(deformation_gradient, cells)
     return end_to_end_length**2 * ln(squared / end_to_end_length**2)
 
 
-def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Any:
+def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
     """M = A : ln C; arrays. Of complex numbers, to first order in the imaginary part."""
     C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, whole_structure_tensor(cells)
     found = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
@@ -270,10 +285,10 @@ class Repulsion(WithParameters):
     >>> del REPULSIONS["squared"]
     """
 
-    sum: Callable[[Any, Sequence[UnitCell], Any], Any]
-    derivatives: Callable[..., tuple[Array, Array | None]] | None = None
+    sum: Callable[[UflOrArray, Sequence[UnitCell], UflOrArray], UflOrArray]
+    derivatives: Formula[tuple[Array, Array | None]] | None = None
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
-    values: Mapping[str, Any] = field(default=NO_VALUES, compare=False)
+    values: Mapping[str, UflOrArray] = field(default=NO_VALUES, compare=False)
     functions = ("sum", "derivatives")
 
 
@@ -309,11 +324,11 @@ class Stresses(NamedTuple):
     ('sigma', 'S')
     """
 
-    first_piola_kirchhoff: Any
-    second_piola_kirchhoff: Any
-    cauchy: Any
+    first_piola_kirchhoff: UflOrArray
+    second_piola_kirchhoff: UflOrArray
+    cauchy: UflOrArray
 
-    def plus(self, deformation_gradient: Any, second_piola_kirchhoff: Any) -> Stresses:
+    def plus(self, deformation_gradient: UflOrArray, second_piola_kirchhoff: UflOrArray) -> Stresses:
         """With what `Tissue.strain_energy` leaves out of UFL, a second Piola-Kirchhoff stress.
 
         Parameters
@@ -372,34 +387,34 @@ class Tissue:
     0.4364
     """
 
-    lame_lambda: Any
-    lame_mu: Any
-    network_modulus: Any
-    contour_length: Any
-    end_to_end_length: Any
+    lame_lambda: UflOrArray
+    lame_mu: UflOrArray
+    network_modulus: UflOrArray
+    contour_length: UflOrArray
+    end_to_end_length: UflOrArray
     chain: Chain | None = CHAINS["wormlike"]
     matrix: Term = neo_hookean
     repulsion: Repulsion = REPULSIONS["axes"]
-    content: Any = None
-    natural_length: Any = None
+    content: UflOrArray = None
+    natural_length: UflOrArray = None
 
     @property
-    def locking_length(self) -> Any:
+    def locking_length(self) -> UflOrArray:
         """Length at which a chain locks, rho L, in link lengths; None where nothing locks."""
         if self.chain is None or not self.chain.locks:
             return None
         return self.contour_length if self.natural_length is None else self.natural_length * self.contour_length
 
     @property
-    def present_modulus(self) -> Any:
+    def present_modulus(self) -> UflOrArray:
         """m c: the network's modulus with the chains that there are."""
         return self.network_modulus if self.content is None else self.content * self.network_modulus
 
-    def relative(self, length: Any) -> Any:
+    def relative(self, length: UflOrArray) -> UflOrArray:
         """r/rho."""
         return length if self.natural_length is None else length / self.natural_length
 
-    def stiffness(self, end_to_end_length: Any) -> Any:
+    def stiffness(self, end_to_end_length: UflOrArray) -> UflOrArray:
         """A stress per strain of matrix and network, where chains have a length r; times eps the rounding of a stress.
 
         lambda + 2 mu + c (r^2 d(g r)/dr + g(r0) r0^2): near the contour length the chains' force changes by much more
@@ -420,7 +435,7 @@ class Tissue:
         return matrix + self.present_modulus * (r**2 * slope + g(r0, L) * r0**2)
 
     @property
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, UflOrArray]:
         """Every parameter by its name: of all tissues, of turnover where there is any, and those that parts have."""
         turned_over = [name for name in TURNED_OVER if getattr(self, name) is not None]
         found = {name: getattr(self, name) for name in (*PARAMETERS, *turned_over)}
@@ -429,12 +444,12 @@ class Tissue:
         return found
 
     @property
-    def _own_parameters(self) -> dict[str, Mapping[str, Any]]:
+    def _own_parameters(self) -> dict[str, Mapping[str, UflOrArray]]:
         """Of chain, matrix and repulsion, where they have any."""
         values = {name: getattr(getattr(self, name), "values", None) for name in ("chain", "matrix", "repulsion")}
         return {name: own for name, own in values.items() if own}
 
-    def map(self, function: Callable[[str, Any], Any]) -> Tissue:
+    def map(self, function: Callable[[str, UflOrArray], UflOrArray]) -> Tissue:
         """The same tissue with function(name, value) for every parameter."""
         found = {name: function(name, value) for name, value in self.parameters.items()}
         own = {
@@ -450,7 +465,7 @@ class Tissue:
         found, again = (self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, turned))
         return bool(np.isclose(found, again, rtol=1e-9))
 
-    def strain_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+    def strain_energy(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
         """W per reference volume (eqs. 3 and 4 with errata 1 and 2), in the unit of the Lame constants.
 
         Parameters
@@ -466,12 +481,12 @@ class Tissue:
         energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
 
-    def distortional_energy(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+    def distortional_energy(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
         """W without the volumetric part of the matrix; as `strain_energy`, which it makes together with that part."""
         energy = self._parts().distortional(deformation_gradient, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
 
-    def volumetric_energy(self, jacobian: Any) -> Any:
+    def volumetric_energy(self, jacobian: UflOrArray) -> UflOrArray:
         """The volumetric part of the matrix, U(J).
 
         Parameters
@@ -488,7 +503,9 @@ class Tissue:
             "the volumetric part of this matrix energy is not told apart: it must be a remodel_fenicsx.extend.Matrix"
         )
 
-    def _with_network(self, energy: Any, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Any:
+    def _with_network(
+        self, energy: UflOrArray, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
+    ) -> UflOrArray:
         """An energy plus that of the chains, where there are any."""
         if self.chain is None:
             return energy
@@ -501,12 +518,12 @@ class Tissue:
         return energy + self.present_modulus * (chains + repulsion)
 
     @property
-    def repulsion_modulus(self) -> Any:
+    def repulsion_modulus(self) -> UflOrArray:
         """m c g(r0): W_rep = -m c g(r0) M / 2."""
         assert self.chain is not None
         return self.present_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
 
-    def stresses(self, deformation_gradient: Any, cells: Sequence[UnitCell]) -> Stresses:
+    def stresses(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> Stresses:
         """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL.
 
         Parameters
@@ -519,13 +536,15 @@ class Tissue:
         F = ufl.variable(deformation_gradient)
         return _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
 
-    def stresses_of_parts(self, deformation_gradient: Any, cells: Sequence[UnitCell], jacobian: Any) -> Stresses:
+    def stresses_of_parts(
+        self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell], jacobian: UflOrArray
+    ) -> Stresses:
         """The same with U at another J than det F: P = d(W - U)/dF + J U'(J) F^-T, J U' the Kirchhoff pressure; UFL."""
         F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
         pressure = J * ufl.diff(self.volumetric_energy(J), J)
         return _stresses(F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T)
 
-    def energy_increment(self, deformation_gradient: Any, old: UnitCell, new: UnitCell) -> Any:
+    def energy_increment(self, deformation_gradient: UflOrArray, old: UnitCell, new: UnitCell) -> UflOrArray:
         """First-order change of W at frozen F when the cells become others, per reference volume; arrays.
 
         W depends on the cells through r^2 = A : C and M = sum_I l_I^2 ln I_I only:
@@ -550,7 +569,9 @@ class Tissue:
         repulsion = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
         return chains - self.repulsion_modulus / 2 * repulsion
 
-    def turnover_increment(self, deformation_gradient: Any, cell: UnitCell, content: Any, natural_length: Any) -> Any:
+    def turnover_increment(
+        self, deformation_gradient: UflOrArray, cell: UnitCell, content: UflOrArray, natural_length: UflOrArray
+    ) -> UflOrArray:
         """First-order change of W at frozen F and cells when ln m and ln rho change, per reference volume; arrays.
 
         dW = W_net d ln m - m c g(r/rho) (r/rho)^2 d ln rho.
@@ -569,6 +590,6 @@ class Tissue:
         return self._with_network(0.0, F, cells) * content - tension * natural_length
 
 
-def _stresses(F: Any, first: Any) -> Stresses:
+def _stresses(F: UflOrArray, first: UflOrArray) -> Stresses:
     """All of them from P; UFL."""
     return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))

@@ -10,23 +10,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.model import spectral, tensor_law
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.chains import NO_PARAMETERS, NO_VALUES, Parameter
+from remodel_fenicsx.model.chains import NO_PARAMETERS, NO_VALUES, Formula, Parameter, UflOrArray
 from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target
 
 Array = NDArray[np.float64]
-RankedFunction = Callable[[Array, Array, Array, Any, float, float], Array]
+Tension = Callable[[UflOrArray], UflOrArray]
+RankedFunction = Callable[[Array, Array, Array, Array | float, float, float], Array]
 Weights = Sequence[float]
 
 COMPLEX_STEP = 1e-30  # its square vanishes beside 1: derivatives are exact to rounding
+
+
+class PrincipalKernels(Protocol):
+    """What computes principal directions: `spectral` itself, or its functions in C."""
+
+    @property
+    def principal(self) -> spectral.Pairing: ...
+
+    @property
+    def positive_direction(self) -> Formula[tuple[Array, NDArray[np.bool_]]]: ...
 
 
 class Drive(NamedTuple):
@@ -86,7 +97,7 @@ class Drive(NamedTuple):
     kappa: Array | float
     pairing: spectral.Pairing = spectral.principal
     rotation_time: float = 40.0
-    kernels: Any = spectral
+    kernels: PrincipalKernels = spectral
     rounding: Array | float = 0.0
     exponent: float = 2.0
     least_tension: float = 0.0
@@ -183,7 +194,7 @@ class Law:
     over_corrects: bool = False
     takes_set_points: bool = False
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
-    speed: Callable[..., float] | None = None
+    speed: Formula[float] | None = None
 
 
 def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
@@ -269,17 +280,17 @@ def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
     return np.take_along_axis(framed, np.argsort(order, axis=1), axis=1)
 
 
-def explicit(l: Array, l0: Array, target: Array, kappa: Any, time_old: float, time_new: float) -> Array:
+def explicit(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
     """Eq. (11): l = l0 + (r0 e - l0)(1 - exp(-kappa t)), a function of the absolute time and the present target."""
     return l0 - (target - l0) * np.expm1(-kappa * time_new)
 
 
-def rate(l: Array, l0: Array, target: Array, kappa: Any, time_old: float, time_new: float) -> Array:
+def rate(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
     """Eq. (10): dl/dt = kappa (r0 e - l0) exp(-kappa t), integrated exactly over the step with e frozen."""
     return l - (target - l0) * np.exp(-kappa * time_old) * np.expm1(-kappa * (time_new - time_old))
 
 
-def relaxation(l: Array, l0: Array, target: Array, kappa: Any, time_old: float, time_new: float) -> Array:
+def relaxation(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
     """Autonomous form dl/dt = kappa (r0 e - l), integrated exactly over the step with e frozen."""
     return l - (target - l) * np.expm1(-kappa * (time_new - time_old))
 
@@ -436,13 +447,13 @@ def mean_target(targets: Sequence[Target], weights: Weights) -> Target:
     return Target(pulled / np.where(switch > 0.0, switch, 1.0)[:, None, None], switch)
 
 
-def _with(drive: Drive, tensor: Array, noise: Any, rounding: Any) -> Drive:
+def _with(drive: Drive, tensor: Array, noise: Array | float, rounding: Array | float) -> Drive:
     driver = replace(drive.driver, material=True)  # the tensor is in material space already
     return drive._replace(tensor=tensor, driver=driver, noise=noise, rounding=rounding)
 
 
-def _weighted(values: Sequence[Any], weights: Weights) -> Any:
-    return sum(weight * value for weight, value in zip(weights, values, strict=True))
+def _weighted(values: Sequence[Array | float], weights: Weights) -> Array:
+    return np.asarray(sum(weight * value for weight, value in zip(weights, values, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -484,7 +495,7 @@ class TurnoverRates(NamedTuple):
 class Followed(NamedTuple):
     """What amount and natural length follow: their rates, and the power of lambda beside g in it."""
 
-    rates: Callable[[TurnoverRule, Callable[[Any], Any], Any], TurnoverRates]
+    rates: Callable[[TurnoverRule, Tension, Array], TurnoverRates]
     power: int
 
 
@@ -496,7 +507,7 @@ class TurnoverRule(NamedTuple):
     gain: float
     followed: Followed
 
-    def rates(self, tissue: Tissue, stretch: Any) -> TurnoverRates:
+    def rates(self, tissue: Tissue, stretch: Array) -> TurnoverRates:
         """Where chains have a stretch lambda_e (n,)."""
         chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
@@ -510,7 +521,7 @@ class TurnoverRule(NamedTuple):
         """k a, which must be above 2 for a wall to come to rest, and the time in which it does so by a factor of e."""
         # The time of a small change near rest: E T/(k a - 2), E = d ln(g - g0/lambda^2)/d ln lambda at lambda_h, where
         # chains and repulsion act together. Of a tissue of numbers.
-        deposited: Any = self.deposition_stretch * (1.0 + 1j * COMPLEX_STEP)
+        deposited = self.deposition_stretch * (1.0 + 1j * COMPLEX_STEP)
         chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
         secant = chain.stiffness(deposited * r0, contour)
@@ -520,10 +531,10 @@ class TurnoverRule(NamedTuple):
         return self.gain * steep, stiff * self.time / (self.gain * steep - 2)
 
 
-def by_stress(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) -> TurnoverRates:
+def by_stress(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
     """Rates `cauchy`."""
 
-    def steepness(some: Any) -> Any:
+    def steepness(some: Array) -> Array:
         return 1.0 + np.log(tension(some * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
 
     steep = steepness(stretch)
@@ -533,7 +544,7 @@ def by_stress(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) -
     return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (steep * rule.time))
 
 
-def by_tension(rule: TurnoverRule, tension: Callable[[Any], Any], stretch: Any) -> TurnoverRates:
+def by_tension(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
     """Rates `tension`."""
     relative = tension(stretch) / tension(rule.deposition_stretch) - 1.0
     content = rule.gain / rule.time * np.clip(relative, -1.0, 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -114,7 +114,7 @@ class Closing(NamedTuple):
     panels: Panels
     radius: Array
     circumferential: float
-    axial: Any
+    axial: Array | float
 
     def natural_radius(self, radius: Array) -> Array:
         """R at r, both (...,)."""
@@ -251,7 +251,7 @@ def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | Non
     """Principal Cauchy stresses (..., 3) along stretches (..., 3), axes of the cells, and d sigma_i/d ln lambda_j."""
     one = np.eye(3).reshape(3, *(1,) * (stretches.ndim - 1), 3)
     near = stretches * np.exp(TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(one[:1]), one]))
-    ways: Any = np.exp(1j * COMPLEX_STEP * one)
+    ways = np.exp(1j * COMPLEX_STEP * one)
     slopes = np.imag(_energy(tissue, near * ways[:, None], dimensions)) / COMPLEX_STEP
     stresses, *others = np.moveaxis(slopes, 0, -1) / np.prod(near, axis=-1)[..., None]
     return stresses, np.stack([(other - stresses) / TANGENT_DIFFERENCE for other in others], axis=-1)
@@ -268,7 +268,7 @@ def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array
 
 def _check_complex(tissue: Tissue, stretches: Array, dimensions: Array | None) -> None:
     """Refuse an energy that is another function of complex numbers: as |x| is, for x where that is positive."""
-    way: Any = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])  # in which the volume, however stiff, stays
+    way = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])  # in which the volume, however stiff, stays
     of_complex = np.imag(_energy(tissue, stretches * np.exp(1j * COMPLEX_STEP * way), dimensions)) / COMPLEX_STEP
     ahead, still, behind = (_energy(tissue, stretches * np.exp(side * way), dimensions) for side in (1, 0, -1))
     slope, bend = (ahead - behind) / 2, np.abs(ahead + behind - 2 * still) + 1e-14 * np.abs(still)
@@ -301,7 +301,9 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
     knots = np.concatenate([edges[:1], np.repeat(edges, 2), edges[-1:]])
     spline = BSpline(knots, np.eye(len(knots) - 3), 2)
     functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]  # zero at the lumen
-    depth, steepness, inner, axial, k = rings.radius - edges[0], np.ones_like(rings.radius), edges[0], 1.0, 1.0
+    depth, steepness, inner = rings.radius - edges[0], np.ones_like(rings.radius), edges[0]
+    axial: Array | float = 1.0
+    k = 1.0
     if closed is not None:  # what opens, were the cells as they were
         inner, axial, k = closed.radius[0, 0], 1 / closed.axial, 1 / closed.circumferential
         depth = closed.natural_radius(rings.radius) - inner
@@ -342,5 +344,7 @@ def means_through(radius: Array, volumes: Array, values: Array, edges: Array) ->
     inside = np.cumsum(volumes[order]) - volumes[order] / 2
     bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
     ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
-    sums: list[Any] = [np.bincount(ring, volumes[order] * part[order]) for part in (np.ones_like(radius), *values.T)]
+    sums: list[Array] = [
+        np.bincount(ring, volumes[order] * part[order]).astype(np.float64) for part in (np.ones_like(radius), *values.T)
+    ]
     return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]

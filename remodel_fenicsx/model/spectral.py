@@ -5,11 +5,12 @@ between machines and between numbers of ranks. The axes enter the stress (erratu
 choice that the tensor itself does not make is made here by the previous axes.
 """
 
-from collections.abc import Callable
 from itertools import permutations
 
 import numpy as np
 import numpy.typing as npt
+
+from remodel_fenicsx.model.chains import Formula
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -100,7 +101,7 @@ def continued(
     return np.take_along_axis(values, rank, axis=1), np.take_along_axis(axes, rank[:, :, None], axis=1)
 
 
-Pairing = Callable[..., tuple[Array, Array]]
+Pairing = Formula[tuple[Array, Array]]
 
 PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": continued}
 """Which dimension of a cell belongs to which principal value: by rank, or by the axis that it continues."""

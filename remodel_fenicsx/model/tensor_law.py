@@ -8,7 +8,7 @@ it. For the driver `finger` D is C. E has trace one, so tr A stays r0^2. Pure fu
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ ABOVE_ROUNDING = 7000.0
 method sees a smooth function."""
 
 
-def floor_above(noise: Any, rounding: Any) -> Any:
+def floor_above(noise: Array | float, rounding: Array | float) -> Array | float:
     """Tension at which the switch is one half, where there is no compression."""
     # What the solver's tolerance leaves out of balance counts as it is: multiplied like the rounding, it would be
     # stress.

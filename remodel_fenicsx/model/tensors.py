@@ -17,12 +17,12 @@ is written here goes over into them without a difference of nearly equal numbers
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
+from remodel_fenicsx.model.chains import UflOrArray
 
 ufl = Late("ufl")
 Array = NDArray[np.float64]
@@ -40,12 +40,12 @@ loses eps / CLOSE, the series CLOSE^5."""
 # computed, without it.
 
 
-def is_array(value: Any) -> bool:
+def is_array(value: object) -> bool:
     """Whether a value is a number or an array, not UFL."""
     return isinstance(value, (np.ndarray, np.generic, float, int, complex))
 
 
-def ln(value: Any) -> Any:
+def ln(value: UflOrArray) -> UflOrArray:
     """Natural logarithm.
 
     Parameters
@@ -69,14 +69,14 @@ def ln(value: Any) -> Any:
     return ufl.ln(value)
 
 
-def sqrt(value: Any) -> Any:
+def sqrt(value: UflOrArray) -> UflOrArray:
     """Square root."""
     if is_array(value):
         return np.sqrt(value)
     return ufl.sqrt(value)
 
 
-def det(tensor: Any) -> Any:
+def det(tensor: UflOrArray) -> UflOrArray:
     """Determinant."""
     if is_array(tensor):  # np.linalg.det factorises each tensor by itself, which takes ten times as long
         (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(tensor, (-2, -1), (0, 1))
@@ -84,14 +84,14 @@ def det(tensor: Any) -> Any:
     return ufl.det(tensor)
 
 
-def squared_norm(tensor: Any) -> Any:
+def squared_norm(tensor: UflOrArray) -> UflOrArray:
     """A : A, the sum of the squares of all nine entries."""
     if is_array(tensor):
         return np.einsum("...ij,...ij->...", tensor, tensor)
     return ufl.inner(tensor, tensor)
 
 
-def squared_stretch(deformation_gradient: Any, directions: Any, row: int) -> Any:
+def squared_stretch(deformation_gradient: UflOrArray, directions: UflOrArray, row: int) -> UflOrArray:
     """n . C n of the unit vector n in a row of `directions` (..., 3, 3), C = F^T F."""
     if is_array(deformation_gradient):  # by component, three times as fast as np.einsum
         F, n = np.moveaxis(deformation_gradient, (-2, -1), (0, 1)), np.moveaxis(directions[..., row, :], -1, 0)
@@ -100,7 +100,7 @@ def squared_stretch(deformation_gradient: Any, directions: Any, row: int) -> Any
     return ufl.inner(fibre, fibre)
 
 
-def component(vector: Any, index: int) -> Any:
+def component(vector: UflOrArray, index: int) -> UflOrArray:
     """Component of a UFL vector, or of vectors in the last dimension of an array."""
     return vector[..., index] if is_array(vector) else vector[index]
 
@@ -214,7 +214,7 @@ def second_derivative(values: Array, components: Array) -> Array:
 # ---------------------------------------------------------------- deformation gradients
 
 
-def passes_through_zero(before: Any, after: Any) -> Any:
+def passes_through_zero(before: Array, after: Array) -> Flags:
     """Where det((1 - s) F + s G) is not positive for an s between 0 and 1."""
     # Both ends may be in order all the same, for two axes can turn at once. Exact: the determinant is a cubic in s.
     change = after - before
@@ -229,7 +229,7 @@ def passes_through_zero(before: Any, after: Any) -> Any:
     return lowest <= 1e-12 * np.max(at, axis=0)  # a double root by rounding
 
 
-def cofactor(tensors: Any) -> Any:
+def cofactor(tensors: Array) -> Array:
     """J F^-T of arrays (..., 3, 3): each row is the cross product of the two others."""
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(tensors, (-2, -1), (0, 1)).copy()  # nine arrays without gaps
     entries = [e * i - f * h, f * g - d * i, d * h - e * g, h * c - i * b, i * a - g * c, g * b - h * a,
@@ -237,7 +237,7 @@ def cofactor(tensors: Any) -> Any:
     return np.stack(entries, axis=-1).reshape(np.shape(tensors))
 
 
-def largest_change_of_length(before: Any, after: Any) -> Any:
+def largest_change_of_length(before: Array, after: Array) -> Array:
     """By what share the lengths at points change most between two deformation gradients (n, 3, 3), to first order."""
     # sqrt(2/3) |E| with E the symmetric part of G F^-1 - 1: the largest |e_I| of a bar, 2/sqrt(3) of it in pure shear,
     # where the volume stays.

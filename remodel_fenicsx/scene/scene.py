@@ -44,6 +44,7 @@ from remodel_fenicsx.schema.settings import (
     Output,
     Properties,
     REGION,
+    REMODELS,
     Region,
     Remodeling,
     STRESS_UNITS,
@@ -279,7 +280,7 @@ class Scene(Table):
         default=(), json_schema_extra={"allowed": "a list of tables, each [[cases]]"}
     )
     """Load cases of a cycle, a table `[[cases]]` each. Without them the loads act all the time."""
-    remodeling: Annotated[SerializeAsAny[Remodeling], KeysOfParts({"law": LAWS})] = Remodeling()
+    remodeling: Annotated[SerializeAsAny[Remodeling], KeysOfParts({"law": LAWS}, tables=REMODELS)] = Remodeling()
     time: Time
     solver: Solver = Solver()
     output: Output = Output()

@@ -636,6 +636,39 @@ class Turnover(_WithStart):  # type: ignore[misc]
         return self
 
 
+@dataclass(frozen=True)
+class RemodelsKind:
+    """Something that remodels beside the cells.
+
+    Attributes
+    ----------
+    table
+        Its keys, `[remodeling.NAME]` in a scene: a `Table` with a property `is_on`.
+    part
+        The class of the `Remodels`, made of state, tissue and `Remodeling`, or its dotted name.
+
+    Examples
+    --------
+    demos/extensions/decaying_collagen.py has one in a file; all there are:
+
+    >>> from remodel_fenicsx.extend import REMODELS
+    >>> sorted(REMODELS)
+    ['turnover']
+    """
+
+    table: type[Table]
+    part: Callable[..., Any] | str
+
+    @property
+    def make(self) -> Callable[..., Any]:
+        """Makes the part of a state, a tissue and a `Remodeling`."""
+        return resolved(self.part)
+
+
+REMODELS = {"turnover": RemodelsKind(Turnover, "remodel_fenicsx.evolution.turnover:TurnoverPass")}
+"""What remodels beside the cells, by the name of its table in `[remodeling]`."""
+
+
 class Remodeling(Table):
     """How the cells follow the load: driving tensor, evolution law, frame and speed.
 
@@ -709,6 +742,11 @@ class Remodeling(Table):
             f"remodeling.coupling = {self.coupling!r} makes a share of {share:g} of each pass, and the law "
             f"{self.law!r} does not make up for the rest: cells remodel at about {share:g} times the speed"
         ]
+
+    @property
+    def beside(self) -> list[RemodelsKind]:
+        """What remodels beside the cells."""
+        return [kind for name, kind in REMODELS.items() if (table := getattr(self, name, None)) and table.is_on]
 
     @property
     def own_parameters(self) -> dict[str, float]:

@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from types import NoneType
+from types import MappingProxyType, NoneType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, get_args, get_origin
 
 from pydantic import (
@@ -75,6 +75,20 @@ class Table(BaseModel):
         Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
     further
         Class of tables that may be there under any name beside the fields; None: there are none.
+
+    Examples
+    --------
+    A shape's keys, or those of what remodels, are fields with what is allowed:
+
+    >>> from remodel_fenicsx.extend import Table
+    >>> class Decay(Table):
+    ...     rate: float = 0.0
+    >>> Decay(rate=0.5).rate
+    0.5
+    >>> Decay(rate="fast")
+    Traceback (most recent call last):
+        ...
+    remodel_fenicsx.schema.tables.SceneError: rate = 'fast': must be a finite number
     """
 
     renamed: ClassVar[Mapping[str, str]] = {}
@@ -187,6 +201,13 @@ class VariantOf:
         return SchemaValidator(only).validate_python(dict(value))  # its faults name the variant after the field
 
 
+class PartWithTable(Protocol):
+    """A part that brings a table."""
+
+    @property
+    def table(self) -> type[Table]: ...
+
+
 class OwnNumber(Protocol):
     """A number that a part brings."""
 
@@ -201,6 +222,7 @@ class KeysOfParts:
 
     registries: Mapping[str, Mapping[str, object]]  # by the key that names the part
     optional: bool = False  # whether the keys may be left out, as those of regions
+    tables: Mapping[str, PartWithTable] = MappingProxyType({})  # parts that bring a table of their name
 
     def __get_pydantic_core_schema__(self, source: type[Table], handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(functools.partial(self._table, source), handler(source))
@@ -211,6 +233,7 @@ class KeysOfParts:
         chosen = {key: value.get(key, table.model_fields[key].default) for key in self.registries}
         parts = [self.registries[key].get(name) for key, name in chosen.items() if isinstance(name, str)]
         own = {name: number for part in parts for name, number in getattr(part, "parameters", {}).items()}
+        own |= {name: part.table for name, part in self.tables.items() if name not in table.model_fields}
         if not own:
             return value
         wide = _widened(table, tuple(own.items()), self.optional)
@@ -220,20 +243,25 @@ class KeysOfParts:
             raise PydanticCustomError("worded", "{text}", {"text": one_line(error, wide)}) from None
 
 
+Own = tuple[tuple[str, OwnNumber | type[Table]], ...]
+
+
 @functools.cache
-def _widened(table: type[Table], own: tuple[tuple[str, OwnNumber], ...], optional: bool) -> type[Table]:
-    """A table with further numbers: one class, so that scenes with them can be equal."""
+def _widened(table: type[Table], own: Own, optional: bool) -> type[Table]:
+    """A table with further numbers and tables: one class, so that scenes with them can be equal."""
     kind = float | None if optional else float
     fields: dict[str, Any] = {
         name: (kind, Field(default=None if optional else number.default, gt=number.above, description=number.meaning))
         for name, number in own
+        if not isinstance(number, type)
     }
+    fields |= {name: (inner, inner()) for name, inner in own if isinstance(inner, type)}
     wide = create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
     wide.widened = table, own, optional
     return wide
 
 
-def _unpickled(widened: tuple[type[Table], tuple[tuple[str, OwnNumber], ...], bool], state: dict[str, object]) -> Table:
+def _unpickled(widened: tuple[type[Table], Own, bool], state: dict[str, object]) -> Table:
     """A table whose class is made, and so has no place from which it could be imported."""
     kind = _widened(*widened)
     made = kind.__new__(kind)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import dolfinx.fem
 import dolfinx.fem.petsc
@@ -23,6 +23,7 @@ from remodel_fenicsx.fem.assembly import (
     over_ranks,
     second_derivative,
 )
+from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, whole_structure_tensor
 from remodel_fenicsx.model.tensors import MANDEL, det, passes_through_zero
@@ -106,8 +107,10 @@ class PointStresses:
         self.ufl: Stresses = state.dilatation.stresses(tissue, F, [state.cells.ufl_cell])
         if self._repulsion is not None:
             self.ufl = self.ufl.plus(F, self._repulsion.stress)
-        kinematics: Any = state.kinematics
-        if kinematics.grows:  # amounts belong to the volume of the start, stresses to the present one
+        kinematics = state.kinematics
+        if (
+            isinstance(kinematics, NaturalConfiguration) and kinematics.grows
+        ):  # amounts belong to the volume of the start, stresses to the present one
             self.ufl = Stresses(*(stress / kinematics.volume_ratio() for stress in self.ufl))
 
     def refresh(self) -> None:

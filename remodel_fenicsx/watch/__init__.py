@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from remodel_fenicsx._lazy import resolved
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.evolution.stepper import Stepper, Watcher
+    from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Stepper, Watcher
     from remodel_fenicsx.scene.scene import Scene
 
 
@@ -51,7 +51,7 @@ class WatcherKind:
     maker: Callable[[Scene, Stepper], Watcher | None] | str
     each_case: bool = False
 
-    def make(self, scene: Scene, stepper: Stepper) -> Watcher | None:
+    def make(self, scene: Scene, stepper: LoadCaseSolver) -> Watcher | None:
         """The watcher of a scene's stepper, or of another load case; None where there is nothing to watch.
 
         Parameters

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import Strut
-from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce, Watcher
+from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, WarnsOnce, Watcher
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.solver.continuation import StepFailure
@@ -37,7 +37,7 @@ FIRST_INVERSE_ITERATIONS = 3  # later steps go on from the vector of the step be
 class EquilibriumStability(Watcher):
     """Knows the number of negative eigenvalues of the tangent at solved states, and says when it changes."""
 
-    def __init__(self, stepper: Stepper, unstable: str = "warn", every_step: bool = False):
+    def __init__(self, stepper: LoadCaseSolver, unstable: str = "warn", every_step: bool = False):
         self.stepper, self.state = stepper, stepper.state
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
@@ -129,7 +129,7 @@ class EquilibriumStability(Watcher):
 class Signs:
     """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues."""
 
-    def __init__(self, stepper: Stepper):
+    def __init__(self, stepper: LoadCaseSolver):
         self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
         state = stepper.state
         self._vector = Earlier(state, "stability_vector", state.unknown.copy, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Recording, Scene, SceneError, cli, read_scene
-from remodel_fenicsx.extend import MATRICES, SHAPES
+from remodel_fenicsx import Recording, Scene, SceneError, cli, preset_scene, read_scene
+from remodel_fenicsx.extend import MATRICES, REMODELS, SHAPES
 from remodel_fenicsx.parts import Tube
 from tests.runs import rows_of, simulated
 
@@ -30,7 +31,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Scene]]:
         runpy.run_path(str(FOLDER / f"{name}.py"))
         return read_scene(FOLDER / f"{name}.toml")
 
-    with patch.dict(SHAPES):
+    with patch.dict(SHAPES), patch.dict(REMODELS):
         yield read
 
 
@@ -94,3 +95,21 @@ def toml(value: Any) -> str:
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {toml(part)}" for key, part in value.items()) + "}"
     return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def test_lost_collagen_is_a_network_of_that_density(scene: Any) -> None:
+    """At each time the cube is as long as one whose chain density is exp(-rate t) of the whole."""
+    runpy.run_path(str(FOLDER / "decaying_collagen.py"))
+    cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"model.kinematics": "point", "time.end": 4.0})
+    still = {"remodeling.law": "none"}
+    decaying = cube.with_values({**still, "remodeling.decay.rate": 0.3})
+    assert decaying.remodeling.decay.rate == 0.3 and not cube.remodeling.decay.is_on  # type: ignore[attr-defined]
+    assert Scene(**tomllib.loads(decaying.to_toml())) == decaying
+    found = [row["mean_stretch"] for row in rows_of(decaying)]
+    for number, stretch in enumerate(found, start=1):
+        less = {**still, "material.chain_density": cube.material.chain_density * np.exp(-0.3 * number)}
+        assert stretch == pytest.approx(rows_of(cube.with_values(less))[number - 1]["mean_stretch"], rel=1e-9)
+    remodeled = cube.with_values({"remodeling.decay.rate": 0.3})
+    assert rows_of(remodeled)[-1]["mean_fibre_angle"] < 54.0  # the cells remodel beside it
+    with pytest.raises(SceneError, match=r"remodeling\.decay\.rate = -1.0: must be .* at least 0"):
+        cube.with_values({"remodeling.decay.rate": -1.0})
