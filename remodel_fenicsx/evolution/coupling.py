@@ -56,49 +56,43 @@ class Predictor:
 
     def __init__(self, state: State):
         self.state = state
-        self._increments = Earlier(state, "predictor_increment", state.unknown.copy, ORDER + FITTED)
-        rates = {f"rate_{name}": 0.0 for name in state.loading.values}
-        durations = {f"duration_{age}": 0.0 for age in range(ORDER + FITTED)}  # of the increments, the newest first
-        self._numbers = Numbers(state, "predictor", durations | rates)
+        # increments over the lengths of their steps: steps of any length take part
+        self._speeds = Earlier(state, "predictor_speed", state.unknown.copy, ORDER + FITTED)
+        self._numbers = Numbers(state, "predictor", {f"rate_{name}": 0.0 for name in state.loading.values})
 
     def expected(self, step: LoadStep) -> Array | None:
         """The unknowns at its end, ghosts included, with what supports and loads prescribe; None at first."""
-        if not self._increments.known or not self._goes_on(step):
+        speeds = self._speeds.values
+        if not speeds or not self._goes_on(step):
             return None
-        # as they would be over a step of this length, at their own speeds
-        known = enumerate(self._increments.values)
-        increments = [step.duration / self._numbers[f"duration_{age}"] * increment for age, increment in known]
-        increment = increments[0]
-        if len(increments) == ORDER + FITTED:
-            increment = self._weights(increments) @ np.array(increments[:ORDER])
-        values: Array = self.state.unknown.x.array + increment
+        speed = speeds[0]
+        if len(speeds) == ORDER + FITTED:
+            speed = self._weights(speeds) @ np.array(speeds[:ORDER])
+        values: Array = self.state.unknown.x.array + step.duration * speed
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
         """The state is the solution of the step; `before`: the unknowns of the step before, or of its first solve."""
-        numbers, increment = self._numbers, self.state.unknown.x.array - before
+        speed = (self.state.unknown.x.array - before) / step.duration
         if again:
-            self._increments.values[0][:] += increment
+            self._speeds.values[0][:] += speed
             return
         if not self._goes_on(step):
-            self._increments.forget()
-        self._increments.push(increment)
-        for age in reversed(range(1, ORDER + FITTED)):
-            numbers[f"duration_{age}"] = numbers[f"duration_{age - 1}"]
-        numbers["duration_0"] = step.duration
+            self._speeds.forget()
+        self._speeds.push(speed)
         for name, rate in step.rates.items():
-            numbers[f"rate_{name}"] = rate
+            self._numbers[f"rate_{name}"] = rate
 
     def _goes_on(self, step: LoadStep) -> bool:
         """Whether the rates are those of the last step."""
         rates = ((rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items())
         return all(abs(rate - last) <= SAME_RATE * max(abs(rate), abs(last)) for rate, last in rates)
 
-    def _weights(self, increments: list[Array]) -> Array:
-        """By least squares, of the last increments from those before them."""
-        rows = np.array([increment[: self.state.number_of_owned_unknowns] for increment in increments])
+    def _weights(self, speeds: list[Array]) -> Array:
+        """Fit the newest increments by those before them, in the sense of least squares."""
+        rows = np.array([speed[: self.state.number_of_owned_unknowns] for speed in speeds])
         products = over_ranks(self.state.comm, rows @ rows.T, MPI.SUM)
         matrix, right = np.zeros((ORDER, ORDER)), np.zeros(ORDER)
         for k in range(FITTED):

@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model.chains import UflOrArray
-from remodel_fenicsx.model.tensors import squared_stretch
+from remodel_fenicsx.model.tensors import is_array
 
+ufl = Late("ufl")
 Array = NDArray[np.float64]
 
 
@@ -54,7 +56,12 @@ class UnitCell(NamedTuple):
         deformation_gradient
             F, UFL of shape (3, 3) or array (..., 3, 3).
         """
-        return [squared_stretch(deformation_gradient, self.axes, i) for i in range(3)]
+        if is_array(deformation_gradient):  # by component, three times as fast as np.einsum
+            F, n = by_component(deformation_gradient), by_component(self.axes)
+            fibres = (F[:, 0] * n[i, 0] + F[:, 1] * n[i, 1] + F[:, 2] * n[i, 2] for i in range(3))
+            return [(fibre**2).sum(axis=0) for fibre in fibres]
+        fibres = [ufl.dot(deformation_gradient, self.axes[i, :]) for i in range(3)]
+        return [ufl.inner(fibre, fibre) for fibre in fibres]
 
 
 def structure_tensor(dimensions: Array, axes: Array) -> Array:

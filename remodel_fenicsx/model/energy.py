@@ -32,7 +32,7 @@ from remodel_fenicsx.model.chains import (
     UflOrArray,
     WithParameters,
 )
-from remodel_fenicsx.model.tensors import component, det, is_array, ln, sqrt, squared_norm
+from remodel_fenicsx.model.tensors import det, is_array, ln, sqrt, squared_norm
 
 ufl = Late("ufl")
 Array = NDArray[np.float64]
@@ -183,7 +183,7 @@ def squared_end_to_end_length(deformation_gradient: UflOrArray, cells: Sequence[
     2.92
     """
     return sum(
-        cell.weight * component(cell.dimensions, i) ** 2 * stretch
+        cell.weight * cell.dimensions[..., i] ** 2 * stretch
         for cell in cells
         for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
     )
@@ -217,7 +217,7 @@ def axes_sum(deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to
     0.4621
     """
     return sum(
-        cell.weight * component(cell.dimensions, i) ** 2 * ln(stretch)
+        cell.weight * cell.dimensions[..., i] ** 2 * ln(stretch)
         for cell in cells
         for i, stretch in enumerate(cell.squared_stretches(deformation_gradient))
     )
