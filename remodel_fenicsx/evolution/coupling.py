@@ -75,7 +75,7 @@ class Predictor:
 
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
         """The state is the solution of the step; `before`: the unknowns of the step before, or of its first solve."""
-        speed: Array = (self.state.unknown.x.array - before) / step.duration
+        speed = np.asarray((self.state.unknown.x.array - before) / step.duration, dtype=np.float64)
         if again:
             self._speeds.values[0][:] += speed
             return
