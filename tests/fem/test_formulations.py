@@ -15,7 +15,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.schema.settings import Cells, Material
-from remodel_fenicsx.watch.warnings import WARNED_SHARE, LockingWarning, PressureNoise
+from remodel_fenicsx.watch.warnings import LockingWarning, PressureNoise
 from tests import parts
 from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, registered, thick_tube
@@ -296,16 +296,12 @@ def random_artery(**values: Any) -> Scene:
     return preset_scene("kuhl-holzapfel-2007", "tube").with_values({"cells.initial": "random", **values})
 
 
-def test_the_papers_artery_is_fine_enough(caplog: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_papers_artery_is_fine_enough(caplog: Any) -> None:
     """Where its random cells make strain vary most: two thirds of what is said."""
     artery = random_artery(**{"time.end": 5.0})
     with caplog.at_level(logging.WARNING), simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _):
         watcher = LockingWarning(simulation.stepper, True)
-        missing = sum(watcher.missing())
-        assert 0.025 < missing < 0.038
-        # where a bound is enough nobody asks the tangent
-        monkeypatch.setattr(watcher, "response", None)
-        assert missing <= sum(watcher._missing(*watcher.energies(), WARNED_SHARE)) <= WARNED_SHARE
+        assert 0.025 < sum(watcher.missing()) < 0.038
     assert not caplog.records
 
 
