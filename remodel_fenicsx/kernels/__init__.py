@@ -13,9 +13,6 @@ positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
 squared_length      model.energy.squared_end_to_end_length
 structure           model.cells.structure_tensor
-extension           kernels.PointKernels.extension
-may_turn            kernels.PointKernels.may_turn
-room                kernels.PointKernels.room
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
@@ -155,26 +152,6 @@ class PointKernels:
         """`energy.squared_end_to_end_length` of one whole cell."""
         return np.asarray(energy.squared_end_to_end_length(F, [cell]))
 
-    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
-        """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J."""
-        with np.errstate(invalid="ignore"):
-            stretch = np.sqrt(states[:, 0]) / length
-        stretch[~np.isfinite(stretch)] = np.inf
-        smallest = states[:, 1].min(initial=np.inf) if np.isfinite(states[:, 1]).all() else -np.inf
-        return stretch, int(np.argmax(stretch)) if stretch.size else 0, float(smallest)
-
-    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
-        """Which points `tensors.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends."""
-        # |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular.
-        F, J, change = before[:, 2:], before[:, 1], after[:, 2:] - before[:, 2:]
-        reach = np.sqrt((change**2).sum(axis=1)) * (F**2).sum(axis=1)
-        return np.flatnonzero((J <= 0.0) | (reach >= 2.0 * J))
-
-    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
-        """Largest |dF| at which J > 0 and r/L < far at all points; chain: |l|/L (n,)."""
-        volume = 2.0 * states[:, 1] / (states[:, 2:] ** 2).sum(axis=1)
-        return float(np.minimum(volume, (far - stretch) / chain).min(initial=np.inf))
-
 
 class CompiledPointKernels(PointKernels):
     """The same in C. `PointKernels` says what goes in and comes out, and does what C leaves open."""
@@ -219,19 +196,6 @@ class CompiledPointKernels(PointKernels):
         squared = np.empty(len(F))
         self._call("squared_length", len(F), F, cell.dimensions, cell.axes, squared)
         return squared
-
-    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
-        stretch, smallest = np.empty(len(length)), np.empty(1)
-        worst = self._call("extension", len(length), states, length, stretch, smallest)
-        return stretch, worst, smallest.item()
-
-    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
-        found = np.empty(len(before), np.bool_)
-        count = self._call("may_turn", len(before), before, after, found)
-        return np.flatnonzero(found) if count else np.empty(0, np.intp)
-
-    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
-        return float(self._call("room", len(stretch), states, stretch, chain, far))
 
 
 def point_kernels(comm: MPI.Intracomm) -> PointKernels:

@@ -349,9 +349,9 @@ class Blend:
         equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
         length = quadrature.owned(equilibrium.locking_length())
         self.theta.value = done
-        now = quadrature.owned(equilibrium.states()[..., 0])
+        now = quadrature.owned(equilibrium.squared_lengths())
         self.theta.value = 1.0
-        end = quadrature.owned(equilibrium.states()[..., 0])
+        end = quadrature.owned(equilibrium.squared_lengths())
         allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
         increase = end - now
         room = np.where(increase > 0, (allowed - now) / np.where(increase > 0, increase, 1.0), np.inf)

@@ -16,7 +16,6 @@ from petsc4py import PETSc
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.solver_methods import (
     AUTO,
-    LAGGED,
     ProblemOptions,
     SOLVER_METHODS,
     chosen,
@@ -109,59 +108,6 @@ class Convergence:
 # The limits r < L and J > 0 in the line search of Newton's method.
 
 NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
-
-
-class Limits:
-    """How far from their limits r < L and J > 0 the states of one solve are; each is evaluated once."""
-
-    def __init__(self, equilibrium: Equilibrium, bounded: bool):
-        self.equilibrium, state = equilibrium, equilibrium.state
-        self.bounded = bounded and state.kinematics.three_dimensional and state.dilatation.jacobians().shape[1] == 0
-        self._gain = equilibrium.quadrature.largest_gradient if self.bounded else np.inf
-        self.forget()
-
-    def forget(self) -> None:
-        """Cells or loads may be others from now on."""
-        self._found: Look | None = None
-        self._chains: Array | None = None  # |l|/L at the points
-        self._room, self._travelled = 0.0, np.inf
-
-    def look(self) -> Look:
-        """`Equilibrium.look` of the present unknowns."""
-        found = self.equilibrium.look()
-        if self.bounded and found is not self._found:
-            self._found, self._room, self._travelled = found, self._room_around(found), 0.0
-        return found
-
-    def allow(self, before: Look, after: Look) -> bool:
-        """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
-        if not after.extension.admissible:
-            return False
-        near = after.extension.max_chain_extension > NEAR_LIMIT
-        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
-            return False
-        return not self.equilibrium.turns_inside_out(before.states, after.states)
-
-    def certainly_allow(self, largest_displacement: float) -> bool:
-        """Whether a further step is admissible by the bound, without a look at its end; it then counts as made."""
-        further = self._travelled + self._gain * largest_displacement
-        if not further < self._room:
-            return False
-        self._travelled = further
-        return True
-
-    def _room_around(self, look: Look) -> float:
-        """Largest |dF| at which J > 0 and r/L < NEAR_LIMIT at every point of all ranks."""
-        if not look.extension.admissible:
-            return 0.0
-        quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
-        if self._chains is None:
-            length = np.sqrt((cells.dimension_values**2).sum(axis=-1)) / self.equilibrium.locking_length()
-            self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
-        room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, NEAR_LIMIT)
-        return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
-
-
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
 
@@ -220,7 +166,6 @@ class _Solve:
     norm: float = np.inf
     previous: float = np.inf
     inadmissible: bool = False
-    bounded: bool = False
 
 
 # by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
@@ -265,8 +210,6 @@ class GuardedNewton:
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
-        bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
-        self.limits = Limits(equilibrium, bounded)
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()), self._matrix)
@@ -321,7 +264,6 @@ class GuardedNewton:
         self.convergence.begin()
         self._pull(self._x)
         self._present = _Solve(start if origin is None else origin)
-        self.limits.forget()
         self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
@@ -439,17 +381,12 @@ class GuardedNewton:
             equilibrium.assemble_lifting(self._external, x)
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
-        present = self._present
-        if present.bounded:
-            present.inadmissible = over_ranks(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
-        else:
-            extension = self.limits.look().extension
-            present.inadmissible = not extension.admissible or extension.stop_signal > 0
-            if not present.inadmissible:
-                self.convergence.extended(extension.max_chain_extension)
-        if present.inadmissible:
+        extension = equilibrium.extension()
+        self._present.inadmissible = not extension.admissible or extension.stop_signal > 0
+        if self._present.inadmissible:
             residual.set(np.nan)
             return
+        self.convergence.extended(extension.max_chain_extension)
         self.convergence.displacement = x.norm(PETSc.NormType.NORM_INFINITY)
 
     def _keep_admissible(self, x: PETSc.Vec, step: PETSc.Vec) -> bool:
@@ -462,17 +399,13 @@ class GuardedNewton:
         if present.first_iterate is None:
             first = x.array_r - step.array_r
             present.first_iterate = self._length(first - present.origin[: first.size])
-        length = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
-        present.bounded = self.limits.bounded and self.limits.certainly_allow(length)
-        if present.bounded:
-            return improved
         self._push(x)
-        before, trial = self.limits.look(), self._trial
+        before, trial = self.equilibrium.look(), self._trial
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
             self._push(trial)
-            after = self.limits.look()
-            if after.extension.stop_signal or self.limits.allow(before, after):
+            after = self.equilibrium.look()
+            if after.extension.stop_signal or self._allows(before, after):
                 break
             step.scale(0.5)
         else:
@@ -481,12 +414,16 @@ class GuardedNewton:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
 
-    def _converged(
-        self,
-        snes: PETSc.SNES,
-        iteration: int,
-        norms: tuple[float, float, float],
-    ) -> int:
+    def _allows(self, before: Look, after: Look) -> bool:
+        """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
+        near, equilibrium = after.extension.max_chain_extension > NEAR_LIMIT, self.equilibrium
+        if not after.extension.admissible:
+            return False
+        if near and not equilibrium.keeps_reserve(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
+            return False
+        return not equilibrium.turns_inside_out(before, after)
+
+    def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
         """SNES asks after every iteration: `Convergence`, or no more iterations."""
         norm = norms[2]
         if not np.isfinite(norm):

@@ -266,7 +266,7 @@ class BucklingWarning(WarnsOnce):
     # ------------------------------------------------------------ the present state
     def _gradients(self) -> Array:
         """F at this rank's points, (n, 3, 3)."""
-        return self.stepper.coupling.equilibrium.look().states[:, 2:].reshape(-1, 3, 3)
+        return self.stepper.coupling.equilibrium.look().gradients
 
     def _length(self) -> float:
         stretch = self._integral(self._gradients()[:, 2, 2]) / self._integral(np.ones(len(self._places)))

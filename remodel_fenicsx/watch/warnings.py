@@ -99,8 +99,8 @@ class LockingWarning(WarnsOnce):
     def energies(self) -> tuple[float, float, float]:
         """Of the matrix, with the mean J of each element; of changes of J inside; twice that of changes of F there."""
         quadrature, (stiffness, shear) = self.quadrature, self.stiffnesses
-        states = self.stepper.coupling.equilibrium.look().states.reshape(*stiffness.shape, 11)
-        logarithm, F = np.log(states[..., 1]), states[..., 2:]
+        look = self.stepper.coupling.equilibrium.look()
+        logarithm, F = np.log(look.jacobians), look.gradients.reshape(*stiffness.shape, 9)
         inside = quadrature.beyond(0, logarithm[..., None])[..., 0]
         matrix = stiffness * (logarithm - inside) ** 2 + shear * (np.square(F).sum(axis=-1) - 3 - 2 * logarithm)
         volume = stiffness * np.square(inside) * self.locks
@@ -234,8 +234,7 @@ class VolumeLoss(WarnsOnce):
             step.findings.append((logging.INFO, self._in_words()))
 
     def _measure(self, step: Step) -> None:
-        numbers, look = self._numbers, self.stepper.coupling.equilibrium.look()
-        jacobians = look.states[:, 1].reshape(look.stretches.shape)
+        numbers, jacobians = self._numbers, self.stepper.coupling.equilibrium.look().jacobians
         mean = self.quadrature.integral(jacobians) / self.quadrature.volume
         if mean < numbers["mean"]:
             numbers["mean"], numbers["mean_time"] = mean, step.time

@@ -15,9 +15,7 @@ from remodel_fenicsx.fem import solver_methods as methods
 from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear
-from remodel_fenicsx.solver.newton import Limits
 from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants
-from remodel_fenicsx.watch.warnings import VolumeResponse
 from tests import parts
 from tests.parts import tube
 from tests.runs import made
@@ -198,27 +196,6 @@ def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
     factor.close()
 
 
-@needs_single
-def test_one_refinement_makes_up_for_single_precision() -> None:
-    """As the watch for locking takes it, of the motion that the factor knows worst."""
-    axes = np.linalg.qr(np.random.default_rng(4).standard_normal((30, 30)))[0]
-    values = axes @ np.diag(np.geomspace(1e-7, 1.0, 30)) @ axes.T
-    factor, matrix = KeptFactor(), matrix_of((values + values.T) / 2)
-    factor.renew(matrix)
-    factors = PETSc.PC().create(PETSc.COMM_SELF)
-    factors.setType(PETSc.PC.Type.PYTHON)
-    factors.setPythonContext(factor)
-    factors.setOperators(matrix)
-    forces, answer = matrix.createVecs()
-    forces.array[:] = axes[:, 0]
-    factors.apply(forces, answer)
-    before = np.abs(1e-7 * answer.array - axes[:, 0]).max()
-    VolumeResponse._refine(answer, forces, factors)
-    assert before > 1e-3 and np.abs(1e-7 * answer.array - axes[:, 0]).max() < before / 10
-    factors.destroy()
-    factor.close()
-
-
 def test_a_kept_factor_stays_when_its_matrix_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     """In double precision: PETSc would make it anew by itself."""
     monkeypatch.setattr(single, "is_available", lambda: False)
@@ -342,7 +319,7 @@ def test_a_linear_problem_is_soon_solved_with_secants() -> None:
     assert norms[20] < 5e-3 * norms[0]
 
 
-# ---------------------------------------------------------------- the bound that spares looks
+# ---------------------------------------------------------------- rounding of displacements
 def test_no_displacement_changes_f_by_more_than_the_bound() -> None:
     """And some come near it: an element that one of its nodes leaves."""
     made = parts.body(tube(length=2.0, divisions=(8, 2, 1), comm=SELF), preset_scene(
@@ -356,32 +333,3 @@ def test_no_displacement_changes_f_by_more_than_the_bound() -> None:
         change = np.linalg.norm(state.deformation_gradient() - np.eye(3), axis=(1, 2))
         largest = max(largest, float(change.max()))
     assert 0.2 * bound < largest < bound
-
-
-def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each state that nobody looked at is looked at here; far more are spared than not."""
-    spared = []
-    spare = Limits.certainly_allow
-
-    def checked(self: Limits, largest_displacement: float) -> bool:
-        found = spare(self, largest_displacement)
-        spared.append(found)
-        return found
-
-    monkeypatch.setattr(Limits, "certainly_allow", checked)
-    simulation, _ = simulated("lagged", solver__predictor="autoregressive", time__end=4.0)
-    newton = simulation.stepper.coupling.newton
-    assert sum(spared) > len(spared) / 2
-    newton.limits.forget()
-    newton.limits.look()
-    x, step = newton.unknown.x.array.copy(), np.random.default_rng(1).standard_normal(newton.unknown.x.array.shape)
-    step /= np.linalg.norm(step.reshape(-1, 3), axis=1).max()
-    size = 1.0
-    while not spare(newton.limits, size):
-        size /= 1.1
-    newton.unknown.x.array[:] = x + size * step
-    extension = newton.equilibrium.extension()
-    assert extension.admissible and extension.max_chain_extension < 0.95
-    assert not spare(newton.limits, size)  # it counts what has been travelled already
-    assert newton.limits.look() and spare(newton.limits, 0.2 * size)  # and anew from a state that is looked at
-    simulation.close()

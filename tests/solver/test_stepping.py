@@ -122,7 +122,7 @@ def test_the_bound_of_a_part_is_where_the_first_point_has_lost_its_share() -> No
 
     def left(theta: float) -> np.ndarray:
         blend.set(theta)
-        return 1 - np.sqrt(blend.equilibrium.states()[..., 0]) / parts.MATERIAL.contour_length
+        return 1 - np.sqrt(blend.equilibrium.squared_lengths()) / parts.MATERIAL.contour_length
 
     first = blend.largest_part(0.0)
     for done in (0.0, first / 2):
