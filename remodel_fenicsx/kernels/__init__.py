@@ -1,6 +1,6 @@
 """What is computed at every quadrature point, in C: compiled like the forms, held against Python by tests.
 
-`Library` compiles the C files and calls them; there is a method for each function, here or in `tensor`. Most stand for
+`Library` compiles the C files and calls them; there is a method for each function. Most stand for
 a function of the package: it is the reference, decides where C leaves a point open, and runs in its place with
 ``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger. Those of `factor`, which calls CHOLMOD, stand for
 none: without them factors are PETSc's, in double precision.
@@ -29,7 +29,7 @@ import functools
 import logging
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -40,9 +40,11 @@ from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.model import cells, energy, spectral
+from remodel_fenicsx.model import cells, energy, spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.drivers import rotated_back
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.system import NOTICE, environment
 
 log = logging.getLogger(__name__)
@@ -54,6 +56,8 @@ FOLDER = Path(__file__).parent
 NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 NOT_FINITE = 2  # mark of a point with NaN or infinity
 HEADER = "suitesparse/cholmod.h"
+NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
+"""What tensor.c takes from Python: the numbers that tune."""
 FIRST = 5  # CHOLMOD's version that has single precision
 
 
@@ -110,11 +114,6 @@ class Library:
         """What a function returns. Arrays that it writes to are contiguous; None is a null pointer."""
         return getattr(self._functions, name)(*map(self._argument, arguments))
 
-    def number(self, name: str) -> int | None:
-        """Of a part of the model that the file knows by this name; None where it does not."""
-        found = getattr(self._functions, name, None) if name else None
-        return found if isinstance(found, int) else None
-
     def _argument(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):
             if value.dtype in (np.bool_, np.uint8):
@@ -129,8 +128,6 @@ def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
     """The tissue with its repulsion in C, where it is `log`."""
     if tissue.chain is None or tissue.repulsion.sum is not energy.log_sum or in_numpy():
         return tissue
-    from remodel_fenicsx.kernels.tensor import TensorKernels  # with the law `tensor`: most runs need neither
-
     kernels = TensorKernels(comm)
     return replace(
         tissue, repulsion=replace(tissue.repulsion, sum=kernels.log_sum, derivatives=kernels.log_derivatives)
@@ -201,6 +198,40 @@ class CompiledPointKernels(PointKernels):
 def point_kernels(comm: MPI.Intracomm) -> PointKernels:
     """In C, or in numpy where that is asked for. Collective."""
     return PointKernels() if in_numpy() else CompiledPointKernels(comm)
+
+
+# ---------------------------------------------------------------- the structure tensor
+
+
+class TensorKernels:
+    """The law `tensor` and the repulsion `log` in C (tensor.c), on arrays of n points."""
+
+    def __init__(self, comm: MPI.Intracomm):
+        self.call = Library(comm, "tensor.c", "the law for the structure tensor", numbers=NUMBERS)
+
+    def target(self, drive: Drive) -> tensor_law.Target:
+        """`laws.tensor_target`."""
+        F, given = drive.deformation_gradient, drive.tensor
+        n, turned_back = len(F), not drive.driver.material
+        if turned_back and drive.frame.tensor is not rotated_back:
+            turned_back, given = False, drive.frame.tensor(F, given)
+        direction, switch = np.empty((n, 3, 3)), np.empty(n)
+        self.call("target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, switch)
+        return tensor_law.Target(direction, switch)
+
+    def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
+        """`energy.log_sum`."""
+        if np.iscomplexobj(F):
+            return energy.log_sum(F, cells, end_to_end_length)
+        result = np.empty(F.shape[:-2])
+        self.call("log_sum", result.size, F, np.broadcast_to(energy.whole_structure_tensor(cells), F.shape), result)
+        return result
+
+    def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
+        """`energy.log_derivatives`."""
+        first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
+        self.call("log_derivatives", len(C), C, A, first, matrices)
+        return first, matrices
 
 
 # ---------------------------------------------------------------- factors in single precision, where CHOLMOD 5 is

@@ -243,6 +243,14 @@ class Equilibrium:
         turns = at.size > 0 and bool(passes_through_zero(F[at], G[at]).any())
         return bool(over_ranks(self.comm, turns, MPI.LOR))
 
+    def room(self, far: float) -> float:
+        """Largest |dF| at which J > 0 and r/L < `far` at every point of all ranks."""
+        look, lengths = self.look(), self.state.cells.dimension_values
+        chains = np.sqrt((lengths**2).sum(axis=-1)) / self.locking_length()
+        volume = 2.0 * look.jacobians.ravel() / np.einsum("nij,nij->n", look.gradients, look.gradients)
+        length = (far - look.stretches) / np.maximum(self.quadrature.owned(chains), 1e-300)
+        return float(over_ranks(self.comm, np.minimum(volume, length.ravel()).min(initial=np.inf), MPI.MIN))
+
     def squared_lengths(self) -> Array:
         """r^2 in squared link lengths, (elements, points); 0 without chains."""
         shape = self.quadrature.shape

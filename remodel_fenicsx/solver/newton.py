@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.fem.solver_methods import (
     AUTO,
+    LAGGED,
     ProblemOptions,
     SOLVER_METHODS,
     chosen,
@@ -166,6 +167,8 @@ class _Solve:
     norm: float = np.inf
     previous: float = np.inf
     inadmissible: bool = False
+    room: float = 0.0  # |dF| around the last state that was looked at within which all are admissible
+    is_certain: bool = False  # whether the state is within it
 
 
 # by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
@@ -210,6 +213,8 @@ class GuardedNewton:
         # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
+        bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
+        self._bounded = bounded and kinematics.three_dimensional and equilibrium.state.dilatation.jacobian is None
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()), self._matrix)
@@ -381,12 +386,18 @@ class GuardedNewton:
             equilibrium.assemble_lifting(self._external, x)
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
-        extension = equilibrium.extension()
-        self._present.inadmissible = not extension.admissible or extension.stop_signal > 0
-        if self._present.inadmissible:
+        present = self._present
+        if present.is_certain:
+            present.inadmissible = over_ranks(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
+        else:
+            extension = equilibrium.extension()
+            present.inadmissible = not extension.admissible or extension.stop_signal > 0
+            if not present.inadmissible:
+                self.convergence.extended(extension.max_chain_extension)
+                present.room = equilibrium.room(NEAR_LIMIT) if self._bounded else 0.0
+        if present.inadmissible:
             residual.set(np.nan)
             return
-        self.convergence.extended(extension.max_chain_extension)
         self.convergence.displacement = x.norm(PETSc.NormType.NORM_INFINITY)
 
     def _keep_admissible(self, x: PETSc.Vec, step: PETSc.Vec) -> bool:
@@ -399,6 +410,12 @@ class GuardedNewton:
         if present.first_iterate is None:
             first = x.array_r - step.array_r
             present.first_iterate = self._length(first - present.origin[: first.size])
+        # so far |dF| goes at most; where that is admissible for certain, nobody looks
+        largest = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
+        present.room -= self.equilibrium.quadrature.largest_gradient * largest
+        present.is_certain = present.room > 0.0
+        if present.is_certain:
+            return improved
         self._push(x)
         before, trial = self.equilibrium.look(), self._trial
         for halving in range(LINE_SEARCH_HALVINGS + 1):
