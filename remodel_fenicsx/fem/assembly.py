@@ -112,12 +112,11 @@ class SolveStopped(ArithmeticError):
 
 
 class Positive:
-    """A positive definite form: its matrix, which several solves share. Collective."""
+    """A positive definite form, which several solves share. Collective."""
 
     def __init__(self, bilinear: ufl.Form):
-        form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
-        self._matrix = create_matrix(form)
-        assemble_matrix(self._matrix, [form], [])
+        self._form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
+        self._matrix = create_matrix(self._form)
 
     @cached_property
     def _degree_one(self) -> tuple[FunctionSpace, PETSc.Mat]:
@@ -133,21 +132,19 @@ class Positive:
         """The function u with bilinear(u, v) = linear(v) for all v; linear is 0 where it is None. Collective."""
         # Conjugate gradients, with no memory for factors. Multigrid is for where what is held is far away; it cannot be
         # where all is held.
-        unknown = dolfinx.fem.Function(self.space)
-        answer, matrix = unknown.x.petsc_vec, self._matrix.copy() if conditions else self._matrix
+        unknown, matrix = dolfinx.fem.Function(self.space), self._matrix
+        answer = unknown.x.petsc_vec
         load = answer.duplicate()
+        assemble_matrix(matrix, [self._form], conditions)
+        with load.localForm() as local:
+            local.array_w[:] = 0.0
         if linear is not None:
-            external = dolfinx.fem.assemble_vector(jit.form(linear))
-            external.scatter_reverse(dolfinx.la.InsertMode.add)
-            load.array[:] = external.array[: load.getLocalSize()]
-        held = []
+            dolfinx.fem.petsc.assemble_vector(load, jit.form(linear))
+        dolfinx.fem.petsc.apply_lifting(load, [self._form], bcs=[conditions])
+        load.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        dolfinx.fem.petsc.set_bc(load, conditions)
         for condition in conditions:
             condition.set(unknown.x.array)
-            dofs, _ = condition.dof_indices()  # of a vector, dolfinx counts ghosts among its own ones
-            held.append(dofs[dofs < load.getLocalSize()])
-        if conditions:
-            rows = np.unique(np.concatenate(held)) + answer.getOwnershipRange()[0]
-            matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0, answer, load)
         solver = PETSc.KSP().create(matrix.comm)
         solver.setOperators(matrix)
         solver.setType("cg")
@@ -160,7 +157,7 @@ class Positive:
         solver.solve(load, answer)
         reason, iterations = solver.getConvergedReason(), solver.getIterationNumber()
         unknown.x.scatter_forward()
-        for thing in (solver, load, *([levels] if levels else []), *([matrix] if conditions else [])):
+        for thing in (solver, load, *([levels] if levels else [])):
             thing.destroy()
         if reason < 0:
             raise SolveStopped(f"the linear solve stopped after {iterations} iterations (reason {reason} of PETSc)")

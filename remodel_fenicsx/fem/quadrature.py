@@ -159,12 +159,9 @@ class Quadrature:
         local = float((self.owned(values) * self.owned(self.volumes)).sum())
         return float(over_ranks(self.mesh.comm, local, MPI.SUM))
 
-    def mean(self, values: NDArray[np.float64], elements: NDArray[np.bool_] | None = None) -> float:
-        """Volume mean of values (elements, points), over all elements or those selected by a mask (elements,)."""
-        if elements is None:
-            return self.integral(values) / self.volume
-        chosen = np.repeat(elements[:, None], self.shape[1], axis=1).astype(np.float64)
-        return self.integral(values * chosen) / self.integral(chosen)
+    def mean(self, values: NDArray[np.float64]) -> float:
+        """Volume mean of values (elements, points)."""
+        return self.integral(values) / self.volume
 
     def mean_of_known(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
         """Volume mean over the points whose value is known, not NaN; NaN where there is none.

@@ -109,6 +109,7 @@ class Convergence:
 # The limits r < L and J > 0 in the line search of Newton's method.
 
 NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
+NOWHERE = Extension(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
 
@@ -130,10 +131,10 @@ class Counted:
 
 @dataclass
 class Solution(Counted):
-    """A solve that has ended well."""
+    """How a solve has ended."""
 
     residual: float = 0.0
-    extension: Extension | None = None
+    extension: Extension = NOWHERE
     reach: float = 0.0  # how far it is from its origin, over how far the first iterate was; 0 where that says nothing
 
 
@@ -143,19 +144,15 @@ class SolveFailure(RuntimeError, Counted):
     def __init__(
         self,
         reason: str,
-        newton_iterations: int,
-        linear_iterations: int,
-        extension: Extension,
+        found: Solution,
         residual_over_tolerance: float = np.inf,
-        tangents: int = 0,
         relative_residual: float = np.inf,
         stagnates: bool = False,
     ):
         super().__init__(reason)
-        self.reason, self.extension = reason, extension
-        self.newton_iterations, self.linear_iterations, self.tangents = newton_iterations, linear_iterations, tangents
+        self.reason, self.extension, self.stagnates = reason, found.extension, stagnates
         self.residual_over_tolerance, self.relative_residual = residual_over_tolerance, relative_residual
-        self.stagnates = stagnates
+        self.count(found)
 
 
 @dataclass
@@ -273,23 +270,21 @@ class GuardedNewton:
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
-        newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         self._push(self._x)
-        extension = self.equilibrium.extension()
-        if reason < 0 or self._present.inadmissible or not extension.admissible:
-            self._values[:] = start
-            if extension.stop_signal:
-                raise Interrupted(extension.stop_signal)
-            norm, tiny = float(self._snes.getFunctionNorm()), float(np.finfo(np.float64).tiny)
-            text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
-            left = norm / max(self.convergence.tolerance(), tiny)
-            relative = norm / max(self.convergence.force_scale, tiny)
-            stagnates = norm > STAGNATION * self._present.previous
-            counts = newton, linear, extension, left, self._linear.tangents - tangents
-            raise SolveFailure(text, *counts, relative, stagnates)
-        self._linear.ended(newton)
-        norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
-        return Solution(newton, linear, tangents, norm, extension, self._reach())
+        extension, norm = self.equilibrium.extension(), float(self._snes.getFunctionNorm())
+        newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
+        found = Solution(newton, linear, self._linear.tangents - tangents, norm, extension)
+        if reason >= 0 and not self._present.inadmissible and extension.admissible:
+            self._linear.ended(newton)
+            found.reach = self._reach()
+            return found
+        self._values[:] = start
+        if extension.stop_signal:
+            raise Interrupted(extension.stop_signal)
+        text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
+        scales = self.convergence.tolerance(), self.convergence.force_scale
+        shares = (norm / max(scale, float(np.finfo(np.float64).tiny)) for scale in scales)
+        raise SolveFailure(text, found, *shares, stagnates=norm > STAGNATION * self._present.previous)
 
     def _reach(self) -> float:
         """`Solution.reach` of the present unknowns."""
@@ -380,7 +375,7 @@ class GuardedNewton:
         # forces at the nodes, reactions included: what the residual must be small against
         self.convergence.force_scale = max(residual.norm(), self._external.norm())
         residual.axpy(1.0, self._external)
-        self.convergence.prescribed_gap = equilibrium.prescribed_gap(x) / loading.domain.size
+        self.convergence.prescribed_gap = equilibrium.prescribed_gap() / loading.domain.size
         if self.convergence.prescribed_gap > PRESCRIBED_ROUNDING:
             # lifting assembles tangents of the constrained elements; it adds exactly zero once x meets the conditions
             equilibrium.assemble_lifting(self._external, x)

@@ -329,7 +329,7 @@ class FrontsInLayers(WarnsOnce):
         has_front = most - least > FRONT_ANGLE
         jump = "is a mean over elements in which the angle jumps from"
         for name, layer in self._layers.items():
-            share = quadrature.mean(np.repeat(has_front[:, None], quadrature.shape[1], axis=1).astype(float), layer)
+            share = quadrature.mean_of_known(np.repeat(has_front[:, None] * 1.0, quadrature.shape[1], axis=1), layer)
             if share > FRONT_SHARE:
                 inside = (layer & has_front)[:, None]
                 low = quadrature.minimum(np.where(inside, least[:, None], np.inf))

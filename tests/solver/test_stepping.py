@@ -175,7 +175,7 @@ class Refusing:
         force = self.made.loading.values["force"]
         self.tried.append(force)
         if force - self.accepted[-1] > self.limit:
-            raise SolveFailure("too much", 7, 7, Extension(0.9, 0.5, (0.0, 0.0, 0.0)))
+            raise SolveFailure("too much", Solution(7, 7, extension=Extension(0.9, 0.5, (0.0, 0.0, 0.0))))
         self.accepted.append(force)
         return Solution(3, 3)
 
@@ -249,7 +249,7 @@ def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeyp
     def refuse_the_first(newton: GuardedNewton, origin: Any = None, roughly: bool = False) -> Solution:
         tried.append(("loads" if newton is coupling.newton else "cells", made.loading.values["force"]))
         if len(tried) == 1:
-            raise SolveFailure("too much", 7, 7, Extension(0.9, 0.5, (0.0, 0.0, 0.0)))
+            raise SolveFailure("too much", Solution(7, 7, extension=Extension(0.9, 0.5, (0.0, 0.0, 0.0))))
         return Solution(3, 3)
 
     monkeypatch.setattr(GuardedNewton, "solve", refuse_the_first)

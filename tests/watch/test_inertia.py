@@ -19,7 +19,7 @@ from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
 from remodel_fenicsx.solver.diagnosis import Inertia, diagnosed
-from remodel_fenicsx.solver.newton import SolveFailure
+from remodel_fenicsx.solver.newton import SolveFailure, Solution
 from remodel_fenicsx.watch import stability as equilibrium_stability
 from remodel_fenicsx.watch.stability import EquilibriumStability
 from tests import parts
@@ -218,5 +218,5 @@ def test_more_elongation_than_chains_allow_is_chain_locking() -> None:
 @pytest.mark.parametrize(("left", "kind"), [(50.0, "solver tolerance"), (1e6, "")])
 def test_a_residual_that_is_almost_small_enough_is_a_matter_of_the_tolerance(left: float, kind: str) -> None:
     made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
-    failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), left)
+    failure = SolveFailure("refused", Solution(25, 25, extension=Extension(0.7, 1.0, (0.0, 0.0, 0.0))), left)
     assert diagnosed(made.problem().newton, failure).kind == kind
