@@ -299,20 +299,6 @@ class GuardedNewton:
         """Norm of a change of the unknowns; of this rank only those that it owns."""
         return float(np.sqrt(over_ranks(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
-    def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
-        """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve."""
-        self._pull(self._x)
-        slope = self._x.duplicate()
-        set_fraction(done + distance)
-        self._assemble_residual(self._snes, self._x, slope)
-        set_fraction(done)
-        self._assemble_residual(self._snes, self._x, self._residual)
-        slope.axpy(-1.0, self._residual)
-        self._linear.renew()
-        values = self._linear_answer(slope) / distance
-        slope.destroy()
-        return values
-
     def answer(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system."""
         # `tangents` were assembled for that state: the last one counts, or where there is none a new one.
