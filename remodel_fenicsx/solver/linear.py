@@ -115,13 +115,6 @@ class KeptFactor:
         else:
             self.preconditioner.apply(x, y)
 
-    @property
-    def negative_pivots(self) -> int | None:
-        """How many there are, as far as the factors tell (`negative_pivots`)."""
-        if self._kind == SINGLE:
-            return 0
-        return None if self.preconditioner is None else negative_pivots(self.preconditioner)
-
     def renew(self, matrix: Mat) -> None:
         """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
         symmetric = matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
@@ -225,11 +218,6 @@ class GatheredFactor:
         self._scatter: Any = None
         self._right: Any = None  # of the first rank; empty on others
         self._answer: Any = None
-
-    @property
-    def negative_pivots(self) -> int | None:
-        """As `negative_pivots` of the kept factors. Collective."""
-        return self.comm.bcast(self.first.negative_pivots)  # type: ignore[no-any-return]
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """As of `KeptFactor`. Collective."""
@@ -515,37 +503,8 @@ class Lagged(EveryTangent):
         self.secants.forget()
 
 
-def negative_pivots(factorisation: PC) -> int | None:
-    """How many there are, on all ranks; 1 or 0, odd or even, where only the determinant is known; None: nothing is."""
-    if factorisation.getType() == "python":
-        return factorisation.getPythonContext().negative_pivots  # type: ignore[no-any-return]
-    package = factorisation.getFactorSolverType()
-    if package == "cholmod":
-        return 0  # it takes positive definite matrices only
-    if package == "petsc":
-        return _on_the_diagonal(factorisation.getFactorMatrix())
-    if package != "mumps":
-        return None
-    factor = factorisation.getFactorMatrix()
-    found = None
-    if factorisation.getType() == "cholesky":
-        found = factor.getMumpsInfog(12)
-    elif factor.getMumpsIcntl(33):
-        found = int(factor.getMumpsRinfog(12) < 0)
-    return factorisation.comm.tompi4py().bcast(found)  # type: ignore[no-any-return]  # the first rank knows it
-
-
 def uneven(vector: Vec) -> Vec:
     """The vector, filled with what no symmetry leaves unchanged."""
     first, last = vector.getOwnershipRange()
     vector.array[:] = np.sin(1.0 + np.arange(first, last) * np.sqrt(2.0))
     return vector
-
-
-def _on_the_diagonal(factor: Mat) -> int:
-    """Of U in PETSc's own LU, which exchanges no rows: a symmetric matrix is L D L^T, with D its diagonal."""
-    pivots = factor.createVecRight()
-    factor.getDiagonal(pivots)
-    count = int(np.count_nonzero(pivots.array_r < 0))
-    pivots.destroy()
-    return count

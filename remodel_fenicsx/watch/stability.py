@@ -1,4 +1,4 @@
-"""Whether equilibria are stable, by signs from Newton's factors; whether whole bodies of a reduction would buckle."""
+"""Whether equilibria are stable, by the curvature that Newton's factors tell; whether whole bodies of a reduction would buckle."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from remodel_fenicsx.body.reductions import Strut
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce, Watcher
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
-from remodel_fenicsx.solver.linear import negative_pivots, uneven
+from remodel_fenicsx.solver.linear import uneven
 from remodel_fenicsx.state import Earlier, Numbers
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class EquilibriumStability(Watcher):
         self.stepper, self.state = stepper, stepper.state
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
-        self.signs = Signs(stepper)
+        self.curvature = Curvature(stepper)
         self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
         # eigenvalues that are known, and Newton iterations since the last look
         self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
@@ -59,7 +59,7 @@ class EquilibriumStability(Watcher):
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
-        suspicious = self.signs.differ(known) if step.work.newton_iterations else False
+        suspicious = bool(step.work.newton_iterations) and self.curvature.is_negative() and known == 0
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
             overdue = False
@@ -76,7 +76,6 @@ class EquilibriumStability(Watcher):
         if np.isnan(count):
             return
         self._numbers["iterations"] = 0
-        self.signs.settle()
         if count != known:
             self._numbers["known"] = count
             self._judge(step, known, int(count))
@@ -122,29 +121,17 @@ class EquilibriumStability(Watcher):
             log.log(level, *message)
 
 
-class Signs:
-    """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues."""
+class Curvature:
+    """What Newton's last tangent tells for one substitution: the sign of its eigenvalue nearest to zero."""
 
     def __init__(self, stepper: Stepper):
         self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
-        state = stepper.state
-        self._vector = Earlier(state, "stability_vector", state.unknown.copy, 1)
-        self._pivots = Numbers(state, "stability_pivots", {"now": 0, "at_look": 0})  # negative ones
+        self._vector = Earlier(stepper.state, "stability_vector", stepper.state.unknown.copy, 1)
 
-    def differ(self, known: int) -> bool:
-        """Whether they contradict what is known: a number of negative eigenvalues."""
+    def is_negative(self) -> bool:
+        """Whether an equilibrium that was stable no longer seems to be."""
         factorisation = self.newton.factorisation()
-        if factorisation is None:
-            return False
-        before, found = int(self._pivots["at_look"]), negative_pivots(factorisation)
-        now = before if found is None else found
-        self._pivots["now"] = now
-        differs = now % 2 != before % 2 or (now == 0) != (before == 0)
-        return differs or (self._curvature(factorisation) < 0 and known == 0)
-
-    def settle(self) -> None:
-        """The eigenvalues have been counted: from now on what differs from the present signs is news."""
-        self._pivots["at_look"] = self._pivots["now"]
+        return factorisation is not None and self._curvature(factorisation) < 0
 
     def _curvature(self, factorisation: PETSc.PC) -> float:
         """Of the remembered vector after one more inverse iteration."""
