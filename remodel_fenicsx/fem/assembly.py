@@ -233,15 +233,6 @@ def point_values(value: Constant | Function, quadrature: Quadrature) -> NDArray[
     return np.full(quadrature.shape, float(np.real(value.value)))
 
 
-def largest(value: Constant | Function, mesh: Mesh) -> float:
-    """Largest value of a coefficient in the body, over all ranks."""
-    if isinstance(value, dolfinx.fem.Function):
-        owned = value.function_space.dofmap.index_map.size_local
-        local = float(np.max(np.real(value.x.array[:owned]), initial=-np.inf))
-        return float(mesh.comm.allreduce(local, MPI.MAX))
-    return float(np.real(value.value))
-
-
 # ---------------------------------------------------------------- values computed once for each state
 
 
@@ -263,7 +254,7 @@ class Remembered(Generic[T]):
     def __call__(self, make: Callable[[], T]) -> T:
         """The value, of `make` where it is not known yet."""
         numbers = [number.tobytes() for number in self._numbers]
-        known = numbers == self._seen_numbers and all(map(_same, self._arrays, self._seen))
+        known = numbers == self._seen_numbers and all(map(np.array_equal, self._arrays, self._seen))
         if self._comm is not None:
             known = bool(over_ranks(self._comm, known, MPI.LAND))
         if not known:
@@ -280,13 +271,9 @@ class Remembered(Generic[T]):
         if not self._seen:
             self._seen = [array.copy() for array in self._arrays]
         for array, seen in zip(self._arrays, self._seen, strict=True):
-            if not _same(array, seen):
+            if not np.array_equal(array, seen):
                 seen[:] = array
         self._seen_numbers = numbers
-
-
-def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    return bool((one == other).all())
 
 
 # ---------------------------------------------------------------- the tangent of an energy

@@ -284,7 +284,6 @@ class Blend:
     def __init__(self, state: State, tissue: Tissue, settings: Solver):
         self.state, self.tissue, self.settings = state, tissue, settings
         self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
-        self._newton: GuardedNewton | None = None
 
     @functools.cached_property
     def equilibrium(self) -> Equilibrium:
@@ -296,18 +295,15 @@ class Blend:
 
         return Equilibrium(self.state, self.tissue, shares(old.ufl_cell, new.ufl_cell, self.theta), at_points)
 
-    @property
+    @functools.cached_property
     def newton(self) -> GuardedNewton:
         """The solver."""
-        if self._newton is None:
-            self._newton = GuardedNewton(self.equilibrium, self.settings, robust=True)
-        return self._newton
+        return GuardedNewton(self.equilibrium, self.settings, robust=True)
 
     def close(self) -> None:
         """Free PETSc's objects."""
-        if self._newton is not None:
-            self._newton.close()
-            self._newton = None
+        if "newton" in vars(self):
+            vars(self).pop("newton").close()
 
     def set(self, fraction: float) -> None:
         """theta."""

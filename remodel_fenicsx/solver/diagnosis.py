@@ -126,9 +126,10 @@ class Inertia:
     def cosine(self, mode: Mode, direction: Array) -> float:
         """Of the angle between a mode and another change of the unknowns, without its sign."""
         owned = self.equilibrium.state.number_of_owned_unknowns
-        mine, other = mode.displacement[:owned], direction[:owned]
-        products = self.equilibrium.comm.allreduce(np.array([mine @ other, mine @ mine, other @ other]), MPI.SUM)
-        return float(abs(products[0]) / np.sqrt(max(products[1] * products[2], np.finfo(np.float64).tiny)))
+        both = np.array([mode.displacement, direction])[:, :owned]
+        products = self.equilibrium.comm.allreduce(both @ both.T)
+        size = np.sqrt(products[0, 0] * products[1, 1])
+        return float(abs(products[0, 1]) / max(size, np.finfo(np.float64).tiny))
 
     # ------------------------------------------------------------ matrices
     def _assemble(self) -> None:
@@ -172,12 +173,10 @@ class Inertia:
 
     def _without_prescribed(self, matrix: PETSc.Mat) -> PETSc.Mat:
         """A copy in which the prescribed unknowns have an eigenvalue of the size of the largest ones, not one."""
-        matrix, diagonal = matrix.copy(), matrix.createVecRight()
-        matrix.getDiagonal(diagonal)
-        local = diagonal.array
-        held = ~np.isnan(self.equilibrium.prescribed_values()[: len(local)])
-        largest = float(np.max(np.abs(local[~held]), initial=0.0))
-        local[held] = self.equilibrium.comm.allreduce(largest, MPI.MAX)
+        matrix, diagonal = matrix.copy(), matrix.getDiagonal()
+        held = ~np.isnan(self.equilibrium.prescribed_values()[: diagonal.getLocalSize()])
+        largest = matrix.norm(PETSc.NormType.NORM_INFINITY)
+        diagonal.array[held] = largest
         matrix.setDiagonal(diagonal)
         diagonal.destroy()
         return matrix
@@ -205,12 +204,9 @@ class Inertia:
         nodes = state.kinematics.nodal_space(state.unknown).tabulate_dof_coordinates()
         largest = self.equilibrium.comm.allreduce(float(np.max(amplitude, initial=0.0)), MPI.MAX)
         # of nodes that symmetry makes equal the first one in space, whatever the number of ranks
-        candidates = [
-            tuple(float(round(c, 12)) + 0.0 for c in node) for node in nodes[amplitude >= (1 - 1e-6) * largest]
-        ]
-        found = [node for rank in self.equilibrium.comm.allgather(candidates) for node in rank]
-        x, y, z = min(found)
-        return Mode(eigenvalue, (x, y, z), function.x.array.copy())
+        candidates = (np.round(nodes[amplitude >= (1 - 1e-6) * largest], 12) + 0.0).tolist()
+        place = min(tuple(node) for rank in self.equilibrium.comm.allgather(candidates) for node in rank)
+        return Mode(eigenvalue, place, function.x.array.copy())
 
 
 def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:

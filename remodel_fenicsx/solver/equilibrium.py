@@ -183,7 +183,7 @@ class Equilibrium:
             internal[0] += self.pointwise.residual(u, F, test) * weight * dx
             tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
         self.internal_forms = [jit.form(form) for form in internal]
-        self.external_form = None if external is None else jit.form(external)
+        self.external_forms = [] if external is None else [jit.form(external)]
         # apart, so that bodies with other loads share the costly one
         self.tangent_forms = [jit.form(form) for form in tangents]
         if external is not None and _depends_on(external, u):
@@ -286,7 +286,7 @@ class Equilibrium:
 
     def assemble_external(self, vector: PETSc.Vec) -> None:
         """Minus the nodal forces of the loads."""
-        self._assemble(vector, [] if self.external_form is None else [self.external_form])
+        self._assemble(vector, self.external_forms)
 
     def _assemble(self, vector: PETSc.Vec, forms: Sequence[dolfinx.fem.Form]) -> None:
         with vector.localForm() as local:

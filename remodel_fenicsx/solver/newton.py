@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import dolfinx.fem.petsc
 import numpy as np
@@ -309,13 +307,9 @@ class GuardedNewton:
         dolfinx.fem.petsc.set_bc(self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0)
         if not (self._linear.tangents if self._linear.keeps else tangents):
             self._linear.renew()
-        return self._linear_answer(self._residual)
-
-    def _linear_answer(self, residual: PETSc.Vec) -> Array:
-        """Change of the unknowns that the tangent gives for a residual, ghosts included."""
         solver, direction = self._snes.getKSP(), self._x.duplicate()
         solver.setOperators(self._matrix)
-        solver.solve(residual, direction)
+        solver.solve(self._residual, direction)
         direction.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
         with direction.localForm() as local:
             values = -local.array_r

@@ -1,9 +1,10 @@
-"""Whether equilibria are stable, by the curvature that Newton's factors tell; whether whole bodies of a reduction would buckle."""
+"""Whether equilibria are stable, by the tangent's curvature; whether whole bodies of a reduction would buckle."""
 
 from __future__ import annotations
 
 import itertools
 import logging
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +42,6 @@ class EquilibriumStability(Watcher):
         self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
         # eigenvalues that are known, and Newton iterations since the last look
         self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
-        self._unloaded: tuple[int, float] | None = None
 
     def close(self) -> None:
         """Free PETSc's objects."""
@@ -66,9 +66,8 @@ class EquilibriumStability(Watcher):
             if step.is_last:
                 self._say(
                     logging.INFO,
-                    "the stability of equilibria was not checked: with %d unknowns that is done only on request, by "
-                    "the column negative_eigenvalues or solver.unstable = 'stop'",
-                    self.unknowns,
+                    f"the stability of equilibria was not checked: with {self.unknowns} unknowns that is done only on "
+                    "request, by the column negative_eigenvalues or solver.unstable = 'stop'",
                 )
         if not (suspicious or overdue or self.every_step):
             return
@@ -85,40 +84,34 @@ class EquilibriumStability(Watcher):
         try:
             return self.inertia.negative_eigenvalues()
         except FactorisationFailed as failure:
-            self._say(logging.WARNING, "the stability of the equilibrium is not known: %s", failure)
+            self._say(logging.WARNING, f"the stability of the equilibrium is not known: {failure}")
             return float("nan")
 
     def _judge(self, step: Step, before: int, now: int) -> None:
         if now < before:
-            self._say(logging.INFO, "%s: %s of the tangent, %d before", step.moment, eigenvalues(now), before)
+            self._say(logging.INFO, f"{step.moment}: {eigenvalues(now)} of the tangent, {before} before")
             return
-        unloaded, scale = self._of_the_unloaded_body()
+        unloaded, scale = self._unloaded
         if now <= unloaded:
             self._say(
                 logging.INFO,
-                "%s: %s of the tangent. The unloaded body has %d, from the stress of its cells at the start: the "
-                "equilibrium is not lost",
-                step.moment,
-                eigenvalues(now),
-                unloaded,
+                f"{step.moment}: {eigenvalues(now)} of the tangent. The unloaded body has {unloaded}, from the "
+                "stress of its cells at the start: the equilibrium is not lost",
             )
             return
         text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
         if self.stops:
             raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
-        self._say(
-            logging.WARNING, "%s: the equilibrium is unstable, and the body would leave it: %s", step.moment, text
-        )
+        unstable = f"{step.moment}: the equilibrium is unstable, and the body would leave it: {text}"
+        self._say(logging.WARNING, unstable)
 
-    def _of_the_unloaded_body(self) -> tuple[int, float]:
-        """`of_the_unloaded_body`, once."""
-        if self._unloaded is None:
-            self._unloaded = of_the_unloaded_body(self.inertia)
-        return self._unloaded
+    @cached_property
+    def _unloaded(self) -> tuple[int, float]:
+        return of_the_unloaded_body(self.inertia)
 
-    def _say(self, level: int, *message: object) -> None:
+    def _say(self, level: int, text: str) -> None:
         if self.state.comm.rank == 0:
-            log.log(level, *message)
+            log.log(level, "%s", text)
 
 
 class Curvature:
@@ -226,7 +219,9 @@ class BucklingWarning(WarnsOnce):
         for i, j in itertools.combinations_with_replacement(range(3), 2):
             H[i, j] = H[j, i] = self._derivative(i, j)
         coupling = H[:2, ALONG].T[..., None]
-        modulus = H[ALONG, ALONG] - (coupling * np.linalg.solve(H[:2, :2].transpose(2, 0, 1), coupling)).sum(axis=(1, 2))
+        modulus = H[ALONG, ALONG] - (coupling * np.linalg.solve(H[:2, :2].transpose(2, 0, 1), coupling)).sum(
+            axis=(1, 2)
+        )
         around = np.einsum("nij,nj->ni", self.state.elastic_gradient(), self._directions[:, :, AROUND])
         squares = self.strut.squared_distances(self._places) * np.square(around).sum(axis=1)
         length = self._length()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import dolfinx.fem
@@ -34,8 +33,8 @@ DRIVEN = 0.9
 # Jumps between linear elements count so many times: at a wall, where strain varies most, an element has neighbours on
 # one side, and half of the jump
 JUMPS = 4.0
-# Part of the motion across an elongated body that it lacks, over the share of volume changes in the matrix's energy: 1.6
-# to 3.3 where the tangent was asked (tubes, elongation 0.1, lambda/mu from 8.8 to 250)
+# Part of the motion across an elongated body that it lacks, over the share of volume changes in the
+# matrix's energy: 1.6 to 3.3 where the tangent was asked (tubes, elongation 0.1, lambda/mu 8.8 to 250)
 HELD_BACK = 2.5
 TURNED_BY_NOISE = 2.0
 """Degrees by which noise of the pressure turns tensions, from which on it is said. Of 150 random tubes with lambda/mu
@@ -58,27 +57,30 @@ class Missing(NamedTuple):
     shape: float
 
 
-class LockingWarning(WarnsOnce):
+class ElementWarning(WarnsOnce):
+    """What warnings of elements know of the tissue: lambda and mu at this rank's own points."""
+
+    def __init__(self, stepper: Stepper, remedy: str = REMEDY):
+        super().__init__(stepper)
+        tissue, shape = self.state.parameters(stepper.tissue).at_points(), self.quadrature.shape
+        self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
+        self.ratio, self.remedy = self.quadrature.maximum(self.stiffnesses[0] / self.stiffnesses[1]), remedy
+
+
+class LockingWarning(ElementWarning):
     """Says once that elements hold the body back, as soon as a solved state shows it."""
 
     name = "locking"
 
     def __init__(self, stepper: Stepper, locks: bool, remedy: str = REMEDY):
-        super().__init__(stepper)
-        tissue = self.state.parameters(stepper.tissue).at_points()
-        shape = self.quadrature.shape
-        self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
-        self.locks, self.remedy = locks, remedy
+        super().__init__(stepper, remedy)
+        self.locks = locks
 
     @classmethod
     def of(cls, scene: Scene, stepper: Stepper) -> LockingWarning | None:
         if stepper.state.kinematics.homogeneous:  # there are no elements that could hold it back
             return None
         return cls(stepper, FORMULATIONS[scene.mesh.formulation].locks, remedy(scene))
-
-    def stiffness_ratio(self) -> float:
-        """Largest lambda/mu in the body."""
-        return self.quadrature.maximum(self.stiffnesses[0] / self.stiffnesses[1])
 
     def missing(self) -> Missing:
         """Return what the present state lacks; zero if neither loads nor prescribed displacements deform the body."""
@@ -147,7 +149,7 @@ class LockingWarning(WarnsOnce):
         lacks = f"displacements are off by about {100 * min(sum(missing), 1.0):.2g} %"
         if missing.volume >= missing.shape:
             return (
-                f"the elements lock, {lacks} (lambda/mu up to {self.stiffness_ratio():.4g}); {self.remedy} "
+                f"the elements lock, {lacks} (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
                 "(docs/theory.md, Volumetric locking)"
             )
         return (
@@ -156,18 +158,10 @@ class LockingWarning(WarnsOnce):
         )
 
 
-class PressureNoise(WarnsOnce):
+class PressureNoise(ElementWarning):
     """Says once that the pressure inside elements, not that of the body, decides where the cells turn."""
 
     name = "pressure_noise"
-
-    def __init__(self, stepper: Stepper, remedy: str = REMEDY):
-        super().__init__(stepper)
-        self.remedy = remedy
-        points = self.state.parameters(stepper.tissue).at_points()
-        lame = points.lame_lambda.reshape(self.quadrature.shape)
-        self.stiffness = self.quadrature.owned(lame)
-        self.ratio = self.quadrature.maximum(lame / points.lame_mu.reshape(self.quadrature.shape))
 
     @classmethod
     def of(cls, scene: Scene, stepper: Stepper) -> PressureNoise | None:
@@ -177,7 +171,7 @@ class PressureNoise(WarnsOnce):
 
     def degrees(self) -> float:
         """Mean over the body of the angle by which the noise turns the tensions of the present state."""
-        quadrature, stiffness = self.quadrature, self.stiffness
+        quadrature, stiffness = self.quadrature, self.stiffnesses[0]
         F, tensor = (values[: stiffness.size] for values in self.stepper.remodeling.driving_tensor())
         J = np.linalg.det(F)
         logarithm = np.log(J).reshape(stiffness.shape)
@@ -270,24 +264,28 @@ class WeakTension(WarnsOnce):
             )
 
 
-class RadialChains(WarnsOnce):
+class ShapeWarning(WarnsOnce):
+    """What a shape knows of the directions of chains."""
+
+    def __init__(self, stepper: Stepper, shape: Shape):
+        super().__init__(stepper)
+        self.shape = shape
+
+    @classmethod
+    def of(cls, scene: Scene, stepper: Stepper) -> ShapeWarning | None:
+        return cls(stepper, scene.geometry)
+
+
+class RadialChains(ShapeWarning):
     """Says once that more than half of the chains point out of the wall."""
 
     name, level = "radial_chains", NOTICE
-
-    def __init__(self, stepper: Stepper, radial_share: Callable[[Array, Array, Array], Array]):
-        super().__init__(stepper)
-        self.radial_share = radial_share
-
-    @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> RadialChains:
-        return cls(stepper, scene.geometry.radial_share)
 
     def look(self, step: Step) -> str:
         """Measure their share."""
         cells = self.state.cells
         share = self.quadrature.mean(
-            self.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+            self.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
         )
         if not share > RADIAL_SHARE:
             return ""
@@ -297,24 +295,10 @@ class RadialChains(WarnsOnce):
         )
 
 
-class FrontsInLayers(WarnsOnce):
+class FrontsInLayers(ShapeWarning):
     """Warns at the end where a layer's mean fibre angle is one of two families, with a front between them."""
 
     name = "fronts"
-
-    def __init__(self, stepper: Stepper, shape: Shape):
-        super().__init__(stepper)
-        self.shape = shape
-        nodes = geometry_dofmap(self.quadrature.mesh)
-        depths = self.state.cells.local_axes.nodal_depth[nodes] if shape.angle_layers else np.zeros(nodes.shape)
-        self._layers = {
-            name: (depths.min(axis=1) <= share + 1e-6) & (depths.max(axis=1) >= share - 1e-6)
-            for name, share in shape.angle_layers.items()
-        }
-
-    @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> FrontsInLayers | None:
-        return cls(stepper, scene.geometry) if scene.geometry.angle_layers else None
 
     def due(self, step: Step) -> bool:
         return step.is_last
@@ -322,13 +306,17 @@ class FrontsInLayers(WarnsOnce):
     def look(self, step: Step) -> str:
         """At the last state."""
         cells, quadrature = self.state.cells, self.quadrature
+        if not self.shape.angle_layers:
+            return ""
+        depths = cells.local_axes.nodal_depth[geometry_dofmap(quadrature.mesh)]
         angles = self.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
         known, found = ~np.isnan(angles), []
         least = np.where(known, angles, np.inf).min(axis=1)
         most = np.where(known, angles, -np.inf).max(axis=1)
         has_front = most - least > FRONT_ANGLE
         jump = "is a mean over elements in which the angle jumps from"
-        for name, layer in self._layers.items():
+        for name, depth in self.shape.angle_layers.items():
+            layer = (depths.min(axis=1) <= depth + 1e-6) & (depths.max(axis=1) >= depth - 1e-6)
             share = quadrature.mean_of_known(np.repeat(has_front[:, None] * 1.0, quadrature.shape[1], axis=1), layer)
             if share > FRONT_SHARE:
                 inside = (layer & has_front)[:, None]

@@ -55,7 +55,7 @@ def test_loads_are_what_their_names_say() -> None:
     problem = made.problem()
     for loads, total in (({"force": 3.0, "pressure": 0.0}, [0, 0, 3]), ({"force": 0.0, "pressure": 5.0}, [-20, 0, 0])):
         made.loading.set(loads)
-        external = -dolfinx.fem.assemble_vector(problem.external_form).array.reshape(-1, 3)
+        external = -dolfinx.fem.assemble_vector(problem.external_forms[0]).array.reshape(-1, 3)
         np.testing.assert_allclose(external.sum(axis=0), total, atol=1e-13)
         assert made.loading.values == {**loads, "elongation": 0.0}
     made.loading.set({"elongation": 0.1})
@@ -171,7 +171,9 @@ def test_no_point_that_turns_is_left_out() -> None:
         G = F + size * rng.normal(size=F.shape)
         expected = passes_through_zero(F, G)
         for at in range(len(F)):
-            ends = [Look(problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1]) for X in (F, G)]
+            ends = [
+                Look(problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1]) for X in (F, G)
+            ]
             assert problem.turns_inside_out(*ends) == expected[at]
     assert expected.any() and not expected.all()
 

@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from remodel_fenicsx import Scene, read_scene
 from remodel_fenicsx.evolution.stepper import Step
-from remodel_fenicsx.fem.solver_methods import ProblemOptions
-from remodel_fenicsx.fem.solver_methods import SYMMETRIC, factor_options, method_options
 from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.equilibrium import Extension
