@@ -534,7 +534,9 @@ class Parameters:
         """The largest value of each in the body, numbers. Collective."""
 
         def found() -> Tissue:
-            whole = self.compiled.map(lambda name, value: assembly.largest(value, self.quadrature.mesh))
+            whole = self.compiled.map(
+                lambda name, value: self.quadrature.maximum(assembly.point_values(value, self.quadrature))
+            )
             if not isinstance(self.tissue.contour_length, dolfinx.fem.Function):
                 return whole
             lengths = self.at_points().contour_length.reshape(self.quadrature.shape)

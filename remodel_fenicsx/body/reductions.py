@@ -111,17 +111,13 @@ def cylinder(radius: float, length: float) -> Body:
 
 @dataclass(frozen=True)
 class Strut:
-    """A body along z that thrust may bend, and suction make oval."""
+    """A body along z that thrust may bend."""
 
     length: float
     end_factor: float
     directions: Callable[[Array], Array]
     squared_distances: Callable[[Array], Array]
-    radii: tuple[float, float] | None = None
-
-    def euler_load(self, bending_stiffness: float, length: float) -> float:
-        """pi^2 EI / (k length)^2."""
-        return math.pi**2 * bending_stiffness / (self.end_factor * length) ** 2
+    inner_radius: float | None = None
 
 
 Rule = Callable[[Any], str | None]

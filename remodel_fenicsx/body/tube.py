@@ -487,8 +487,8 @@ class Tube(RoundWall):
         def squared_distances(places: Array) -> Array:
             return np.square(places[:, :2]).sum(axis=1) / 2
 
-        radii, factor = (self.inner_radius, self.outer_radius), 0.5 if ends == "clamped" else 1.0
-        return reduced.Strut(self.length, factor, reduced.about_z, squared_distances, radii)
+        factor = 0.5 if ends == "clamped" else 1.0
+        return reduced.Strut(self.length, factor, reduced.about_z, squared_distances, self.inner_radius)
 
     def depth(self, coordinates: Array) -> Array:
         """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""

@@ -252,9 +252,7 @@ class Homeostasis:
     def remodel(self, time: float) -> float:
         """Nothing is left to do but to say how far the state is from the cells of its own stress."""
         self.remodeling.look_ahead(time, self._residual)
-        quadrature, r0 = self.quadrature, float(
-            assembly.largest(self.stepper.tissue.end_to_end_length, self.quadrature.mesh)
-        )
+        quadrature, r0 = self.quadrature, self.remodeling.parameters.largest().end_to_end_length
         left = self.remodeling.distance() / r0**2
         self._say(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)
         jump, place = self._largest_jump()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import Remembered, coefficient, over_ranks, point_values
-from remodel_fenicsx.kernels import in_numpy
+from remodel_fenicsx.kernels import TensorKernels, in_numpy
 from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
@@ -86,8 +86,6 @@ class RemodelingPass(Remodels):
         self._known: Remembered[Array] = Remembered(state.comm, tensor)
         self._target = self.law.target
         if self._target is tensor_target and not settings.has_set_point and not in_numpy():
-            from remodel_fenicsx.kernels.tensor import TensorKernels
-
             self._target = TensorKernels(state.comm).target  # with the exponent 2 and no threshold
 
     @property

@@ -112,12 +112,11 @@ class SolveStopped(ArithmeticError):
 
 
 class Positive:
-    """A positive definite form: its matrix, which several solves share. Collective."""
+    """A positive definite form, which several solves share. Collective."""
 
     def __init__(self, bilinear: ufl.Form):
-        form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
-        self._matrix = create_matrix(form)
-        assemble_matrix(self._matrix, [form], [])
+        self._form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
+        self._matrix = create_matrix(self._form)
 
     @cached_property
     def _degree_one(self) -> tuple[FunctionSpace, PETSc.Mat]:
@@ -133,21 +132,19 @@ class Positive:
         """The function u with bilinear(u, v) = linear(v) for all v; linear is 0 where it is None. Collective."""
         # Conjugate gradients, with no memory for factors. Multigrid is for where what is held is far away; it cannot be
         # where all is held.
-        unknown = dolfinx.fem.Function(self.space)
-        answer, matrix = unknown.x.petsc_vec, self._matrix.copy() if conditions else self._matrix
+        unknown, matrix = dolfinx.fem.Function(self.space), self._matrix
+        answer = unknown.x.petsc_vec
         load = answer.duplicate()
+        assemble_matrix(matrix, [self._form], conditions)
+        with load.localForm() as local:
+            local.array_w[:] = 0.0
         if linear is not None:
-            external = dolfinx.fem.assemble_vector(jit.form(linear))
-            external.scatter_reverse(dolfinx.la.InsertMode.add)
-            load.array[:] = external.array[: load.getLocalSize()]
-        held = []
+            dolfinx.fem.petsc.assemble_vector(load, jit.form(linear))
+        dolfinx.fem.petsc.apply_lifting(load, [self._form], bcs=[conditions])
+        load.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        dolfinx.fem.petsc.set_bc(load, conditions)
         for condition in conditions:
             condition.set(unknown.x.array)
-            dofs, _ = condition.dof_indices()  # of a vector, dolfinx counts ghosts among its own ones
-            held.append(dofs[dofs < load.getLocalSize()])
-        if conditions:
-            rows = np.unique(np.concatenate(held)) + answer.getOwnershipRange()[0]
-            matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0, answer, load)
         solver = PETSc.KSP().create(matrix.comm)
         solver.setOperators(matrix)
         solver.setType("cg")
@@ -160,7 +157,7 @@ class Positive:
         solver.solve(load, answer)
         reason, iterations = solver.getConvergedReason(), solver.getIterationNumber()
         unknown.x.scatter_forward()
-        for thing in (solver, load, *([levels] if levels else []), *([matrix] if conditions else [])):
+        for thing in (solver, load, *([levels] if levels else [])):
             thing.destroy()
         if reason < 0:
             raise SolveStopped(f"the linear solve stopped after {iterations} iterations (reason {reason} of PETSc)")
@@ -236,15 +233,6 @@ def point_values(value: Constant | Function, quadrature: Quadrature) -> NDArray[
     return np.full(quadrature.shape, float(np.real(value.value)))
 
 
-def largest(value: Constant | Function, mesh: Mesh) -> float:
-    """Largest value of a coefficient in the body, over all ranks."""
-    if isinstance(value, dolfinx.fem.Function):
-        owned = value.function_space.dofmap.index_map.size_local
-        local = float(np.max(np.real(value.x.array[:owned]), initial=-np.inf))
-        return float(mesh.comm.allreduce(local, MPI.MAX))
-    return float(np.real(value.value))
-
-
 # ---------------------------------------------------------------- values computed once for each state
 
 
@@ -266,7 +254,7 @@ class Remembered(Generic[T]):
     def __call__(self, make: Callable[[], T]) -> T:
         """The value, of `make` where it is not known yet."""
         numbers = [number.tobytes() for number in self._numbers]
-        known = numbers == self._seen_numbers and all(map(_same, self._arrays, self._seen))
+        known = numbers == self._seen_numbers and all(map(np.array_equal, self._arrays, self._seen))
         if self._comm is not None:
             known = bool(over_ranks(self._comm, known, MPI.LAND))
         if not known:
@@ -283,13 +271,9 @@ class Remembered(Generic[T]):
         if not self._seen:
             self._seen = [array.copy() for array in self._arrays]
         for array, seen in zip(self._arrays, self._seen, strict=True):
-            if not _same(array, seen):
+            if not np.array_equal(array, seen):
                 seen[:] = array
         self._seen_numbers = numbers
-
-
-def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    return bool((one == other).all())
 
 
 # ---------------------------------------------------------------- the tangent of an energy

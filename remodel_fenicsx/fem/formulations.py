@@ -188,6 +188,7 @@ class _PartsApart(Dilatation):
         degree: int,
     ):
         from remodel_fenicsx.fem import jit
+        from remodel_fenicsx.fem.quadrature import shape_functions
 
         super().__init__(quadrature)
         self.dx = ufl.Measure("dx", domain=quadrature.mesh, metadata={"quadrature_degree": degree})
@@ -195,8 +196,7 @@ class _PartsApart(Dilatation):
         points = np.asarray(basix.make_quadrature(kind, degree)[0], dtype=np.float64)
         jacobian = ufl.det(kinematics.elastic_gradient(unknown))
         self._expression = jit.expression(jacobian, points, "J where the formulation takes it")
-        polynomials = basix.create_element(basix.ElementFamily.P, kind, degree // 2, discontinuous=True)
-        there, here = (np.asarray(polynomials.tabulate(0, p))[0, :, :, 0] for p in (points, quadrature.points))
+        there, here = (shape_functions(kind.name, degree // 2, p)[0] for p in (points, quadrature.points))
         self._interpolation = here @ np.linalg.pinv(there)  # exactly one and the same where the rule has one point
         self.jacobian = quadrature.function("jacobian_of_the_formulation", ())
         self.refresh()

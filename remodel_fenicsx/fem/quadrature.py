@@ -92,16 +92,15 @@ class Quadrature:
         points, weights = basix.make_quadrature(basix.CellType[self.element_kind], self.degree)
         self.points: NDArray[np.float64] = np.asarray(points, dtype=np.float64)
         self.weights: NDArray[np.float64] = np.asarray(weights, dtype=np.float64)
-        self.number_of_owned_elements = mesh.topology.index_map(mesh.topology.dim).size_local
-        self.elements = np.arange(
-            self.number_of_owned_elements + mesh.topology.index_map(mesh.topology.dim).num_ghosts, dtype=np.int32
-        )
+        dimension = mesh.topology.dim
+        elements = mesh.topology.index_map(dimension)
+        self.number_of_owned_elements = elements.size_local
+        self.elements = np.arange(elements.size_local + elements.num_ghosts, dtype=np.int32)
         self.shape = len(self.elements), len(self.weights)
         self.coordinates, lengths = self._geometry()
         # the product of an element's extents is |det J|, on lines and surfaces too
         self.volumes: NDArray[np.float64] = lengths.prod(axis=2) * self.weights
-        number = mesh.topology.index_map(mesh.topology.dim).size_global
-        self.extent = float((self.integral(np.ones(self.shape)) / number) ** (1 / mesh.topology.dim))
+        self.extent = float((self.integral(np.ones(self.shape)) / elements.size_global) ** (1 / dimension))
         if not isinstance(weight, (int, float)):
             weight = self.evaluate(jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ())
         self.volumes = self.volumes * weight
@@ -159,12 +158,9 @@ class Quadrature:
         local = float((self.owned(values) * self.owned(self.volumes)).sum())
         return float(over_ranks(self.mesh.comm, local, MPI.SUM))
 
-    def mean(self, values: NDArray[np.float64], elements: NDArray[np.bool_] | None = None) -> float:
-        """Volume mean of values (elements, points), over all elements or those selected by a mask (elements,)."""
-        if elements is None:
-            return self.integral(values) / self.volume
-        chosen = np.repeat(elements[:, None], self.shape[1], axis=1).astype(np.float64)
-        return self.integral(values * chosen) / self.integral(chosen)
+    def mean(self, values: NDArray[np.float64]) -> float:
+        """Volume mean of values (elements, points)."""
+        return self.integral(values) / self.volume
 
     def mean_of_known(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
         """Volume mean over the points whose value is known, not NaN; NaN where there is none.
@@ -200,8 +196,7 @@ class Quadrature:
 
     def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
-        means = self._shares[:, None] @ values.reshape(*values.shape[:2], int(np.prod(values.shape[2:])))
-        return means.reshape(len(values), *values.shape[2:])
+        return np.einsum("ep,ep...->e...", self._shares, values)
 
     def element_mean_of_known(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volume mean over the points of each element whose value is not NaN, (elements, points) to (elements,)."""
@@ -281,10 +276,10 @@ class Quadrature:
     def place_of_largest(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
         """Reference place of the largest of values (elements, points), over all ranks."""
         owned = self.owned(values)
-        local = (-np.inf, (np.nan, np.nan, np.nan))
+        local: tuple[float, tuple[float, float, float]] = (-np.inf, (np.nan, np.nan, np.nan))
         if owned.size:
-            point = self.coordinates[np.unravel_index(int(np.argmax(owned)), owned.shape)]
-            local = (float(owned.max()), (float(point[0]), float(point[1]), float(point[2])))
+            at = np.unravel_index(int(np.argmax(owned)), owned.shape)
+            local = (float(owned[at]), tuple(self.coordinates[at].tolist()))
         return max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
 
     def shown_place_of_largest(self, values: NDArray[np.float64]) -> str:

@@ -63,7 +63,6 @@ NEWTON = {"snes_type": "newtonls", "snes_linesearch_type": "basic"}
 BY_MUMPS = {
     "pc_type": "lu",
     "pc_factor_mat_solver_type": "mumps",
-    "mat_mumps_icntl_33": 1,  # the determinant, whose sign tells of unstable equilibria; costs nothing
 }
 ON_ONE_RANK = {
     "pc_type": "telescope",
@@ -124,7 +123,6 @@ FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "mumps",
         "mat_mumps_icntl_7": 3,  # SCOTCH, as fast as any; PORD ends the process for some small matrices
-        "mat_mumps_icntl_33": 1,
     },
     GENERAL: SOLVER_METHODS["direct"].options,
 }
@@ -155,7 +153,7 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, ob
     """PETSc options of a method on so many ranks; `small`: for a problem that `is_small`, on one rank."""
     options = dict(SOLVER_METHODS[method].options)
     if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":
-        options |= {"pc_factor_mat_solver_type": "petsc", "mat_mumps_icntl_33": False}
+        options["pc_factor_mat_solver_type"] = "petsc"
     if ranks > 1:
         options |= SOLVER_METHODS[method].on_several_ranks
         if options.get("pc_type") == "telescope":

@@ -1,6 +1,6 @@
 """What is computed at every quadrature point, in C: compiled like the forms, held against Python by tests.
 
-`Library` compiles the C files and calls them; there is a method for each function, here or in `tensor`. Most stand for
+`Library` compiles the C files and calls them; there is a method for each function. Most stand for
 a function of the package: it is the reference, decides where C leaves a point open, and runs in its place with
 ``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger. Those of `factor`, which calls CHOLMOD, stand for
 none: without them factors are PETSc's, in double precision.
@@ -13,9 +13,6 @@ positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
 squared_length      model.energy.squared_end_to_end_length
 structure           model.cells.structure_tensor
-extension           kernels.PointKernels.extension
-may_turn            kernels.PointKernels.may_turn
-room                kernels.PointKernels.room
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
@@ -32,7 +29,7 @@ import functools
 import logging
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -43,9 +40,11 @@ from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.model import cells, energy, spectral
+from remodel_fenicsx.model import cells, energy, spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.drivers import rotated_back
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.system import NOTICE, environment
 
 log = logging.getLogger(__name__)
@@ -57,6 +56,8 @@ FOLDER = Path(__file__).parent
 NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 NOT_FINITE = 2  # mark of a point with NaN or infinity
 HEADER = "suitesparse/cholmod.h"
+NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
+"""What tensor.c takes from Python: the numbers that tune."""
 FIRST = 5  # CHOLMOD's version that has single precision
 
 
@@ -113,11 +114,6 @@ class Library:
         """What a function returns. Arrays that it writes to are contiguous; None is a null pointer."""
         return getattr(self._functions, name)(*map(self._argument, arguments))
 
-    def number(self, name: str) -> int | None:
-        """Of a part of the model that the file knows by this name; None where it does not."""
-        found = getattr(self._functions, name, None) if name else None
-        return found if isinstance(found, int) else None
-
     def _argument(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):
             if value.dtype in (np.bool_, np.uint8):
@@ -132,8 +128,6 @@ def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
     """The tissue with its repulsion in C, where it is `log`."""
     if tissue.chain is None or tissue.repulsion.sum is not energy.log_sum or in_numpy():
         return tissue
-    from remodel_fenicsx.kernels.tensor import TensorKernels  # with the law `tensor`: most runs need neither
-
     kernels = TensorKernels(comm)
     return replace(
         tissue, repulsion=replace(tissue.repulsion, sum=kernels.log_sum, derivatives=kernels.log_derivatives)
@@ -154,26 +148,6 @@ class PointKernels:
     def squared_length(self, F: Array, cell: UnitCell) -> Array:
         """`energy.squared_end_to_end_length` of one whole cell."""
         return np.asarray(energy.squared_end_to_end_length(F, [cell]))
-
-    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
-        """How far points are from their limits: r/L (n,), the number of the largest, and the smallest J."""
-        with np.errstate(invalid="ignore"):
-            stretch = np.sqrt(states[:, 0]) / length
-        stretch[~np.isfinite(stretch)] = np.inf
-        smallest = states[:, 1].min(initial=np.inf) if np.isfinite(states[:, 1]).all() else -np.inf
-        return stretch, int(np.argmax(stretch)) if stretch.size else 0, float(smallest)
-
-    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
-        """Which points `tensors.passes_through_zero` has to be asked for, by number; states (n, 11) of both ends."""
-        # |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular.
-        F, J, change = before[:, 2:], before[:, 1], after[:, 2:] - before[:, 2:]
-        reach = np.sqrt((change**2).sum(axis=1)) * (F**2).sum(axis=1)
-        return np.flatnonzero((J <= 0.0) | (reach >= 2.0 * J))
-
-    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
-        """Largest |dF| at which J > 0 and r/L < far at all points; chain: |l|/L (n,)."""
-        volume = 2.0 * states[:, 1] / (states[:, 2:] ** 2).sum(axis=1)
-        return float(np.minimum(volume, (far - stretch) / chain).min(initial=np.inf))
 
 
 class CompiledPointKernels(PointKernels):
@@ -220,23 +194,44 @@ class CompiledPointKernels(PointKernels):
         self._call("squared_length", len(F), F, cell.dimensions, cell.axes, squared)
         return squared
 
-    def extension(self, states: Array, length: Array) -> tuple[Array, int, float]:
-        stretch, smallest = np.empty(len(length)), np.empty(1)
-        worst = self._call("extension", len(length), states, length, stretch, smallest)
-        return stretch, worst, smallest.item()
-
-    def may_turn(self, before: Array, after: Array) -> NDArray[np.intp]:
-        found = np.empty(len(before), np.bool_)
-        count = self._call("may_turn", len(before), before, after, found)
-        return np.flatnonzero(found) if count else np.empty(0, np.intp)
-
-    def room(self, states: Array, stretch: Array, chain: Array, far: float) -> float:
-        return float(self._call("room", len(stretch), states, stretch, chain, far))
-
 
 def point_kernels(comm: MPI.Intracomm) -> PointKernels:
     """In C, or in numpy where that is asked for. Collective."""
     return PointKernels() if in_numpy() else CompiledPointKernels(comm)
+
+
+# ---------------------------------------------------------------- the structure tensor
+
+
+class TensorKernels:
+    """The law `tensor` and the repulsion `log` in C (tensor.c), on arrays of n points."""
+
+    def __init__(self, comm: MPI.Intracomm):
+        self.call = Library(comm, "tensor.c", "the law for the structure tensor", numbers=NUMBERS)
+
+    def target(self, drive: Drive) -> tensor_law.Target:
+        """`laws.tensor_target`."""
+        F, given = drive.deformation_gradient, drive.tensor
+        n, turned_back = len(F), not drive.driver.material
+        if turned_back and drive.frame.tensor is not rotated_back:
+            turned_back, given = False, drive.frame.tensor(F, given)
+        direction, switch = np.empty((n, 3, 3)), np.empty(n)
+        self.call("target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, switch)
+        return tensor_law.Target(direction, switch)
+
+    def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
+        """`energy.log_sum`."""
+        if np.iscomplexobj(F):
+            return energy.log_sum(F, cells, end_to_end_length)
+        result = np.empty(F.shape[:-2])
+        self.call("log_sum", result.size, F, np.broadcast_to(energy.whole_structure_tensor(cells), F.shape), result)
+        return result
+
+    def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
+        """`energy.log_derivatives`."""
+        first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
+        self.call("log_derivatives", len(C), C, A, first, matrices)
+        return first, matrices
 
 
 # ---------------------------------------------------------------- factors in single precision, where CHOLMOD 5 is

@@ -33,7 +33,6 @@ FAR = 2.0
 without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
 # Iterations, or tangents of a whole step: chains near their contour length make ends nearer too, but within 11
 CLOSE, MANY = 0.5, 12
-SLOPE_SHARE = 1e-3  # of the bounded part: over it the slope of the residual is taken
 SAME_SOLUTION = (
     1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
 )
@@ -158,7 +157,7 @@ class Change:
                 f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, attempt {attempts}: {100 * part:.2g} %"
             )
             before = self.state.unknown.x.array.copy()
-            part = self._started(min(part, 1.0 - done), done, work)
+            part = min(part, 1.0 - done, self.largest_part(done))
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
             solution = attempted(partial(self.newton.solve, before, self.roughly and not is_last), SolveFailure)
@@ -186,35 +185,6 @@ class Change:
                 self._direction = (self.state.unknown.x.array - before) / part
                 part *= 2
                 work.substeps += 1
-
-    def _started(self, wanted: float, done: float, work: Work) -> float:
-        """The next part, with the unknowns that it starts from."""
-        # Where the bound at the present unknowns is smaller than what is wanted, they go on as over the last part:
-        # along that way chains keep about their length, and parts can be larger. Every point keeps its reserve there
-        # too.
-        bound = min(wanted, self.largest_part(done))
-        if bound >= wanted:
-            return bound
-        if self._direction is None:
-            self._direction = self.newton.tangent_direction(self.set_fraction, done, SLOPE_SHARE * bound)
-            work.newton_iterations += 1
-            work.linear_iterations += 1
-        if not np.all(np.isfinite(self._direction)):
-            self._direction = None
-            return bound
-        unknown, equilibrium = self.state.unknown.x.array, self.newton.equilibrium
-        before = unknown.copy()
-        self.set_fraction(done)
-        present = equilibrium.look().stretches
-        while wanted > bound:
-            self.set_fraction(done + wanted)
-            unknown[:] = before + wanted * self._direction
-            expected = equilibrium.look()
-            if expected.extension.admissible and equilibrium.keeps_reserve(present, expected.stretches, KEPT_RESERVE):
-                return wanted
-            wanted /= 2
-        unknown[:] = before
-        return bound
 
     def look_back(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
         """After a step: look into one that has ended far from its tangent or from the step before."""
@@ -314,7 +284,6 @@ class Blend:
     def __init__(self, state: State, tissue: Tissue, settings: Solver):
         self.state, self.tissue, self.settings = state, tissue, settings
         self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
-        self._newton: GuardedNewton | None = None
 
     @functools.cached_property
     def equilibrium(self) -> Equilibrium:
@@ -326,18 +295,15 @@ class Blend:
 
         return Equilibrium(self.state, self.tissue, shares(old.ufl_cell, new.ufl_cell, self.theta), at_points)
 
-    @property
+    @functools.cached_property
     def newton(self) -> GuardedNewton:
         """The solver."""
-        if self._newton is None:
-            self._newton = GuardedNewton(self.equilibrium, self.settings, robust=True)
-        return self._newton
+        return GuardedNewton(self.equilibrium, self.settings, robust=True)
 
     def close(self) -> None:
         """Free PETSc's objects."""
-        if self._newton is not None:
-            self._newton.close()
-            self._newton = None
+        if "newton" in vars(self):
+            vars(self).pop("newton").close()
 
     def set(self, fraction: float) -> None:
         """theta."""
@@ -349,9 +315,9 @@ class Blend:
         equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
         length = quadrature.owned(equilibrium.locking_length())
         self.theta.value = done
-        now = quadrature.owned(equilibrium.states()[..., 0])
+        now = quadrature.owned(equilibrium.squared_lengths())
         self.theta.value = 1.0
-        end = quadrature.owned(equilibrium.states()[..., 0])
+        end = quadrature.owned(equilibrium.squared_lengths())
         allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
         increase = end - now
         room = np.where(increase > 0, (allowed - now) / np.where(increase > 0, increase, 1.0), np.inf)

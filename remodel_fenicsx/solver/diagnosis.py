@@ -12,9 +12,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.solver_methods import LARGE
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.linear import kept_factor, uneven
+from remodel_fenicsx.solver.linear import KeptFactor, uneven
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 
 log = logging.getLogger(__name__)
@@ -58,7 +57,7 @@ class Inertia:
         self._factorised: PETSc.Mat | None = None
         self._factorisation: PETSc.PC | None = None
         self._is_unsymmetric = False
-        self._definite = kept_factor(equilibrium.comm)
+        self._definite = KeptFactor()
 
     def close(self) -> None:
         """Free PETSc's objects; the next question makes new ones."""
@@ -72,16 +71,14 @@ class Inertia:
     def negative_eigenvalues(self) -> int:
         """Count the eigenvalues of negative real part."""
         self._assemble()
-        size = self._symmetric.getSize()[0]
-        kept = size <= LARGE  # of larger ones MUMPS on all ranks takes less time and memory
-        if kept and self._definite.is_definite(self._symmetric):
+        if self.equilibrium.comm.size == 1 and self._definite.is_definite(self._symmetric):  # in half of MUMPS's time
             return 0
         number = self._negative_of(self._symmetric)
         if number == 0 or not self._is_unsymmetric:
             return number
         wanted = 1
         while (negative := sum(value < 0 for value in self._lowest(wanted)[0])) >= wanted:
-            wanted = min(2 * negative, size)
+            wanted = min(2 * negative, self._symmetric.getSize()[0])
         return negative
 
     def lowest(self) -> Mode:
@@ -129,9 +126,10 @@ class Inertia:
     def cosine(self, mode: Mode, direction: Array) -> float:
         """Of the angle between a mode and another change of the unknowns, without its sign."""
         owned = self.equilibrium.state.number_of_owned_unknowns
-        mine, other = mode.displacement[:owned], direction[:owned]
-        products = self.equilibrium.comm.allreduce(np.array([mine @ other, mine @ mine, other @ other]), MPI.SUM)
-        return float(abs(products[0]) / np.sqrt(max(products[1] * products[2], np.finfo(np.float64).tiny)))
+        both = np.array([mode.displacement, direction])[:, :owned]
+        products = self.equilibrium.comm.allreduce(both @ both.T)
+        size = np.sqrt(products[0, 0] * products[1, 1])
+        return float(abs(products[0, 1]) / max(size, np.finfo(np.float64).tiny))
 
     # ------------------------------------------------------------ matrices
     def _assemble(self) -> None:
@@ -175,12 +173,10 @@ class Inertia:
 
     def _without_prescribed(self, matrix: PETSc.Mat) -> PETSc.Mat:
         """A copy in which the prescribed unknowns have an eigenvalue of the size of the largest ones, not one."""
-        matrix, diagonal = matrix.copy(), matrix.createVecRight()
-        matrix.getDiagonal(diagonal)
-        local = diagonal.array
-        held = ~np.isnan(self.equilibrium.prescribed_values()[: len(local)])
-        largest = float(np.max(np.abs(local[~held]), initial=0.0))
-        local[held] = self.equilibrium.comm.allreduce(largest, MPI.MAX)
+        matrix, diagonal = matrix.copy(), matrix.getDiagonal()
+        held = ~np.isnan(self.equilibrium.prescribed_values()[: diagonal.getLocalSize()])
+        largest = matrix.norm(PETSc.NormType.NORM_INFINITY)
+        diagonal.array[held] = largest
         matrix.setDiagonal(diagonal)
         diagonal.destroy()
         return matrix
@@ -208,12 +204,9 @@ class Inertia:
         nodes = state.kinematics.nodal_space(state.unknown).tabulate_dof_coordinates()
         largest = self.equilibrium.comm.allreduce(float(np.max(amplitude, initial=0.0)), MPI.MAX)
         # of nodes that symmetry makes equal the first one in space, whatever the number of ranks
-        candidates = [
-            tuple(float(round(c, 12)) + 0.0 for c in node) for node in nodes[amplitude >= (1 - 1e-6) * largest]
-        ]
-        found = [node for rank in self.equilibrium.comm.allgather(candidates) for node in rank]
-        x, y, z = min(found)
-        return Mode(eigenvalue, (x, y, z), function.x.array.copy())
+        candidates = (np.round(nodes[amplitude >= (1 - 1e-6) * largest], 12) + 0.0).tolist()
+        place = min(tuple(node) for rank in self.equilibrium.comm.allgather(candidates) for node in rank)
+        return Mode(eigenvalue, place, function.x.array.copy())
 
 
 def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:

@@ -150,11 +150,12 @@ class Extension:
 
 
 class Look(NamedTuple):
-    """At a state: how far it is from its limits; r/L at all points, and r^2, J and F (n, 11)."""
+    """A state at this rank's own points: how far it is from its limits; r/L and J (elements, points), F (n, 3, 3)."""
 
     extension: Extension
     stretches: Array
-    states: Array
+    jacobians: Array
+    gradients: Array
 
 
 class Equilibrium:
@@ -185,7 +186,7 @@ class Equilibrium:
             internal[0] += self.pointwise.residual(u, F, test) * weight * dx
             tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
         self.internal_forms = [jit.form(form) for form in internal]
-        self.external_form = None if external is None else jit.form(external)
+        self.external_forms = [] if external is None else [jit.form(external)]
         # apart, so that bodies with other loads share the costly one
         self.tangent_forms = [jit.form(form) for form in tangents]
         if external is not None and _depends_on(external, u):
@@ -208,20 +209,22 @@ class Equilibrium:
         return look
 
     def _look(self) -> Look:
-        number = self.quadrature.number_of_owned_elements
-        states, shape = self.quadrature.owned(self.states()).reshape(-1, 11), (number, self.quadrature.shape[1])
-        lengths = self.quadrature.owned(self.locking_length()).reshape(-1)
-        stretch, worst, smallest = self.state.cells.kernels.extension(states, lengths)
-        of_formulation = self.quadrature.owned(self.state.dilatation.jacobians())
-        if of_formulation.size:
-            smallest = min(smallest, float(of_formulation.min()) if np.isfinite(of_formulation).all() else -np.inf)
+        quadrature = self.quadrature
+        squares, lengths = quadrature.owned(self.squared_lengths()), quadrature.owned(self.locking_length())
+        gradients = self.state.elastic_gradient()[: squares.size]
+        jacobians = det(gradients).reshape(squares.shape)
+        with np.errstate(invalid="ignore"):
+            stretches = np.sqrt(squares) / lengths
+        stretches[~np.isfinite(stretches)] = np.inf
+        smallest = min(map(_smallest, (jacobians, quadrature.owned(self.state.dilatation.jacobians()))))
         local: tuple[float, tuple[float, ...]] = (-np.inf, (np.nan,) * 3)
-        if stretch.size:
-            local = stretch.item(worst), tuple(self.quadrature.coordinates.reshape(-1, 3)[worst].tolist())
+        if stretches.size:
+            worst = int(np.argmax(stretches))
+            local = stretches.item(worst), tuple(quadrature.coordinates.reshape(-1, 3)[worst].tolist())
         ranks = of_all_ranks(self.comm, (*local, smallest, self.state.stop_signal()))
         largest, worst_point, _, _ = max(ranks, key=lambda rank: rank[0])
         extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
-        return Look(extension, stretch.reshape(shape), states)
+        return Look(extension, stretches, jacobians, gradients)
 
     def keeps_reserve(
         self,
@@ -234,28 +237,32 @@ class Equilibrium:
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
         return not over_ranks(self.comm, lost, MPI.LOR)
 
-    def turns_inside_out(self, before: Array, after: Array) -> bool:
-        """Whether J vanishes on the straight way between two states at a point of any rank; `Look.states` of both."""
-        at = self.state.cells.kernels.may_turn(before, after)
-        turns = at.size > 0 and bool(
-            passes_through_zero(*(ends[at, 2:].reshape(-1, 3, 3) for ends in (before, after))).any()
-        )
+    def turns_inside_out(self, before: Look, after: Look) -> bool:
+        """Whether J vanishes on the straight way between two states at a point of any rank."""
+        # |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular: few points are to be asked
+        F, G, J = before.gradients, after.gradients, before.jacobians.ravel()
+        change, own = (np.einsum("nij,nij->n", each, each) for each in (G - F, F))
+        at = np.flatnonzero((J <= 0.0) | (np.sqrt(change) * own >= 2.0 * J))
+        turns = at.size > 0 and bool(passes_through_zero(F[at], G[at]).any())
         return bool(over_ranks(self.comm, turns, MPI.LOR))
 
-    def states(self) -> Array:
-        """r^2 in squared link lengths (0 without chains), J and F, eleven numbers: (elements, points, 11)."""
-        F = self.state.elastic_gradient()
-        states = np.empty((len(F), 11))
-        states[:, 0] = self._squared_length(F)
-        states[:, 1], states[:, 2:] = det(F), F.reshape(-1, 9)
-        return states.reshape(*self.quadrature.shape, 11)
+    def room(self, far: float) -> float:
+        """Largest |dF| at which J > 0 and r/L < `far` at every point of all ranks."""
+        look, lengths = self.look(), self.state.cells.dimension_values
+        chains = np.sqrt((lengths**2).sum(axis=-1)) / self.locking_length()
+        volume = 2.0 * look.jacobians.ravel() / np.einsum("nij,nij->n", look.gradients, look.gradients)
+        length = (far - look.stretches) / np.maximum(self.quadrature.owned(chains), 1e-300)
+        return float(over_ranks(self.comm, np.minimum(volume, length.ravel()).min(initial=np.inf), MPI.MIN))
 
-    def _squared_length(self, F: Array) -> Array | float:
+    def squared_lengths(self) -> Array:
+        """r^2 in squared link lengths, (elements, points); 0 without chains."""
+        shape = self.quadrature.shape
         if self.tissue.chain is None:
-            return 0.0
+            return np.zeros(shape)
+        F = self.state.elastic_gradient()
         if self._point_shares is None:
-            return self.state.cells.kernels.squared_length(F, self.state.cells.point_cells)
-        return np.asarray(squared_end_to_end_length(F, self._point_shares()))
+            return self.state.cells.kernels.squared_length(F, self.state.cells.point_cells).reshape(shape)
+        return np.asarray(squared_end_to_end_length(F, self._point_shares())).reshape(shape)
 
     def locking_length(self) -> NDArray[np.float64]:
         """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""
@@ -282,7 +289,7 @@ class Equilibrium:
 
     def assemble_external(self, vector: PETSc.Vec) -> None:
         """Minus the nodal forces of the loads."""
-        self._assemble(vector, [] if self.external_form is None else [self.external_form])
+        self._assemble(vector, self.external_forms)
 
     def _assemble(self, vector: PETSc.Vec, forms: Sequence[dolfinx.fem.Form]) -> None:
         with vector.localForm() as local:
@@ -322,18 +329,18 @@ class Equilibrium:
             condition.set(values)
         return values
 
-    def prescribed_gap(self, x: PETSc.Vec) -> float:
+    def prescribed_gap(self) -> float:
         """Largest distance of a prescribed value from its target, over all ranks."""
-        conditions = self.state.loading.boundary_conditions
-        if not conditions:
-            return 0.0
-        with x.localForm() as local:
-            values = local.array_r
-            target = values.copy()
-            for condition in conditions:
-                condition.set(target)
-            target -= values
-        return float(over_ranks(self.comm, float(np.abs(target).max(initial=0.0)), MPI.MAX))
+        values = self.state.unknown.x.array
+        target = values.copy()
+        for condition in self.state.loading.boundary_conditions:
+            condition.set(target)
+        return float(over_ranks(self.comm, float(np.abs(target - values).max(initial=0.0)), MPI.MAX))
+
+
+def _smallest(values: Array) -> float:
+    """Smallest value; -inf if one is not finite."""
+    return float(values.min(initial=np.inf)) if np.isfinite(values).all() else -np.inf
 
 
 def _depends_on(form: ufl.Form, unknown: Function) -> bool:

@@ -6,14 +6,15 @@ import logging
 from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx import kernels
-from remodel_fenicsx.fem.assembly import DegreeOne, degree_one, rigid_motions
+from remodel_fenicsx.fem.assembly import DegreeOne, degree_one, over_ranks, rigid_motions
 from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
@@ -21,83 +22,56 @@ if TYPE_CHECKING:
     from mpi4py.MPI import Comm
     from petsc4py.PETSc import Mat, PC, SNES, Vec
 
+Array = NDArray[np.float64]
+
 
 # ---------------------------------------------------------------- quasi-Newton steps on a kept factor
-# L-BFGS with PETSc's vectors, on any number of ranks.
+# L-BFGS, on any number of ranks.
 
 REMEMBERED_PAIRS = 20  # pairs that are remembered
 CURVED = 1e-8  # cosine between a step and the change of the residual, below which they say nothing of use
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """A step s, the change z of the residual over it, and H z with the kept inverse H."""
-
-    step: Vec
-    change: Vec
-    image: Vec
-    curvature: float
-
-    def destroy(self) -> None:
-        for vector in (self.step, self.change, self.image):
-            vector.destroy()
-
-
 class Secants:
     """Betters the steps of a kept factor by what earlier steps have shown of the present tangent."""
 
-    def __init__(self) -> None:
-        self._pairs: deque[_Pair] = deque()
-        self._last: tuple[Vec, Vec, Vec] | None = None
+    def __init__(self, comm: Comm) -> None:
+        self._comm = comm
+        # a step s, the change z of the residual over it, and H z with the kept inverse H; with s . z
+        self._pairs: deque[tuple[Array, float]] = deque(maxlen=REMEMBERED_PAIRS)
+        self._last: Array | None = None
 
     def forget(self) -> None:
         """The factor is another one."""
         self.interrupt()
-        for pair in self._pairs:
-            pair.destroy()
         self._pairs.clear()
 
     def interrupt(self) -> None:
         """The next step does not follow the last one: another problem, or another place."""
-        if self._last is not None:
-            for vector in self._last:
-                vector.destroy()
         self._last = None
 
     def improve(self, x: Vec, residual: Vec, step: Vec) -> bool:
         """Better the step H r (trial: x - step) in place; whether it was changed."""
-        self._learn(x, residual, step)
-        self._last = (x.copy(), residual.copy(), step.copy())
-        if not self._pairs:
-            return False
-        right, weights = residual.copy(), []
-        for pair in reversed(self._pairs):
-            weight = pair.step.dot(right) / pair.curvature
-            weights.append(weight)
-            right.axpy(-weight, pair.change)
-            step.axpy(-weight, pair.image)
-        for pair, weight in zip(self._pairs, reversed(weights), strict=True):
-            step.axpy(weight - pair.change.dot(step) / pair.curvature, pair.step)
-        right.destroy()
-        return True
+        now = np.array([x.array_r, residual.array_r, step.array_r])
+        if self._last is not None:
+            pair = now - self._last
+            products = over_ranks(self._comm, pair[:2] @ pair[:2].T, MPI.SUM)
+            if products[0, 1] > CURVED * np.sqrt(products[0, 0] * products[1, 1]):
+                self._pairs.append((pair, products[0, 1]))
+        self._last = now.copy()
+        _, right, better = now
+        weights = []
+        for (taken, change, image), curvature in reversed(self._pairs):
+            weights.append(self._product(taken, right) / curvature)
+            right -= weights[-1] * change
+            better -= weights[-1] * image
+        for ((taken, change, _), curvature), weight in zip(self._pairs, reversed(weights), strict=True):
+            better += (weight - self._product(change, better) / curvature) * taken
+        step.array[:] = better
+        return bool(weights)
 
-    def _learn(self, x: Vec, residual: Vec, step: Vec) -> None:
-        if self._last is None:
-            return
-        before = self._last
-        self._last = None
-        way, change, image = pair = [now.copy() for now in (x, residual, step)]
-        for now, then in zip(pair, before, strict=True):
-            now.axpy(-1.0, then)
-            then.destroy()
-        curvature = way.dot(change)
-        if curvature > CURVED * way.norm() * change.norm():
-            self._pairs.append(_Pair(way, change, image, curvature))
-            if len(self._pairs) > REMEMBERED_PAIRS:
-                self._pairs.popleft().destroy()
-        else:
-            for vector in pair:
-                vector.destroy()
+    def _product(self, one: Array, other: Array) -> float:
+        return float(over_ranks(self._comm, one @ other, MPI.SUM))
 
 
 log = logging.getLogger(__name__)
@@ -140,13 +114,6 @@ class KeptFactor:
             y.set(np.nan)
         else:
             self.preconditioner.apply(x, y)
-
-    @property
-    def negative_pivots(self) -> int | None:
-        """How many there are, as far as the factors tell (`negative_pivots`)."""
-        if self._kind == SINGLE:
-            return 0
-        return None if self.preconditioner is None else negative_pivots(self.preconditioner)
 
     def renew(self, matrix: Mat) -> None:
         """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
@@ -252,11 +219,6 @@ class GatheredFactor:
         self._right: Any = None  # of the first rank; empty on others
         self._answer: Any = None
 
-    @property
-    def negative_pivots(self) -> int | None:
-        """As `negative_pivots` of the kept factors. Collective."""
-        return self.comm.bcast(self.first.negative_pivots)  # type: ignore[no-any-return]
-
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """As of `KeptFactor`. Collective."""
         self._scatter.scatter(x, self._right, mode=PETSc.ScatterMode.FORWARD)
@@ -266,16 +228,6 @@ class GatheredFactor:
 
     def renew(self, matrix: Mat) -> None:
         """As of `KeptFactor`. Collective."""
-        self._gather(matrix)
-        if self.comm.rank == 0:
-            self.first.renew(self._whole.getDiagonalBlock())
-
-    def is_definite(self, matrix: Mat) -> bool:
-        """As of `KeptFactor`. Collective."""
-        self._gather(matrix)
-        return bool(self.comm.bcast(self.comm.rank == 0 and self.first.is_definite(self._whole.getDiagonalBlock())))
-
-    def _gather(self, matrix: Mat) -> None:
         if self._scatter is None:
             template = matrix.createVecRight()
             self._scatter, self._right = PETSc.Scatter.toZero(template)
@@ -284,6 +236,8 @@ class GatheredFactor:
         rows = PETSc.IS().createStride(self._right.getLocalSize(), 0, 1, comm=matrix.comm)
         self._whole = matrix.createSubMatrix(rows, rows, submat=self._whole)
         rows.destroy()
+        if self.comm.rank == 0:
+            self.first.renew(self._whole.getDiagonalBlock())
 
     def close(self) -> None:
         """Free PETSc's objects."""
@@ -473,7 +427,7 @@ class Lagged(EveryTangent):
             preconditioner = snes.getKSP().getPC()
             preconditioner.setType(PETSc.PC.Type.PYTHON)
             preconditioner.setPythonContext(self.factor)
-        self.secants = Secants()
+        self.secants = Secants(equilibrium.comm)
         self._before = 0  # tangents before the solve
         self._norms: list[float] = []  # of the residual since the tangent was renewed, of this solve
         self._due = True
@@ -549,37 +503,8 @@ class Lagged(EveryTangent):
         self.secants.forget()
 
 
-def negative_pivots(factorisation: PC) -> int | None:
-    """How many there are, on all ranks; 1 or 0, odd or even, where only the determinant is known; None: nothing is."""
-    if factorisation.getType() == "python":
-        return factorisation.getPythonContext().negative_pivots  # type: ignore[no-any-return]
-    package = factorisation.getFactorSolverType()
-    if package == "cholmod":
-        return 0  # it takes positive definite matrices only
-    if package == "petsc":
-        return _on_the_diagonal(factorisation.getFactorMatrix())
-    if package != "mumps":
-        return None
-    factor = factorisation.getFactorMatrix()
-    found = None
-    if factorisation.getType() == "cholesky":
-        found = factor.getMumpsInfog(12)
-    elif factor.getMumpsIcntl(33):
-        found = int(factor.getMumpsRinfog(12) < 0)
-    return factorisation.comm.tompi4py().bcast(found)  # type: ignore[no-any-return]  # the first rank knows it
-
-
 def uneven(vector: Vec) -> Vec:
     """The vector, filled with what no symmetry leaves unchanged."""
     first, last = vector.getOwnershipRange()
     vector.array[:] = np.sin(1.0 + np.arange(first, last) * np.sqrt(2.0))
     return vector
-
-
-def _on_the_diagonal(factor: Mat) -> int:
-    """Of U in PETSc's own LU, which exchanges no rows: a symmetric matrix is L D L^T, with D its diagonal."""
-    pivots = factor.createVecRight()
-    factor.getDiagonal(pivots)
-    count = int(np.count_nonzero(pivots.array_r < 0))
-    pivots.destroy()
-    return count

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import dolfinx.fem.petsc
 import numpy as np
@@ -109,59 +107,7 @@ class Convergence:
 # The limits r < L and J > 0 in the line search of Newton's method.
 
 NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
-
-
-class Limits:
-    """How far from their limits r < L and J > 0 the states of one solve are; each is evaluated once."""
-
-    def __init__(self, equilibrium: Equilibrium, bounded: bool):
-        self.equilibrium, state = equilibrium, equilibrium.state
-        self.bounded = bounded and state.kinematics.three_dimensional and state.dilatation.jacobians().shape[1] == 0
-        self._gain = equilibrium.quadrature.largest_gradient if self.bounded else np.inf
-        self.forget()
-
-    def forget(self) -> None:
-        """Cells or loads may be others from now on."""
-        self._found: Look | None = None
-        self._chains: Array | None = None  # |l|/L at the points
-        self._room, self._travelled = 0.0, np.inf
-
-    def look(self) -> Look:
-        """`Equilibrium.look` of the present unknowns."""
-        found = self.equilibrium.look()
-        if self.bounded and found is not self._found:
-            self._found, self._room, self._travelled = found, self._room_around(found), 0.0
-        return found
-
-    def allow(self, before: Look, after: Look) -> bool:
-        """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
-        if not after.extension.admissible:
-            return False
-        near = after.extension.max_chain_extension > NEAR_LIMIT
-        if near and not self.equilibrium.keeps_reserve(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
-            return False
-        return not self.equilibrium.turns_inside_out(before.states, after.states)
-
-    def certainly_allow(self, largest_displacement: float) -> bool:
-        """Whether a further step is admissible by the bound, without a look at its end; it then counts as made."""
-        further = self._travelled + self._gain * largest_displacement
-        if not further < self._room:
-            return False
-        self._travelled = further
-        return True
-
-    def _room_around(self, look: Look) -> float:
-        """Largest |dF| at which J > 0 and r/L < NEAR_LIMIT at every point of all ranks."""
-        if not look.extension.admissible:
-            return 0.0
-        quadrature, cells = self.equilibrium.quadrature, self.equilibrium.state.cells
-        if self._chains is None:
-            length = np.sqrt((cells.dimension_values**2).sum(axis=-1)) / self.equilibrium.locking_length()
-            self._chains = np.maximum(quadrature.owned(length), 1e-300).reshape(-1)
-        room = cells.kernels.room(look.states, look.stretches.reshape(-1), self._chains, NEAR_LIMIT)
-        return float(over_ranks(self.equilibrium.comm, room, MPI.MIN))
-
-
+NOWHERE = Extension(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
 POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
 
@@ -183,10 +129,10 @@ class Counted:
 
 @dataclass
 class Solution(Counted):
-    """A solve that has ended well."""
+    """How a solve has ended."""
 
     residual: float = 0.0
-    extension: Extension | None = None
+    extension: Extension = NOWHERE
     reach: float = 0.0  # how far it is from its origin, over how far the first iterate was; 0 where that says nothing
 
 
@@ -196,19 +142,15 @@ class SolveFailure(RuntimeError, Counted):
     def __init__(
         self,
         reason: str,
-        newton_iterations: int,
-        linear_iterations: int,
-        extension: Extension,
+        found: Solution,
         residual_over_tolerance: float = np.inf,
-        tangents: int = 0,
         relative_residual: float = np.inf,
         stagnates: bool = False,
     ):
         super().__init__(reason)
-        self.reason, self.extension = reason, extension
-        self.newton_iterations, self.linear_iterations, self.tangents = newton_iterations, linear_iterations, tangents
+        self.reason, self.extension, self.stagnates = reason, found.extension, stagnates
         self.residual_over_tolerance, self.relative_residual = residual_over_tolerance, relative_residual
-        self.stagnates = stagnates
+        self.count(found)
 
 
 @dataclass
@@ -220,7 +162,8 @@ class _Solve:
     norm: float = np.inf
     previous: float = np.inf
     inadmissible: bool = False
-    bounded: bool = False
+    room: float = 0.0  # |dF| around the last state that was looked at within which all are admissible
+    is_certain: bool = False  # whether the state is within it
 
 
 # by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
@@ -266,7 +209,7 @@ class GuardedNewton:
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
         bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
-        self.limits = Limits(equilibrium, bounded)
+        self._bounded = bounded and kinematics.three_dimensional and equilibrium.state.dilatation.jacobian is None
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()), self._matrix)
@@ -321,28 +264,25 @@ class GuardedNewton:
         self.convergence.begin()
         self._pull(self._x)
         self._present = _Solve(start if origin is None else origin)
-        self.limits.forget()
         self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
-        newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         self._push(self._x)
-        extension = self.equilibrium.extension()
-        if reason < 0 or self._present.inadmissible or not extension.admissible:
-            self._values[:] = start
-            if extension.stop_signal:
-                raise Interrupted(extension.stop_signal)
-            norm, tiny = float(self._snes.getFunctionNorm()), float(np.finfo(np.float64).tiny)
-            text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
-            left = norm / max(self.convergence.tolerance(), tiny)
-            relative = norm / max(self.convergence.force_scale, tiny)
-            stagnates = norm > STAGNATION * self._present.previous
-            counts = newton, linear, extension, left, self._linear.tangents - tangents
-            raise SolveFailure(text, *counts, relative, stagnates)
-        self._linear.ended(newton)
-        norm, tangents = float(self._snes.getFunctionNorm()), self._linear.tangents - tangents
-        return Solution(newton, linear, tangents, norm, extension, self._reach())
+        extension, norm = self.equilibrium.extension(), float(self._snes.getFunctionNorm())
+        newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
+        found = Solution(newton, linear, self._linear.tangents - tangents, norm, extension)
+        if reason >= 0 and not self._present.inadmissible and extension.admissible:
+            self._linear.ended(newton)
+            found.reach = self._reach()
+            return found
+        self._values[:] = start
+        if extension.stop_signal:
+            raise Interrupted(extension.stop_signal)
+        text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
+        scales = self.convergence.tolerance(), self.convergence.force_scale
+        shares = (norm / max(scale, float(np.finfo(np.float64).tiny)) for scale in scales)
+        raise SolveFailure(text, found, *shares, stagnates=norm > STAGNATION * self._present.previous)
 
     def _reach(self) -> float:
         """`Solution.reach` of the present unknowns."""
@@ -357,20 +297,6 @@ class GuardedNewton:
         """Norm of a change of the unknowns; of this rank only those that it owns."""
         return float(np.sqrt(over_ranks(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
-    def tangent_direction(self, set_fraction: Callable[[float], None], done: float, distance: float) -> Any:
-        """Change of the unknowns per fraction of a change of the problem, at a solved state; one linear solve."""
-        self._pull(self._x)
-        slope = self._x.duplicate()
-        set_fraction(done + distance)
-        self._assemble_residual(self._snes, self._x, slope)
-        set_fraction(done)
-        self._assemble_residual(self._snes, self._x, self._residual)
-        slope.axpy(-1.0, self._residual)
-        self._linear.renew()
-        values = self._linear_answer(slope) / distance
-        slope.destroy()
-        return values
-
     def answer(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system."""
         # `tangents` were assembled for that state: the last one counts, or where there is none a new one.
@@ -381,13 +307,9 @@ class GuardedNewton:
         dolfinx.fem.petsc.set_bc(self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0)
         if not (self._linear.tangents if self._linear.keeps else tangents):
             self._linear.renew()
-        return self._linear_answer(self._residual)
-
-    def _linear_answer(self, residual: PETSc.Vec) -> Array:
-        """Change of the unknowns that the tangent gives for a residual, ghosts included."""
         solver, direction = self._snes.getKSP(), self._x.duplicate()
         solver.setOperators(self._matrix)
-        solver.solve(residual, direction)
+        solver.solve(self._residual, direction)
         direction.ghostUpdate(addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.FORWARD)
         with direction.localForm() as local:
             values = -local.array_r
@@ -433,20 +355,21 @@ class GuardedNewton:
         # forces at the nodes, reactions included: what the residual must be small against
         self.convergence.force_scale = max(residual.norm(), self._external.norm())
         residual.axpy(1.0, self._external)
-        self.convergence.prescribed_gap = equilibrium.prescribed_gap(x) / loading.domain.size
+        self.convergence.prescribed_gap = equilibrium.prescribed_gap() / loading.domain.size
         if self.convergence.prescribed_gap > PRESCRIBED_ROUNDING:
             # lifting assembles tangents of the constrained elements; it adds exactly zero once x meets the conditions
             equilibrium.assemble_lifting(self._external, x)
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
         present = self._present
-        if present.bounded:
+        if present.is_certain:
             present.inadmissible = over_ranks(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
         else:
-            extension = self.limits.look().extension
+            extension = equilibrium.extension()
             present.inadmissible = not extension.admissible or extension.stop_signal > 0
             if not present.inadmissible:
                 self.convergence.extended(extension.max_chain_extension)
+                present.room = equilibrium.room(NEAR_LIMIT) if self._bounded else 0.0
         if present.inadmissible:
             residual.set(np.nan)
             return
@@ -462,17 +385,19 @@ class GuardedNewton:
         if present.first_iterate is None:
             first = x.array_r - step.array_r
             present.first_iterate = self._length(first - present.origin[: first.size])
-        length = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
-        present.bounded = self.limits.bounded and self.limits.certainly_allow(length)
-        if present.bounded:
+        # so far |dF| goes at most; where that is admissible for certain, nobody looks
+        largest = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
+        present.room -= self.equilibrium.quadrature.largest_gradient * largest
+        present.is_certain = present.room > 0.0
+        if present.is_certain:
             return improved
         self._push(x)
-        before, trial = self.limits.look(), self._trial
+        before, trial = self.equilibrium.look(), self._trial
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
             self._push(trial)
-            after = self.limits.look()
-            if after.extension.stop_signal or self.limits.allow(before, after):
+            after = self.equilibrium.look()
+            if after.extension.stop_signal or self._allows(before, after):
                 break
             step.scale(0.5)
         else:
@@ -481,12 +406,16 @@ class GuardedNewton:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
 
-    def _converged(
-        self,
-        snes: PETSc.SNES,
-        iteration: int,
-        norms: tuple[float, float, float],
-    ) -> int:
+    def _allows(self, before: Look, after: Look) -> bool:
+        """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
+        near, equilibrium = after.extension.max_chain_extension > NEAR_LIMIT, self.equilibrium
+        if not after.extension.admissible:
+            return False
+        if near and not equilibrium.keeps_reserve(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
+            return False
+        return not equilibrium.turns_inside_out(before, after)
+
+    def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
         """SNES asks after every iteration: `Convergence`, or no more iterations."""
         norm = norms[2]
         if not np.isfinite(norm):

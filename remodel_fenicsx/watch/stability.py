@@ -1,4 +1,4 @@
-"""Whether equilibria are stable, by signs from Newton's factors; whether whole bodies of a reduction would buckle."""
+"""Whether equilibria are stable, by the tangent's curvature; whether whole bodies of a reduction would buckle."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import Strut
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, WarnsOnce, Watcher
-from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
-from remodel_fenicsx.solver.linear import negative_pivots, uneven
+from remodel_fenicsx.solver.linear import uneven
 from remodel_fenicsx.state import Earlier, Numbers
 
 if TYPE_CHECKING:
@@ -41,11 +38,10 @@ class EquilibriumStability(Watcher):
         self.stepper, self.state = stepper, stepper.state
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
-        self.signs = Signs(stepper)
+        self.curvature = Curvature(stepper)
         self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
         # eigenvalues that are known, and Newton iterations since the last look
         self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
-        self._unloaded: tuple[int, float] | None = None
 
     def close(self) -> None:
         """Free PETSc's objects."""
@@ -63,16 +59,15 @@ class EquilibriumStability(Watcher):
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
-        suspicious = self.signs.differ(known) if step.work.newton_iterations else False
+        suspicious = bool(step.work.newton_iterations) and self.curvature.is_negative() and known == 0
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
             overdue = False
             if step.is_last:
                 self._say(
                     logging.INFO,
-                    "the stability of equilibria was not checked: with %d unknowns that is done only on request, by "
-                    "the column negative_eigenvalues or solver.unstable = 'stop'",
-                    self.unknowns,
+                    f"the stability of equilibria was not checked: with {self.unknowns} unknowns that is done only on "
+                    "request, by the column negative_eigenvalues or solver.unstable = 'stop'",
                 )
         if not (suspicious or overdue or self.every_step):
             return
@@ -80,7 +75,6 @@ class EquilibriumStability(Watcher):
         if np.isnan(count):
             return
         self._numbers["iterations"] = 0
-        self.signs.settle()
         if count != known:
             self._numbers["known"] = count
             self._judge(step, known, int(count))
@@ -90,65 +84,47 @@ class EquilibriumStability(Watcher):
         try:
             return self.inertia.negative_eigenvalues()
         except FactorisationFailed as failure:
-            self._say(logging.WARNING, "the stability of the equilibrium is not known: %s", failure)
+            self._say(logging.WARNING, f"the stability of the equilibrium is not known: {failure}")
             return float("nan")
 
     def _judge(self, step: Step, before: int, now: int) -> None:
         if now < before:
-            self._say(logging.INFO, "%s: %s of the tangent, %d before", step.moment, eigenvalues(now), before)
+            self._say(logging.INFO, f"{step.moment}: {eigenvalues(now)} of the tangent, {before} before")
             return
-        unloaded, scale = self._of_the_unloaded_body()
+        unloaded, scale = self._unloaded
         if now <= unloaded:
             self._say(
                 logging.INFO,
-                "%s: %s of the tangent. The unloaded body has %d, from the stress of its cells at the start: the "
-                "equilibrium is not lost",
-                step.moment,
-                eigenvalues(now),
-                unloaded,
+                f"{step.moment}: {eigenvalues(now)} of the tangent. The unloaded body has {unloaded}, from the "
+                "stress of its cells at the start: the equilibrium is not lost",
             )
             return
         text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
         if self.stops:
             raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
-        self._say(
-            logging.WARNING, "%s: the equilibrium is unstable, and the body would leave it: %s", step.moment, text
-        )
+        unstable = f"{step.moment}: the equilibrium is unstable, and the body would leave it: {text}"
+        self._say(logging.WARNING, unstable)
 
-    def _of_the_unloaded_body(self) -> tuple[int, float]:
-        """`of_the_unloaded_body`, once."""
-        if self._unloaded is None:
-            self._unloaded = of_the_unloaded_body(self.inertia)
-        return self._unloaded
+    @cached_property
+    def _unloaded(self) -> tuple[int, float]:
+        return of_the_unloaded_body(self.inertia)
 
-    def _say(self, level: int, *message: object) -> None:
+    def _say(self, level: int, text: str) -> None:
         if self.state.comm.rank == 0:
-            log.log(level, *message)
+            log.log(level, "%s", text)
 
 
-class Signs:
-    """What the factors of Newton's last tangent tell for nothing, or for one substitution, about its eigenvalues."""
+class Curvature:
+    """What Newton's last tangent tells for one substitution: the sign of its eigenvalue nearest to zero."""
 
     def __init__(self, stepper: LoadCaseSolver):
         self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
-        state = stepper.state
-        self._vector = Earlier(state, "stability_vector", state.unknown.copy, 1)
-        self._pivots = Numbers(state, "stability_pivots", {"now": 0, "at_look": 0})  # negative ones
+        self._vector = Earlier(stepper.state, "stability_vector", stepper.state.unknown.copy, 1)
 
-    def differ(self, known: int) -> bool:
-        """Whether they contradict what is known: a number of negative eigenvalues."""
+    def is_negative(self) -> bool:
+        """Whether an equilibrium that was stable no longer seems to be."""
         factorisation = self.newton.factorisation()
-        if factorisation is None:
-            return False
-        before, found = int(self._pivots["at_look"]), negative_pivots(factorisation)
-        now = before if found is None else found
-        self._pivots["now"] = now
-        differs = now % 2 != before % 2 or (now == 0) != (before == 0)
-        return differs or (self._curvature(factorisation) < 0 and known == 0)
-
-    def settle(self) -> None:
-        """The eigenvalues have been counted: from now on what differs from the present signs is news."""
-        self._pivots["at_look"] = self._pivots["now"]
+        return factorisation is not None and self._curvature(factorisation) < 0
 
     def _curvature(self, factorisation: PETSc.PC) -> float:
         """Of the remembered vector after one more inverse iteration."""
@@ -193,18 +169,19 @@ def described(mode: Mode, unloaded: float) -> str:
 STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6
 # The estimate is 0.8 to 1.1 where whole slender tubes lose their stability (docs/theory.md, Buckling)
 WARNED_LOAD = 0.9
-ACROSS, AROUND, ALONG = range(3)
-_SIGNS = {1: np.array([[1.0], [-1.0]]), 2: np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])}
+AROUND, ALONG = 1, 2
 
 
 class BucklingWarning(WarnsOnce):
-    """Says once that the whole body would buckle, where a reduced kinematics cannot."""
+    """Says once that thrust would bend the whole body, where a reduced kinematics cannot show it."""
 
     name = "buckling"
 
     def __init__(self, stepper: Stepper, strut: Strut):
         super().__init__(stepper)
         self.strut = strut
+        self._places = self.quadrature.coordinates.reshape(-1, 3)
+        self._directions = strut.directions(self._places)
 
     @classmethod
     def of(cls, scene: Scene, stepper: Stepper) -> BucklingWarning | None:
@@ -212,126 +189,63 @@ class BucklingWarning(WarnsOnce):
         return None if strut is None else cls(stepper, strut)  # a whole body buckles by itself
 
     def look(self, step: Step | None = None) -> str:
-        """What is too much in the present state; nothing where it is stable."""
-        shares = {"thrust along z": self.thrust_share(), "suction": self.suction_share()}
-        said = [
-            f"{name} is about {share:.2g} times what it can bear"
-            for name, share in shares.items()
-            if share > WARNED_LOAD
-        ]
-        if not said:
+        """Compare the present thrust with what the body can bear."""
+        share = self.thrust() / self.euler_load()
+        if not share > WARNED_LOAD:
             return ""
         return (
-            f"the whole body would buckle: its {' and its '.join(said)}. Kinematics {self.state.kinematics.name!r} "
-            "cannot show that; set model.kinematics = 'full' (docs/theory.md, Buckling)"
+            f"the whole body would buckle: its thrust along z is about {share:.2g} times what it can bear. Kinematics "
+            f"{self.state.kinematics.name!r} cannot show that; set model.kinematics = 'full' (docs/theory.md, Buckling)"
         )
 
-    def thrust_share(self) -> float:
-        """Thrust over Euler's load; 0 under tension."""
-        thrust = self.thrust()
-        return thrust / self.euler_load() if thrust > 0 else 0.0
-
     def thrust(self) -> float:
-        """Of the wall and of what fills the cavity, along z."""
-        force = self._integral(self._derivative(ALONG)) / self._length()
-        if self.strut.radii is None:
-            return -force
-        return self._pressure * np.pi * self._radii()[0] ** 2 - force
+        """Thrust of the wall and of what fills the lumen, along z."""
+        thrust = -self._integral(self._derivative(ALONG)) / self._length()
+        pressure = self.state.loading.values.get("pressure", 0.0)
+        return thrust if self.strut.inner_radius is None else thrust + pressure * self.lumen_area()
 
-    @property
-    def _pressure(self) -> float:
-        return self.state.loading.values.get("pressure", 0.0)
-
-    def euler_load(self) -> float:
-        """Of the present body."""
-        H = self._moduli()
-        across = H[:2, :2]
-        coupling = H[:2, ALONG].T[..., None]
-        modulus = H[ALONG, ALONG] - (coupling * np.linalg.solve(np.moveaxis(across, -1, 0), coupling)).sum(axis=(1, 2))
-        stretch = np.einsum("nij,nj->ni", self._gradients(), self._directions[:, :, AROUND])
-        squares = self.strut.squared_distances(self._places) * np.square(stretch).sum(axis=1)
-        length = self._length()
-        return self.strut.euler_load(self._integral(modulus * squares) / length, length)
-
-    def suction_share(self) -> float:
-        """Pressure below zero over that at which the wall turns oval, a ring in plane strain."""
-        if self.strut.radii is None or self._pressure >= 0:
-            return 0.0
-        (inner, outer), H = self._radii(), self._moduli()
-        modulus = H[AROUND, AROUND] - H[AROUND, ACROSS] ** 2 / H[ACROSS, ACROSS]
-        area = np.pi * (outer**2 - inner**2)
-        stiffness = self._integral(modulus) / (self._length() * area) * (outer - inner) ** 3 / 12
-        return float(-self._pressure * inner / (3 * stiffness / ((inner + outer) / 2) ** 2))
-
-    # ------------------------------------------------------------ the present state
-    def _gradients(self) -> Array:
-        """F at this rank's points, (n, 3, 3)."""
-        return self.stepper.coupling.equilibrium.look().states[:, 2:].reshape(-1, 3, 3)
-
-    def _length(self) -> float:
-        stretch = self._integral(self._gradients()[:, 2, 2]) / self._integral(np.ones(len(self._places)))
-        return self.strut.length * stretch
-
-    def _radii(self) -> tuple[float, float]:
-        """Of the cavity's wall, inside and outside: means over the nodes there."""
-        assert self.strut.radii is not None
+    def lumen_area(self) -> float:
+        """Present area of the lumen's section, from the mean radius of the nodes on its wall."""
         kinematics, unknown = self.state.kinematics, self.state.unknown
         nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
-        deformed = np.linalg.norm((nodes + kinematics.nodal_displacement(unknown))[:, :2], axis=1)
-        reference = np.linalg.norm(nodes[:, :2], axis=1)
-        at = [np.isclose(reference, radius, rtol=1e-6) for radius in self.strut.radii]
-        local = np.array([[deformed[here].sum(), here.sum()] for here in at])
-        inner, outer = self.state.comm.allreduce(local, MPI.SUM)
-        return float(inner[0] / inner[1]), float(outer[0] / outer[1])
+        here = np.isclose(np.linalg.norm(nodes[:, :2], axis=1), self.strut.inner_radius, rtol=1e-6)
+        deformed = np.linalg.norm((nodes + kinematics.nodal_displacement(unknown))[here, :2], axis=1)
+        total, number = self.state.comm.allreduce(np.array([deformed.sum(), here.sum()]))
+        return float(np.pi * (total / number) ** 2)
+
+    def euler_load(self) -> float:
+        """Euler's load of the present body, pi^2 EI / (k l)^2."""
+        H = np.empty((3, 3, len(self._places)))  # second derivatives of W by logarithmic strains
+        for i, j in itertools.combinations_with_replacement(range(3), 2):
+            H[i, j] = H[j, i] = self._derivative(i, j)
+        coupling = H[:2, ALONG].T[..., None]
+        modulus = H[ALONG, ALONG] - (coupling * np.linalg.solve(H[:2, :2].transpose(2, 0, 1), coupling)).sum(
+            axis=(1, 2)
+        )
+        around = np.einsum("nij,nj->ni", self.state.elastic_gradient(), self._directions[:, :, AROUND])
+        squares = self.strut.squared_distances(self._places) * np.square(around).sum(axis=1)
+        length = self._length()
+        return np.pi**2 * self._integral(modulus * squares) / length / (self.strut.end_factor * length) ** 2
+
+    def _length(self) -> float:
+        return self.strut.length * self._integral(self.state.elastic_gradient()[:, 2, 2]) / self.quadrature.volume
 
     def _integral(self, values: Array) -> float:
-        """Over the reference body, of values (n,)."""
-        return self.quadrature.integral(values.reshape(-1, self.quadrature.shape[1]))
-
-    def _moduli(self) -> Array:
-        """Second derivatives of W by logarithmic strains, (3, 3, n)."""
-        H = np.empty((3, 3, len(self._places)))
-        for i, j in itertools.combinations_with_replacement(range(3), 2):
-            H[i, j] = H[j, i] = self._derivative(j, i)
-        return H
+        """Integral over the reference body, of values (n,)."""
+        return self.quadrature.integral(values.reshape(self.quadrature.shape))
 
     def _derivative(self, *axes: int) -> Array:
-        """Of W at the points, by one or two logarithmic strains of the present body: central differences."""
+        """Derivative of W at the points by one or two logarithmic strains of the present body: central differences."""
         room = 1 - max(0.0, self.stepper.coupling.equilibrium.extension().max_chain_extension)  # no chain reaches L
-        h, signs = STRAINS[len(axes)] * room, _SIGNS[len(axes)]
-        strains = np.zeros((len(signs), 3))
-        for axis, way in zip(axes, signs.T, strict=True):
-            strains[:, axis] += h * way
-        weights: Array = signs.prod(axis=1) / (2 * h) ** len(axes)
-        return weights @ self._energies(strains)
+        h, total = STRAINS[len(axes)] * room, np.zeros(len(self._places))
+        for signs in itertools.product((1.0, -1.0), repeat=len(axes)):
+            strains = np.zeros(3)
+            np.add.at(strains, list(axes), np.multiply(signs, h))
+            total += np.prod(signs) * self._energy(strains)
+        return total / (2 * h) ** len(axes)
 
-    def _energies(self, strains: Array) -> Array:
-        """W at the points (k, n) after further stretches exp(strains), (k, 3), along the directions."""
-        Q = self._directions
-        stretch = (Q * np.exp(strains)[:, None, None]) @ Q.swapaxes(1, 2)
-        F = self._as_elements_take_it()
-        cells = self.state.cells.point_cells
-        number = len(F)
-        cell = UnitCell(cells.dimensions[:number], cells.axes[:number])
-        return self._tissue.strain_energy(stretch @ F, [cell])
-
-    def _as_elements_take_it(self) -> Array:
-        """F, with one J in an element where differences of it cost nothing."""
-        F = self._gradients()
-        if self.state.dilatation.jacobians().size == 0:
-            return F
-        states = np.log(self.stepper.coupling.equilibrium.look().states[:, 1]).reshape(-1, self.quadrature.shape[1], 1)
-        return F * np.exp(-self.quadrature.beyond(0, states).reshape(-1) / 3)[:, None, None]
-
-    @cached_property
-    def _places(self) -> Array:
-        return self.quadrature.owned(self.quadrature.coordinates).reshape(-1, 3)
-
-    @cached_property
-    def _directions(self) -> Array:
-        return self.strut.directions(self._places)
-
-    @cached_property
-    def _tissue(self) -> Tissue:
-        number = len(self._places)
-        return self.state.parameters(self.stepper.tissue).at_points().map(lambda name, value: value[:number])
+    def _energy(self, strains: Array) -> Array:
+        """W at the points after further stretches exp(strains) along the directions."""
+        Q, tissue = self._directions, self.state.parameters(self.stepper.tissue).at_points()
+        stretch = (Q * np.exp(strains)) @ Q.swapaxes(1, 2)
+        return tissue.strain_energy(stretch @ self.state.elastic_gradient(), [self.state.cells.point_cells])

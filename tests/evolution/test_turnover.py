@@ -14,7 +14,7 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.system import NOTICE
-from remodel_fenicsx.solver.newton import SolveFailure
+from remodel_fenicsx.solver.newton import SolveFailure, Solution
 from tests.runs import goes_on, last_row, made, opening_angle, rows_of, simulated
 from tests.values import ANGLES, TENSION, ramped, isotropic
 
@@ -200,7 +200,7 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
     def solved(origin: Any = None, roughly: bool = False) -> Any:
         if simulation.state.number not in refused:
             refused.add(simulation.state.number)
-            raise SolveFailure("in vain", 0, 0, coupled.equilibrium.extension())
+            raise SolveFailure("in vain", Solution(extension=coupled.equilibrium.extension()))
         return solve(origin, roughly)
 
     def noted(fraction: float) -> None:

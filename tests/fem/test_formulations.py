@@ -15,7 +15,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.model.energy import MATRICES, neo_hookean
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.schema.settings import Cells, Material
-from remodel_fenicsx.watch.warnings import WARNED_SHARE, LockingWarning, PressureNoise
+from remodel_fenicsx.watch.warnings import LockingWarning, PressureNoise
 from tests import parts
 from tests.conftest import Case, slowly
 from tests.locking_bodies import EXACT_TUBE, bar_scene, registered, thick_tube
@@ -95,7 +95,7 @@ def test_the_guard_knows_j_where_the_formulation_takes_it() -> None:
     x, y, z = (2 * made.nodes - 1).T
     for sign in (-1.0, 1.0):
         made.set_displacement(0.15 * np.column_stack((y * z, x * z, sign * x * y)) - 0.3 * made.nodes)
-        at_points, at_centre = problem.states()[..., 1].min(), problem.state.dilatation.jacobians().min()
+        at_points, at_centre = problem.look().jacobians.min(), problem.state.dilatation.jacobians().min()
         assert at_centre == pytest.approx(0.7**3, rel=1e-12)
         assert (at_points > at_centre) == (sign < 0) and abs(at_points - at_centre) > 1e-3
         assert problem.extension().min_jacobian == min(at_points, at_centre)
@@ -296,16 +296,12 @@ def random_artery(**values: Any) -> Scene:
     return preset_scene("kuhl-holzapfel-2007", "tube").with_values({"cells.initial": "random", **values})
 
 
-def test_the_papers_artery_is_fine_enough(caplog: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_papers_artery_is_fine_enough(caplog: Any) -> None:
     """Where its random cells make strain vary most: two thirds of what is said."""
     artery = random_artery(**{"time.end": 5.0})
     with caplog.at_level(logging.WARNING), simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _):
         watcher = LockingWarning(simulation.stepper, True)
-        missing = sum(watcher.missing())
-        assert 0.025 < missing < 0.038
-        # where a bound is enough nobody asks the tangent
-        monkeypatch.setattr(watcher, "response", None)
-        assert missing <= sum(watcher._missing(*watcher.energies(), WARNED_SHARE)) <= WARNED_SHARE
+        assert 0.025 < sum(watcher.missing()) < 0.038
     assert not caplog.records
 
 

@@ -9,7 +9,6 @@ from mpi4py import MPI
 from remodel_fenicsx.kernels import CompiledPointKernels, PointKernels
 from remodel_fenicsx.model import energy, spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
-from remodel_fenicsx.model.tensors import passes_through_zero
 
 COUNT = 203  # no multiple of the eight that are done at once
 
@@ -17,11 +16,6 @@ COUNT = 203  # no multiple of the eight that are done at once
 @pytest.fixture(scope="module")
 def kernels() -> PointKernels:
     return CompiledPointKernels(MPI.COMM_SELF)
-
-
-@pytest.fixture(params=["C", "numpy"])
-def either(request: pytest.FixtureRequest, kernels: PointKernels) -> PointKernels:
-    return kernels if request.param == "C" else PointKernels()
 
 
 def random_axes(rng: np.random.Generator) -> spectral.Array:
@@ -73,53 +67,6 @@ def test_what_is_not_finite_is_named(kernels: PointKernels) -> None:
         kernels.principal(tensors, axes)
     with pytest.raises(FloatingPointError, match="triad of previous axes 3 of 20"):
         kernels.principal(axes, np.where(np.arange(20)[:, None, None] == 3, np.inf, axes))
-
-
-def states_of_every_kind(rng: np.random.Generator) -> spectral.Array:
-    """r^2, J and F: of bodies in order, and of some that are not."""
-    F = np.eye(3) + 0.5 * rng.normal(size=(COUNT, 3, 3))
-    states = np.column_stack([rng.random(COUNT) * 80, np.linalg.det(F), F.reshape(-1, 9)])
-    return states[states[:, 1] > 0]
-
-
-def test_how_far_points_are_from_their_limits(either: PointKernels) -> None:
-    rng = np.random.default_rng(16)
-    states = states_of_every_kind(rng)
-    lengths = 5 + 5 * rng.random(len(states))
-    stretch, worst, smallest = either.extension(states, lengths)
-    np.testing.assert_allclose(stretch, np.sqrt(states[:, 0]) / lengths, rtol=1e-15)
-    assert worst == np.argmax(stretch) and smallest == states[:, 1].min()
-    assert either.extension(states, np.full(len(states), np.inf))[0].max() == 0.0
-    for number in (np.nan, np.inf, -np.inf):
-        states[[5, 9], [0, 1]] = number
-        stretch, worst, smallest = either.extension(states, lengths)
-        assert stretch[5] == np.inf and worst == 5 and np.isfinite(np.delete(stretch, 5)).all()
-        assert smallest == -np.inf
-    assert either.extension(states[:0], lengths[:0])[2] == np.inf
-
-
-def test_no_point_that_turns_is_left_out(either: PointKernels) -> None:
-    """Of small changes no point need be asked for, of large ones every point that turns is among those that are."""
-    rng = np.random.default_rng(17)
-    before = states_of_every_kind(rng)
-    for size in (1e-3, 0.1, 0.3, 1.0):
-        after = before + size * rng.normal(size=before.shape)
-        at = either.may_turn(before, after)
-        F, G = (ends[:, 2:].reshape(-1, 3, 3) for ends in (before, after))
-        assert set(np.flatnonzero(passes_through_zero(F, G))) <= set(at)
-        assert 0 < len(at) < len(before) or size in (1e-3, 1.0), size
-    assert either.may_turn(before, before).size == 0
-
-
-def test_within_the_room_around_a_state_there_is_no_limit(either: PointKernels) -> None:
-    rng = np.random.default_rng(18)
-    states, far = states_of_every_kind(rng), 0.95
-    stretch, chain = 0.9 * rng.random(len(states)), 0.5 + rng.random(len(states))
-    for some in (slice(None), slice(0, 1), slice(3, 4)):
-        sizes = (states[some, 2:] ** 2).sum(axis=1)
-        expected = np.minimum(2 * states[some, 1] / sizes, (far - stretch[some]) / chain[some]).min()
-        assert either.room(states[some], stretch[some], chain[some], far) == pytest.approx(expected, rel=1e-14)
-    assert either.room(states[:0], stretch[:0], chain[:0], far) == np.inf
 
 
 def test_noise_across_the_axes(kernels: PointKernels) -> None:
@@ -220,13 +167,3 @@ def test_what_is_just_across_the_axes(kernels: PointKernels, plane: tuple[int, i
     found = kernels.without_noise(tensors, axes, noise)
     np.testing.assert_array_equal(found, spectral.without_noise(tensors, axes, noise))
     np.testing.assert_array_equal(found[:, plane[0], plane[1]], np.where(near > 1, -near * noise, 0.0))
-
-
-@pytest.mark.parametrize("factor", [1 - 1e-9, 1 + 1e-9])
-def test_a_change_that_may_just_turn_a_point(either: PointKernels, factor: float) -> None:
-    """From F = I at |dF| = 2/3; and a state with J = 0 always."""
-    before, change = np.concatenate([[3.0, 1.0], np.eye(3).ravel()])[None], np.zeros(11)
-    change[2:] = factor * 2 / 3 / 3
-    assert either.may_turn(before, before + change).size == (factor > 1)
-    before[0, 1] = 0.0
-    assert either.may_turn(before, before).size == 1

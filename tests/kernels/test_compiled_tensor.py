@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx.kernels.tensor import TensorKernels
+from remodel_fenicsx.kernels import TensorKernels
 from remodel_fenicsx.model import energy
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES

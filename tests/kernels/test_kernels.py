@@ -19,7 +19,6 @@ from mpi4py import MPI
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx import kernels
-from remodel_fenicsx.kernels import tensor
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.system.environment import KERNELS, versions
@@ -27,7 +26,7 @@ from tests.conftest import Refused
 from tests.runs import simulated
 
 ROOT = Path(__file__).parents[2]
-NUMBERS = {"factor.c": kernels.NO_NUMBERS, "spectral.c": kernels.NO_NUMBERS, "tensor.c": tensor.NUMBERS}
+NUMBERS = {"factor.c": kernels.NO_NUMBERS, "spectral.c": kernels.NO_NUMBERS, "tensor.c": kernels.NUMBERS}
 CC = shlex.split(os.environ.get("CC", "cc"))
 
 
@@ -70,17 +69,17 @@ def test_memory_and_arithmetic_under_the_sanitizers() -> None:
 
 def test_a_change_of_any_file_or_number_is_another_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its text it is found in the cache."""
-    before = kernels.source("tensor.c", tensor.NUMBERS)
-    assert kernels.source("tensor.c", tensor.NUMBERS) == before
-    assert kernels.source("tensor.c", {**tensor.NUMBERS, "TOLERANCE": 1e-11}) != before
+    before = kernels.source("tensor.c", kernels.NUMBERS)
+    assert kernels.source("tensor.c", kernels.NUMBERS) == before
+    assert kernels.source("tensor.c", {**kernels.NUMBERS, "TOLERANCE": 1e-11}) != before
     copy = tmp_path / "kernels"
     shutil.copytree(kernels.FOLDER, copy)
     monkeypatch.setattr(kernels, "FOLDER", copy)
-    assert kernels.source("tensor.c", tensor.NUMBERS) == before
+    assert kernels.source("tensor.c", kernels.NUMBERS) == before
     for name in ("tensor.c", "algebra.h"):
         text = (copy / name).read_text()
         (copy / name).write_text(text + "/* more */\n")
-        assert kernels.source("tensor.c", tensor.NUMBERS) != before
+        assert kernels.source("tensor.c", kernels.NUMBERS) != before
         (copy / name).write_text(text)
 
 

@@ -16,7 +16,7 @@ from remodel_fenicsx import Scene
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import Change
 from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, Solution
 from remodel_fenicsx.solver.diagnosis import diagnosed
 from tests.locking_bodies import thick_tube
 from tests.runs import made
@@ -64,7 +64,7 @@ def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:
     with made(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125})) as simulation:
         before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
         last = simulation.unknown.x.array - before
-        failure = SolveFailure("refused", 25, 25, Extension(0.7, 1.0, (0.0, 0.0, 0.0)), residual_over_tolerance=50.0)
+        failure = SolveFailure("refused", Solution(25, 25, extension=Extension(0.7, 1.0, (0.0, 0.0, 0.0))), 50.0)
         refusal = diagnosed(simulation.stepper.coupling.newton, failure, last)
     assert refusal.kind == "limit point"
 

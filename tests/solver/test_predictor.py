@@ -12,7 +12,7 @@ from remodel_fenicsx import Recording, Simulation
 from remodel_fenicsx.evolution.coupling import LoadStep, Predictor
 from remodel_fenicsx.running import run
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, Solution
 from tests.parts import pulled_cube
 from tests.results.test_resume import SELF, rows
 from tests.runs import made
@@ -91,7 +91,7 @@ def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pyt
     def failing(newton: GuardedNewton, origin: Any = None) -> Any:
         if not failed or failed[-1] != newton.equilibrium.state.number:
             failed.append(newton.equilibrium.state.number)
-            raise SolveFailure("made to fail", 3, 3, newton.equilibrium.extension())
+            raise SolveFailure("made to fail", Solution(3, 3, extension=newton.equilibrium.extension()))
         return solve(newton, origin)
 
     monkeypatch.setattr(Predictor, "expected", lambda self, step: self.state.unknown.x.array + 0.0)

@@ -55,11 +55,11 @@ def test_loads_are_what_their_names_say() -> None:
     problem = made.problem()
     for loads, total in (({"force": 3.0, "pressure": 0.0}, [0, 0, 3]), ({"force": 0.0, "pressure": 5.0}, [-20, 0, 0])):
         made.loading.set(loads)
-        external = -dolfinx.fem.assemble_vector(problem.external_form).array.reshape(-1, 3)
+        external = -dolfinx.fem.assemble_vector(problem.external_forms[0]).array.reshape(-1, 3)
         np.testing.assert_allclose(external.sum(axis=0), total, atol=1e-13)
         assert made.loading.values == {**loads, "elongation": 0.0}
     made.loading.set({"elongation": 0.1})
-    assert problem.prescribed_gap(problem.state.unknown.x.petsc_vec) == pytest.approx(0.2, rel=1e-14)
+    assert problem.prescribed_gap() == pytest.approx(0.2, rel=1e-14)
 
 
 def test_a_prescribed_elongation_is_reached_as_fast_as_newton_can() -> None:
@@ -134,7 +134,7 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     made = stretched_bar(4.0)
     start = made.displacement.x.array.copy()
     problem = made.problem(parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}}))
-    real, harmless = problem.look, Look(Extension(0.5, 0.5, (0.0, 0.0, 0.0)), np.zeros(0), np.zeros((0, 11)))
+    real, harmless = problem.look, Look(Extension(0.5, 0.5, (0.0, 0.0, 0.0)), *np.zeros((3, 0)))
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
     guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
     monkeypatch.setattr(problem, "look", guard)
@@ -159,6 +159,37 @@ def test_a_straight_way_through_a_collapsed_volume_is_seen() -> None:
     half_a_turn = np.diag([-1.0, -1.0, 1.0])[None]
     assert passes_through_zero(np.eye(3)[None], half_a_turn) and not passes_through_zero(half_a_turn, half_a_turn)
     assert not passes_through_zero(np.eye(3)[None], np.full((1, 3, 3), np.nan))  # others refuse that
+
+
+def test_no_point_that_turns_is_left_out() -> None:
+    """Few points are asked whether the way between two states turns them, and no other one turns."""
+    problem = parts.body(cube(refinement=1), Cells(initial="isotropic")).problem()
+    rng = np.random.default_rng(17)
+    F = np.eye(3) + 0.5 * rng.normal(size=(200, 3, 3))
+    F = F[np.linalg.det(F) > 0]
+    for size in (1e-3, 0.1, 0.3, 1.0):
+        G = F + size * rng.normal(size=F.shape)
+        expected = passes_through_zero(F, G)
+        for at in range(len(F)):
+            ends = [
+                Look(problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1]) for X in (F, G)
+            ]
+            assert problem.turns_inside_out(*ends) == expected[at]
+    assert expected.any() and not expected.all()
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_state_that_is_not_finite_is_at_its_limits(number: float) -> None:
+    """At its worst point r/L is infinite, J is no volume, and the other points stay as they are."""
+    made = parts.body(cube(refinement=2), Cells(initial="isotropic"))
+    problem = made.problem()
+    elsewhere = problem.look().stretches
+    made.displacement.x.array[0] = number
+    look = problem.look()
+    bad = np.isinf(look.stretches)
+    assert bad.any() and not look.extension.admissible
+    assert look.extension.max_chain_extension == np.inf and look.extension.min_jacobian == -np.inf
+    np.testing.assert_array_equal(look.stretches[~bad], elsewhere[~bad])
 
 
 def test_a_newton_step_is_shortened_where_elements_turn_inside_out_or_chains_lock() -> None:
