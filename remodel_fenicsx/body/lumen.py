@@ -73,7 +73,7 @@ def _signed_volume(points: Array, triangles: Integers) -> float:
     """Inside of the triangles and flat caps on their openings."""
     places = points[triangles]
     sides = np.einsum("ni,ni->", places.mean(axis=1), area_vectors(places)) / 3
-    return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim, _ in rims(triangles)))
+    return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim in rims(triangles)))
 
 
 def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
@@ -88,7 +88,7 @@ def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
         reason = str(error).removeprefix(DAMAGED)
         raise SceneError(f"--size {size:g}: Gmsh could not divide the surface so: {reason}") from error
     points, triangles = found["points"], found["triangles"]
-    on_rims = np.isin(np.arange(len(points)), np.concatenate([rim for rim, _ in rims(triangles)]))
+    on_rims = np.isin(np.arange(len(points)), np.concatenate(rims(triangles)))
     divided = Surface(rounded(surface, points, on_rims), triangles, {})
     return oriented(divided, "the surface by Gmsh"), cKDTree(surface.points).query(points)[1]
 
@@ -118,7 +118,7 @@ def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
     Phong's tessellation with the factor 1/2, which is exact where the surface is a parabola: T. Boubekeur and M. Alexa,
     Phong tessellation (2008).
     """
-    rims_of_it = [rim for rim, _ in rims(surface.triangles)]
+    rims_of_it = rims(surface.triangles)
     normals, found = _normals(surface, rims_of_it), np.empty_like(places)
     for simplices, chosen in ((surface.triangles, ~on_rims), (np.concatenate(rims_of_it), on_rims)):
         rows, flat = nearest(surface.points, simplices, places[chosen])
@@ -164,7 +164,7 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
     shares, ends = np.array(list(layers.values())), np.cumsum([0.0, *layers.values()])
     levels = np.concatenate([[0.0], *(np.linspace(ends[k], ends[k + 1], n + 1)[1:] for k, n in enumerate(counts))])
     levels /= shares.sum()
-    openings = [rim for rim, _ in rims(surface.triangles)]
+    openings = rims(surface.triangles)
     size, layer = len(surface.points), np.arange(len(levels) - 1)[:, None, None]
     wedges = np.concatenate([surface.triangles, surface.triangles + size], axis=1) + size * layer
     tetrahedra = split_wedges(wedges.reshape(-1, 6)).reshape(-1, 4)

@@ -358,8 +358,7 @@ class FileBody(WithRegions, FromFile):
             if load == "displacement" and kind not in HELD_ACROSS:
                 able = " or ".join(map(repr, HELD_ACROSS))
                 raise SceneError(f"{key}: its support ({kind!r}) lets it move; a face that is displaced must be {able}")
-            parts = [part for part in domain.parts if part.name == face]  # type: ignore[attr-defined]
-            if load == "displacement" and min(part.flatness for part in parts) < mesh_faces.NOT_AROUND:
+            if load == "displacement" and domain.boundary.goes_around(face):
                 raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
             if load == "displacement" and face in moved:
                 raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
