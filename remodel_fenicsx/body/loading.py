@@ -293,7 +293,7 @@ class Loading:
             Of kinematics that are not those of a mesh in three dimensions.
         """
         self._check_three_dimensional("displacements that are prescribed")
-        facets = self.domain.facet_tags.find(self.domain.faces[face])
+        facets = self.domain.facets(face)
         for component in components:
             subspace = self.kinematics.subspace(self.space, component)
             collapsed, _ = subspace.collapse()
@@ -346,8 +346,8 @@ class Loading:
 
     def measure_alone(self, face: str) -> Any:
         """As `surface_measure`, for forms of this face alone: they have the kernel of the same form of another face."""
-        facets = self.domain.facet_tags.find(self.domain.faces[face])
-        mesh, ones = self.domain.mesh, np.ones(len(facets), dtype=np.int32)
+        mesh, facets = self.domain.mesh, self.domain.facets(face)
+        ones = np.ones(len(facets), dtype=np.int32)
         tags = dolfinx.mesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
         measure = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
         return measure(1, metadata={"quadrature_degree": 2 * field_degree(self.space)})
@@ -419,8 +419,8 @@ class Loading:
         subspace = self.kinematics.subspace(self.space, component)
         if subspace is None:
             return
-        facets = self.domain.facet_tags.find(self.domain.faces[face])
-        dofs = dolfinx.fem.locate_dofs_topological(subspace, self.domain.mesh.topology.dim - 1, facets)
+        dimension = self.domain.mesh.topology.dim - 1
+        dofs = dolfinx.fem.locate_dofs_topological(subspace, dimension, self.domain.facets(face))
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
 
 

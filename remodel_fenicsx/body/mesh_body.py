@@ -400,11 +400,10 @@ def _angle_at(face: str) -> AngleOf:
     """Mean angle over the elements that have a facet on a face."""
 
     def elements(m: Any) -> Flags:
-        from remodel_fenicsx.body.axes import facets_of
         from remodel_fenicsx.body.domain import cells_of
 
         found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
-        found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
+        found[cells_of(m.domain.mesh, m.domain.facets(face))[0]] = True
         return found
 
     def value(m: Any, angle: Array) -> float:

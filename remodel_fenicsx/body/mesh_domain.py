@@ -17,7 +17,7 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.axes import facets_of, harmonic, slopes
+from remodel_fenicsx.body.axes import harmonic, slopes
 from remodel_fenicsx.body.domain import Domain, cells_of, symbolic_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.loading import Loading
@@ -74,7 +74,7 @@ class MeshDomain(Domain):
             return 0.0
         mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
-        psi = harmonic(slopes(mesh, degree, dx), *(facets_of(self, [face]) for face in ("inlet", "outlet")))
+        psi = harmonic(slopes(mesh, degree, dx), self.facets("inlet"), self.facets("outlet"))
         slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(mesh, np.float64(1.0))
         parts = [float(np.real(dolfinx.fem.assemble_scalar(jit.form(value * dx)))) for value in (one, slope)]
         volume, total = over_ranks(self.comm, np.array(parts), MPI.SUM)
