@@ -23,6 +23,7 @@ from remodel_fenicsx.system.children import LARGEST_FILE
 log = logging.getLogger(__name__)
 
 FIBRE_ENDINGS = (".vtu", ".xdmf", ".csv")
+SOLID = ("tetra", "hexa", "wedge")  # beginnings of the names of elements
 SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
@@ -127,16 +128,15 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
     """Arrays of the solid elements, or else of the points; and the file."""
     mesh = read_exchange_file(path)
     try:
-        solid = [n for n, (kind, _) in enumerate(mesh.cells) if kind.startswith(("tetra", "hexa", "wedge"))]
+        solid = [rows for kind, rows in mesh.cells if kind.startswith(SOLID)]
+        chosen = np.repeat([kind.startswith(SOLID) for kind, _ in mesh.cells], [len(rows) for _, rows in mesh.cells])
         of_cells = {
-            name: np.concatenate([_columns(blocks[n]) for n in solid])
-            for name, blocks in mesh.cell_data.items()
-            if name in MEASURED and solid
+            name: _columns(values)[chosen] for name, values in mesh.cell_data.items() if name in MEASURED and solid
         }
         of_points = {name: _columns(values) for name, values in mesh.point_data.items() if name in MEASURED}
         points = np.asarray(mesh.points, dtype=np.float64)
         points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])])
-        centres = [points[mesh.cells[n][1]].mean(axis=1) for n in solid]
+        centres = [points[rows].mean(axis=1) for rows in solid]
     except (ValueError, TypeError, IndexError) as error:
         raise UnreadableFile(f"has arrays that do not fit its elements: {' '.join(str(error).split())}") from error
     if set(of_cells) & set(SOURCES):

@@ -12,7 +12,7 @@ import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
-from remodel_fenicsx.body.mesh_file import ORDERS, Block, gmsh_text, in_place, split_quads, split_wedges
+from remodel_fenicsx.body.mesh_file import ORDERS, Block, gmsh_text, in_place, of_gmsh, split_quads, split_wedges
 from remodel_fenicsx.body.surface_file import SURFACES, Surface, triangles_of
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
@@ -95,8 +95,6 @@ def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
 
 def by_gmsh(file: str) -> dict[str, Any]:
     """In the child process: points and triangles of a size, of those in a file."""
-    from remodel_fenicsx.body.gmsh_file import of_gmsh
-
     with np.load(file) as read, gmsh_model("wall") as gmsh:
         count, corners = len(read["points"]), read["triangles"].ravel() + 1
         gmsh.model.addDiscreteEntity(2, 1)

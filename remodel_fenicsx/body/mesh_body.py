@@ -23,6 +23,7 @@ from remodel_fenicsx.body.mesh_file import (
     MeshFile,
     assembled,
     distinct,
+    of_gmsh,
     read_mesh,
 )
 from remodel_fenicsx.body.surface_file import SURFACES
@@ -396,40 +397,32 @@ class FileBody(WithRegions, FromFile):
 NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
 
 
-def _angle_at(face: str) -> AngleOf:
-    """Mean angle over the elements that have a facet on a face."""
+def _at(face: str, m: Any) -> Flags:
+    """Elements that have a facet on a face."""
+    from remodel_fenicsx.body.domain import cells_of
 
-    def elements(m: Any) -> Flags:
-        from remodel_fenicsx.body.domain import cells_of
-
-        found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
-        found[cells_of(m.domain.mesh, m.domain.facets(face))[0]] = True
-        return found
-
-    def value(m: Any, angle: Array) -> float:
-        chosen = m.tool(("elements at", face), lambda: elements(m))
-        return m.quadrature.mean_of_known(angle, chosen)
-
-    return value
+    found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
+    found[cells_of(m.domain.mesh, m.domain.facets(face))[0]] = True
+    return found
 
 
-def _middle_angle(m: Any, angle: Array) -> float:
-    """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
+def _middle(m: Any) -> Flags:
+    """Elements that are half-way through the wall; there are some in every mesh."""
+    from remodel_fenicsx.fem.compat import geometry_dofmap
 
-    def elements() -> Flags:
-        from remodel_fenicsx.fem.compat import geometry_dofmap
+    depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+    return (depths.min(axis=1) <= 0.5 + NODES_AT_A_DEPTH) & (depths.max(axis=1) >= 0.5 - NODES_AT_A_DEPTH)
 
-        depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
-        low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
-        return (low <= 0.5) & (high >= 0.5)
 
-    return m.quadrature.mean_of_known(angle, m.tool("middle elements", elements))
+def _mean_over(elements: Callable[[Any], Flags]) -> AngleOf:
+    """The mean over elements that are looked for once."""
+    return lambda m, values: m.quadrature.mean_of_known(values, m.tool(elements, lambda: elements(m)))
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
-    "inner": ("with a facet on the inner face", _angle_at("inner")),
-    "middle": ("half-way through the wall", _middle_angle),
-    "outer": ("with a facet on the outer face", _angle_at("outer")),
+    "inner": ("with a facet on the inner face", _mean_over(partial(_at, "inner"))),
+    "middle": ("half-way through the wall", _mean_over(_middle)),
+    "outer": ("with a facet on the outer face", _mean_over(partial(_at, "outer"))),
 }
 
 
@@ -570,8 +563,6 @@ SPLIT = {"tetrahedron": {3: 4, 2: 2}, "hexahedron": {3: 5, 2: 3}}
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     """A mesh of plane elements, split into halves along each edge, as often as asked for."""
-    from remodel_fenicsx.body.gmsh_file import of_gmsh
-
     with gmsh_model("file") as gmsh:
         model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
         for dimension, rows, groups in ((3, file.cells, file.cell_groups), (2, file.facets, file.facet_groups)):

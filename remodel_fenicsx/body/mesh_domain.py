@@ -31,6 +31,7 @@ from remodel_fenicsx.schema.tables import SceneError
 if TYPE_CHECKING:
     from dolfinx.fem import Function
     from dolfinx.mesh import Mesh, MeshTags
+    from ufl.core.expr import Expr
 
 log = logging.getLogger(__name__)
 
@@ -121,8 +122,6 @@ def _tags_of_facets(mesh: Mesh, corners: Integers, values: Integers) -> MeshTags
 
 
 # ---------------------------------------------------------------- supports of faces
-Density = Callable[[Any], Any]
-
 GUIDE = (
     1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
 )
@@ -139,48 +138,30 @@ def add_support(
         for part, facets in loading.domain.facets_of_parts(face):  # type: ignore[attr-defined]
             loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
         loading.supports[face] = None
-    elif support.kind in _DENSITIES:
-        density = _DENSITIES[support.kind](loading, face, support, moves)
+    elif support.kind != "free":
+        density = _density(loading, face, support, moves)
         half, measure = loading.constant((support.stiffness or stiffness) / 2), loading.surface_measure(face)
 
-        def potential(u: Any) -> Any:
+        def potential(u: Function) -> ufl.Form:
             return half * density(loading.kinematics.displacement(u)) * loading.weight * measure
 
         loading.add_potential(potential)
         loading.supports[face] = potential
 
 
-def _guided(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N - d)^2 + (u . c)^2."""
+def _density(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Callable[[Expr], Expr]:
+    """What a face's springs store over half of their stiffness."""
     domain: Any = loading.domain
-    sliding = _sliding(loading, face, support, moves)
-    normal, centre = (domain.of_parts(face, name) for name in ("normal", "centre"))
-    around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
+    if support.kind == "elastic":  # (u . N)^2 + s |u - (u . N) N|^2, N of the place
+        share, across = loading.constant(support.tangential), ufl.FacetNormal(domain.mesh)
+        return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, across) ** 2
+    normal, way = domain.of_parts(face, "normal"), loading.magnitude(*moves) if moves else 0.0
+    if support.kind == "sliding":
+        return lambda u: (ufl.inner(u, normal) - way) ** 2
+    around = ufl.cross(normal, ufl.SpatialCoordinate(domain.mesh) - domain.of_parts(face, "centre"))
     # a Constant: a number in the kernel would be another kernel for each mesh
-    squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
-    return lambda u: sliding(u) + ufl.inner(u, around) ** 2 / squared
-
-
-def _sliding(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N - d)^2."""
-    domain: Any = loading.domain
-    normal = domain.of_parts(face, "normal")
-    way = loading.magnitude(*moves) if moves else 0.0
-    return lambda u: (ufl.inner(u, normal) - way) ** 2
-
-
-def _elastic(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N)^2 + s |u - (u . N) N|^2, N of the place."""
-    share, normal = loading.constant(support.tangential), ufl.FacetNormal(loading.domain.mesh)
-    return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, normal) ** 2
-
-
-# what a face's springs store over half of their stiffness, by the kind of support
-_DENSITIES: dict[str, Callable[[Loading, str, Support, tuple[str, float] | None], Density]] = {
-    "guided": _guided,
-    "sliding": _sliding,
-    "elastic": _elastic,
-}
+    squared = ufl.inner(around, around) + loading.constant(1e-24 * domain.size**2)
+    return lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, around) ** 2 / squared
 
 
 # ---------------------------------------------------------------- rigid motions
@@ -201,7 +182,7 @@ def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongate
         warn_of_twist(name, support, domain.comm)
 
 
-def warn_of_twist(name: str, support: Support, comm: Any) -> None:
+def warn_of_twist(name: str, support: Support, comm: MPI.Intracomm) -> None:
     """Say so where springs may turn a body about its axis."""
     if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and comm.rank == 0:
         log.warning(
@@ -235,14 +216,11 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
 
 def _held_directions(support: Support, part: Face, places: Array) -> Array:
     """What a support holds at a place of each facet of a part, as projections (facets, 3, 3)."""
-    along = np.broadcast_to(np.outer(part.normal, part.normal), (len(part.places), 3, 3))
-    around = np.cross(part.normal, places - part.centre)
-    around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
-    own = part.normals
-    share, springs = support.tangential, np.einsum("fi,fj->fij", own, own)
-    return {
-        "guided": along + np.einsum("fi,fj->fij", around, around),
-        "sliding": along,
-        "held": np.broadcast_to(np.eye(3), along.shape),
-        "elastic": share * np.eye(3) + (1 - share) * springs,
-    }[support.kind]
+    share = {"held": 1.0, "elastic": support.tangential}.get(support.kind, 0.0)
+    normals = part.normals if support.kind == "elastic" else np.broadcast_to(part.normal, places.shape)
+    found: Array = share * np.eye(3) + (1 - share) * np.einsum("fi,fj->fij", normals, normals)
+    if support.kind == "guided":
+        around = np.cross(part.normal, places - part.centre)
+        around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
+        found += np.einsum("fi,fj->fij", around, around)
+    return found

@@ -53,7 +53,7 @@ class Face:
 
 @dataclass(frozen=True, eq=False)
 class Boundary:
-    """What bounds a body: facets with the elements behind them and the names of their faces, "" where they have none."""
+    """What bounds a body: facets, the elements behind them, and the names of their faces or ""."""
 
     facets: Integers
     cell: Integers

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Integers
@@ -47,7 +48,7 @@ def triangles_of(path: Path) -> tuple[Surface, bytes]:
 
 
 def _by_vtk(module: str, name: str, file: str) -> dict[str, Any]:
-    reader = of_vtk(module, name)()
+    reader = getattr(importlib.import_module(f"vtkmodules.{module}"), name)()
     reader.AddObserver("WarningEvent", lambda *_: None)  # of colours behind the places of an OBJ, say
     reader.SetFileName(file)
     reader.Update()
@@ -73,7 +74,7 @@ def ply(file: str) -> dict[str, Any]:
     try:
         order = PLY_ORDERS[next(line[1] for line in header if line[0] == "format")]
         points, polygons = _ply_numbers(header, order, body[body.index(b"\n") + 1 :])
-        places = np.column_stack([points.pop(axis) for axis in "xyz"]).astype(np.float64)
+        places = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)
     except (IndexError, KeyError, StopIteration, ValueError, struct.error):
         raise UnreadableFile("has other numbers than its header announces: is it cut off?") from None
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
@@ -85,18 +86,18 @@ def ply(file: str) -> dict[str, Any]:
     cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(np.array(polygons, dtype=np.int64)))
     surface.SetPoints(corners)
     surface.SetPolys(cells)
-    for name, values in points.items():
-        array = numpy_to_vtk(values.astype(np.float64), deep=True)
+    for name in {*(points.dtype.names or ())} - {*"xyz"}:
+        array = numpy_to_vtk(points[name].astype(np.float64), deep=True)
         array.SetName(name)
         surface.GetPointData().AddArray(array)
     return _triangulated(surface)
 
 
-def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[dict[str, Any], list[int]]:
-    """Arrays at the points by name, and polygons, each with the number of its corners before them."""
+def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[NDArray[Any], list[int]]:
+    """Numbers at the points by name, and polygons, each with the number of its corners before them."""
     is_text, at = order == "=", 0
     body = np.array(body.split(), dtype=np.float64).tobytes() if is_text else body
-    points: dict[str, Any] = {}
+    points = np.empty(0)
     polygons: list[int] = []
     starts = [*(k for k, line in enumerate(header) if line[0] == "element"), len(header)]
     for start, end in itertools.pairwise(starts):
@@ -106,11 +107,10 @@ def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[
             for line in lines
             if line[0] == "property"
         }
-        if all(len(kinds) == 1 for kinds in properties.values()):
+        if element == "vertex":  # numbers alone, and most of them
             record = np.dtype([(name, order + kind) for name, (kind,) in properties.items()])
-            found = np.frombuffer(body, record, abs(int(count)), at) if int(count) else np.empty(0, record)
-            at += found.nbytes
-            points |= {name: found[name] for name in properties} if element == "vertex" else {}
+            points = np.frombuffer(body, record, abs(int(count)), at)
+            at += points.nbytes
             continue
         for _ in range(int(count)):
             for name, kinds in properties.items():
@@ -128,7 +128,10 @@ def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[
 
 def _triangulated(data: Any) -> dict[str, Any]:
     """Triangles of polygons and strips, with corners at one place as one, and arrays of a number at each point."""
-    numbers, points = of_vtk("util.numpy_support", "vtk_to_numpy"), data.GetPoints()
+    from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
+    from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkTriangleFilter
+
+    points = data.GetPoints()
     cells = [
         numbers(each.GetConnectivityArray()) for each in (data.GetPolys(), data.GetStrips()) if each.GetNumberOfCells()
     ]
@@ -138,7 +141,7 @@ def _triangulated(data: Any) -> dict[str, Any]:
         raise UnreadableFile("has polygons with corners that are not there")
     if not np.isfinite(numbers(points.GetData())).all():
         raise UnreadableFile("has points whose coordinates are not finite")
-    triangles, merged = of_vtk("vtkFiltersCore", "vtkTriangleFilter")(), of_vtk("vtkFiltersCore", "vtkCleanPolyData")()
+    triangles, merged = vtkTriangleFilter(), vtkCleanPolyData()
     triangles.SetInputData(data)
     merged.SetInputConnection(triangles.GetOutputPort())
     merged.SetTolerance(0.0)  # two corners at one place leave a line, which is passed over
@@ -153,16 +156,9 @@ def _triangulated(data: Any) -> dict[str, Any]:
     }
 
 
-def of_vtk(module: str, name: str) -> Any:
-    """A class or a function of VTK's."""
-    try:
-        return getattr(importlib.import_module(f"vtkmodules.{module}"), name)
-    except ImportError:
-        raise UnreadableFile("VTK, which reads such files, is not installed: pip install vtk") from None
-
-
 def vtk_arrays(data: Any) -> dict[str, Any]:
     """Arrays of points or cells by name."""
-    numbers = of_vtk("util.numpy_support", "vtk_to_numpy")
+    from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
+
     found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
     return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
