@@ -206,6 +206,7 @@ def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> Non
     if degree == 1:
         return
     mesh = gmsh.model.mesh
+    (straight,), _, _ = mesh.getElements(3)
     mesh.setOrder(degree)
     tags, coordinates, _ = mesh.getNodes()
     old = coordinates.reshape(-1, 3)
@@ -214,7 +215,7 @@ def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> Non
     (kind,), _, (nodes,) = mesh.getElements(3)
     _, _, _, count, local, corners = mesh.getElementProperties(kind)
     cells = row[nodes].reshape(-1, count)
-    weights = _corner_weights(local.reshape(count, 3)[corners:], corners)
+    weights = mesh.getBasisFunctions(straight, local[3 * corners :], "Lagrange")[1].reshape(-1, corners)
     mean = np.einsum("kc,ncd->nkd", weights, old[cells[:, :corners]])
     radius = np.hypot(*np.moveaxis(old[cells[:, :corners], :2], 2, 0)) @ weights.T
     chord = np.hypot(mean[..., 0], mean[..., 1])
@@ -224,12 +225,3 @@ def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> Non
     between, first = np.unique(cells[:, corners:], return_index=True)
     for index, point in zip(between, mean.reshape(-1, 3)[first], strict=True):
         mesh.setNode(tags[index], point, [])
-
-
-def _corner_weights(local: Array, corners: int) -> Array:
-    """Linear shape functions of the corners at Gmsh's reference coordinates (n, 3), (n, corners)."""
-    if corners == 4:
-        return np.column_stack((1.0 - local.sum(axis=1), local))
-    face = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-    signs = np.array([(*corner, height) for height in (-1, 1) for corner in face])
-    return np.prod(0.5 * (1.0 + signs[None] * local[:, None]), axis=2)

@@ -358,12 +358,12 @@ class Loading:
         terms = [term(self.unknown, virtual) for term in self._terms]
         potentials = self.residual_of_potentials(test)
         terms += [] if potentials is None else [potentials]
-        return sum(terms[1:], terms[0]) if terms else None
+        return sum(terms) if terms else None
 
     def residual_of_potentials(self, test: Any) -> Any:
         """The part of it that has a potential: springs, of own bodies; None where there is none."""
         terms = [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
-        return sum(terms[1:], terms[0]) if terms else None
+        return sum(terms) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:
         """Give the named loads new magnitudes.

@@ -12,8 +12,18 @@ import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
-from remodel_fenicsx.body.mesh_file import ORDERS, Block, gmsh_text, in_place, of_gmsh, split_quads, split_wedges
-from remodel_fenicsx.body.surface_file import SURFACES, Surface, triangles_of
+from remodel_fenicsx.body.mesh_file import (
+    ORDERS,
+    SURFACES,
+    Block,
+    Surface,
+    gmsh_text,
+    in_place,
+    of_gmsh,
+    split_quads,
+    split_wedges,
+    triangles_of,
+)
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
@@ -209,17 +219,12 @@ def _straightened(points: Array, tetrahedra: Integers) -> int:
     done: set[int] = set()
     body: Any = SimpleNamespace(kind="tetrahedron", degree=2, points=points, cells=tetrahedra[:, ORDERS["tetra10"]])
     while True:
-        twisted = (jacobian_determinants(body) <= 0).any(axis=1)
-        edges = {
-            int(middle): cell[edge]
-            for cell in tetrahedra[twisted]
-            for middle, edge in zip(cell[4:], map(list, EDGES), strict=True)
-        }
-        if not edges.keys() - done:
+        twisted = tetrahedra[(jacobian_determinants(body) <= 0).any(axis=1)]
+        middles = twisted[:, 4:]
+        if done.issuperset(middles.ravel()):
             return len(done)
-        done |= edges.keys()
-        for middle, ends in edges.items():
-            points[middle] = points[ends].mean(axis=0)
+        done |= {*middles.ravel()}
+        points[middles] = points[twisted[:, EDGES]].mean(axis=2)
 
 
 def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:

@@ -19,6 +19,7 @@ from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gms
 from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
     READERS,
+    SURFACES,
     TAGS,
     MeshFile,
     assembled,
@@ -26,7 +27,6 @@ from remodel_fenicsx.body.mesh_file import (
     of_gmsh,
     read_mesh,
 )
-from remodel_fenicsx.body.surface_file import SURFACES
 from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
 from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_columns, stress_columns
 from remodel_fenicsx.errors import UnreadableFile

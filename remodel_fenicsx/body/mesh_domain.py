@@ -172,7 +172,9 @@ def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongate
     if free := free_motions(domain.boundary.faces, supports):
         kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
         raise SceneError(f"supports ({kinds}): they leave the body free to move, in {free} of 6 rigid motions")
-    sliding = [part for part in domain.boundary.faces if supports.get(part.name, Support(kind="free")).kind == "sliding"]
+    sliding = [
+        part for part in domain.boundary.faces if supports.get(part.name, Support(kind="free")).kind == "sliding"
+    ]
     if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
         raise SceneError(
             "loads.elongation: both ends slide and are not parallel, so the elongation would only shift the body, "

@@ -952,7 +952,7 @@ def homogeneous_bar(
 ) -> reduced.Reduction:
     """The reduction "point" of a body between two faces across z, the same strain everywhere."""
 
-    def build(scene: Any, comm: Any = None) -> Domain:
+    def build(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
         from remodel_fenicsx.body.domain import lattice_domain
 
         shape, length = scene.geometry, scene.geometry.axial_length

@@ -47,17 +47,17 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 # ---------------------------------------------------------------- what stands for all of a tube
 
 
-def build_ray(scene: Any, comm: Any = None) -> Domain:
+def build_ray(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The wall on the x axis, as many elements as the body has through it."""
-    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:2], ("inner", "outer"))
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:2])
 
 
-def build_half_plane(scene: Any, comm: Any = None) -> Domain:
+def build_half_plane(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The wall in the half-plane y = 0, x > 0, with the body's elements through the wall and along."""
-    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:], ("bottom", "top", "inner", "outer"))
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:])
 
 
-def _in_half_plane(scene: Any, comm: Any, counts: tuple[int, ...], names: tuple[str, ...]) -> Domain:
+def _in_half_plane(scene: reduced.ReducedScene, comm: MPI.Intracomm | None, counts: tuple[int, ...]) -> Domain:
     from remodel_fenicsx.body.domain import lattice_domain
 
     shape, degree = scene.geometry, scene.mesh.degree
@@ -65,24 +65,25 @@ def _in_half_plane(scene: Any, comm: Any, counts: tuple[int, ...], names: tuple[
     along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [np.zeros(1)]
     z, radii = np.meshgrid(*along, wall.nodes(degree), indexing="ij")
     points = np.stack([radii.ravel(), np.zeros(radii.size), z.ravel()], axis=1)
-    places = {
+    faces = {
         "bottom": lambda x: np.isclose(x[2], 0.0, atol=1e-9 * shape.length),
         "top": lambda x: np.isclose(x[2], shape.length),
         "inner": lambda x: np.isclose(x[0], shape.inner_radius),
         "outer": lambda x: np.isclose(x[0], shape.outer_radius),
     }
-    faces = {name: places[name] for name in names}
+    if not counts[1:]:  # a ray has no ends
+        faces = {name: faces[name] for name in ("inner", "outer")}
     return wall.marked(lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm))
 
 
-def build_quarter(scene: Any, comm: Any = None) -> Domain:
+def build_quarter(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The body's elements with x > 0 and y > 0; one layer along z where all sections are alike."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)
     return whole_tube(scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1)
 
 
-def layers(scene: Any) -> int:
+def layers(scene: reduced.ReducedScene) -> int:
     """Elements of a quarter along z: one where nothing but u_z depends on z, which is linear in it."""
     alike = reduced.free_ends(scene) is None and reduced.same_cells(scene) is None
     return 1 if alike else PAPER[2] * scene.mesh.refinement
@@ -115,7 +116,7 @@ def _in_layers(points: Array, elements: Integers) -> reduced.Body:
     return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
 
 
-def springs_across(scene: Any) -> str | None:
+def springs_across(scene: reduced.ReducedScene) -> str | None:
     """Springs along the wall pull its sections out of their planes."""
     for face, support in scene.supports.faces.items():
         if support.tangential:
@@ -123,7 +124,7 @@ def springs_across(scene: Any) -> str | None:
     return None
 
 
-def mirrored_draws(scene: Any) -> str | None:
+def mirrored_draws(scene: reduced.ReducedScene) -> str | None:
     """Random cells of the quarter stand for those of the whole tube in the mean alone, and nearly."""
     if reduced.drawn_once(scene) is None:
         return None
