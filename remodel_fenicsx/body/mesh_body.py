@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -28,11 +27,11 @@ from remodel_fenicsx.body.mesh_file import (
     read_mesh,
 )
 from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
-from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_columns, stress_columns
+from remodel_fenicsx.body.wall import AngleOf, Walled, angle_columns, columns_on_request
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.model.tensors import Array, Flags
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
@@ -80,9 +79,9 @@ def _faces(value: Any) -> Any:
 
 def _files(value: Any) -> list[str]:
     """Paths of a mesh and of its surfaces, of one or a list; nothing where they are none."""
-    files = list(value) if isinstance(value, (list, tuple)) else [value]
-    kinds = [READERS, *[SURFACES] * len(files[1:])]
-    return files if files and all(map(_ends_with, files, kinds)) else []
+    mesh, *surfaces = value if isinstance(value, (list, tuple)) and value else [value]
+    are_files = _ends_with(mesh, READERS) and all(_ends_with(one, SURFACES) for one in surfaces)
+    return [mesh, *surfaces] if are_files else []
 
 
 def _ends_with(file: Any, endings: Collection[str]) -> bool:
@@ -103,25 +102,23 @@ def _file(value: Any) -> Any:
 def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
     """The keys with surfaces that faces give as files, inner = { file = "lumen.vtp" }, after the mesh."""
     faces, file = geometry.get("faces"), geometry.get("file")
-    entries = dict(faces) if isinstance(faces, Mapping) else {}
-    own: dict[Any, Any] = {face: one.get("file") for face, one in entries.items() if isinstance(one, Mapping)}
-    own = {face: surface for face, surface in own.items() if _ends_with(surface, SURFACES)}
-    if not own:
-        return dict(geometry)
-    files = dict.fromkeys([*(file if isinstance(file, (list, tuple)) else [file]), *own.values()])
-    return {**geometry, "file": [*files], "faces": entries | {face: Path(one).stem for face, one in own.items()}}
+    files, found = file if isinstance(file, (list, tuple)) else [file], {}
+    for face, one in faces.items() if isinstance(faces, Mapping) else ():
+        if isinstance(one, Mapping) and _ends_with(one.get("file"), SURFACES):
+            files, found[face] = [*files, one["file"]], Path(one["file"]).stem
+    return {**geometry, "file": [*dict.fromkeys(files)], "faces": {**faces, **found}} if found else dict(geometry)
 
 
-def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], there: set[int]) -> list[int]:
+def _numbers(key: str, entries: Names, names: Mapping[str, int], groups: Integers) -> list[int]:
     """Numbers in the file of what a scene gives as a face or a region, by name or number."""
-    found, word = [], {"face": "face", "region": "volume"}[kind]
-    for entry in entries:
-        number = names.get(entry, 0) if isinstance(entry, str) else entry
+    there = {*distinct(groups)} - {0}
+    found = [names.get(entry, 0) if isinstance(entry, str) else int(entry) for entry in entries]
+    for entry, number in zip(entries, found, strict=True):
         if number not in there:
-            listed = [*map(repr, names), *(str(other) for other in sorted(there - set(names.values())))]
+            listed = [*map(repr, names), *map(str, sorted(there - {*names.values()}))]
+            word = "face" if key.startswith("faces") else "volume"
             rule = f"the file has no such {word}; it has {', '.join(listed) or 'none'}"
-            raise SceneError(f"geometry.{kind}s.{name} = {shown(entry)}: {rule}")
-        found.append(int(number))
+            raise SceneError(f"geometry.{key} = {shown(entry)}: {rule}")
     return found
 
 
@@ -283,12 +280,12 @@ class FileBody(WithRegions, FromFile):
 
     def _boundary(self, file: MeshFile) -> mesh_faces.Boundary:
         """With the faces of the body, and further named ones of the file under their own names."""
-        names, there = file.names[2], set(distinct(file.facet_groups)) - {0}
-        asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*self.face_names, *self.faces])}
-        groups = {face: _numbers("face", face, entries, names, there) for face, entries in asked.items()}
-        taken = set(itertools.chain.from_iterable(groups.values()))
-        others = {name: [n] for name, n in names.items() if n in there - taken and name not in groups}
-        return mesh_faces.boundary_of(file, groups, self.open_boundary, others)
+        names, found = file.names[2], file.facet_groups
+        asked = {face: (face,) for face in self.face_names} | self.faces
+        groups = {face: _numbers(f"faces.{face}", entries, names, found) for face, entries in asked.items()}
+        others = {*distinct(found)}.difference(*groups.values())
+        further = {name: [n] for name, n in names.items() if n in others and name not in groups}
+        return mesh_faces.boundary_of(file, groups, self.open_boundary, further)
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
         numbers = distinct(file.cell_groups)
@@ -298,7 +295,6 @@ class FileBody(WithRegions, FromFile):
                 f"{len(lost)} elements are in no named volume, the first is {lost[0]}; name all volumes, or none"
             )
         names = {number: name for name, number in file.names[3].items()}
-        names |= {self._volumes(file, name, entries[:1])[0]: name for name, entries in self.regions.items()}
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
 
     def _mesh(self) -> MeshFile:
@@ -306,17 +302,19 @@ class FileBody(WithRegions, FromFile):
         file = self._read()
         if not self.regions:
             return file
-        groups, taken = file.cell_groups.copy(), set()
+        groups, numbers = file.cell_groups.copy(), dict[str, int]()
         for name, entries in self.regions.items():
-            numbers = self._volumes(file, name, entries)
-            groups[np.isin(groups, numbers)] = numbers[0]
-            taken.add(numbers[0])
-        own = ~mesh_faces.again(file.corners, groups, taken)
-        return replace(file, cells=file.cells[own], cell_numbers=file.cell_numbers[own], cell_groups=groups[own])
-
-    def _volumes(self, file: MeshFile, region: str, entries: Names) -> list[int]:
-        """Numbers of the volumes that a region has in the file."""
-        return _numbers("region", region, entries, file.names[3], set(distinct(file.cell_groups)) - {0})
+            numbers[name], *others = _numbers(f"regions.{name}", entries, file.names[3], file.cell_groups)
+            groups[np.isin(groups, others)] = numbers[name]
+        own = ~mesh_faces.again(file.corners, groups, numbers.values())
+        others = {name: number for name, number in file.names[3].items() if number not in numbers.values()}
+        return replace(
+            file,
+            cells=file.cells[own],
+            cell_numbers=file.cell_numbers[own],
+            cell_groups=groups[own],
+            names={**file.names, 3: others | numbers},
+        )
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
         """Refuse faces that cannot be those of the body. On rank 0."""
@@ -433,11 +431,7 @@ class WalledMesh(Walled):
     """
 
     columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
-        *itertools.chain.from_iterable(angle_columns(MEANS_ON_A_MESH, name) for name in CONFIGURATIONS),
-        *stress_columns(MEANS_ON_A_MESH),
-        *Walled.columns_on_request,
-    )
+    columns_on_request: ClassVar[tuple[Column, ...]] = columns_on_request(MEANS_ON_A_MESH)
     axis_kinds = ("local", "global")
     constant_fields = CONSTANT_FIELDS
     defaults = {"cells": {"axes": "local"}}

@@ -7,7 +7,6 @@ https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import importlib
 import itertools
@@ -17,6 +16,7 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -123,13 +123,17 @@ TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
 """Arrays of numbers of faces and volumes: as meshio, VMTK and Medit call them."""
 
 
+Arrays = dict[str, NDArray[Any]]
+Blocks = list[tuple[str, Integers]]
+
+
 class ExchangeFile(NamedTuple):
     """What such a file holds: types of the elements with their rows of nodes, arrays over all, and the file itself."""
 
-    points: NDArray[Any]
-    cells: list[tuple[str, NDArray[Any]]]
-    point_data: dict[str, NDArray[Any]]
-    cell_data: dict[str, NDArray[Any]]
+    points: Array
+    cells: Blocks
+    point_data: Arrays
+    cell_data: Arrays
     group_names: list[tuple[int, int, str]]
     data: bytes
 
@@ -152,22 +156,12 @@ def read_exchange_file(path: Path) -> ExchangeFile:
 # what the child calls, without the modules of other formats
 
 
-def arrays_xdmf(file: str) -> dict[str, Any]:
+def arrays_xdmf(file: str) -> Arrays:
     """Those of a file in XDMF."""
     mesh = importlib.import_module("meshio.xdmf").read(file)
     cells = [_in_gmsh_order(block.type, block.data) for block in mesh.cells]
     of_cells = {name: np.concatenate(values) for name, values in mesh.cell_data.items()}
     return as_arrays(mesh.points, cells, mesh.point_data, of_cells)
-
-
-def arrays_vtu(file: str) -> dict[str, Any]:
-    """Those of a file in VTK's XML, however its writers pack numbers."""
-    return _of_vtk("vtkIOXML", "vtkXMLUnstructuredGridReader", file)
-
-
-def arrays_vtk(file: str) -> dict[str, Any]:
-    """Those of a file in VTK's old format, as text or not."""
-    return _of_vtk("vtkIOLegacy", "vtkUnstructuredGridReader", file)
 
 
 def _read_by_vtk(module: str, reader: str, file: str, is_surface: bool = True) -> Any:
@@ -181,7 +175,7 @@ def _read_by_vtk(module: str, reader: str, file: str, is_surface: bool = True) -
     return made.GetOutput()
 
 
-def _of_vtk(module: str, reader: str, file: str) -> dict[str, Any]:
+def _of_vtk(module: str, reader: str, file: str) -> Arrays:
     """By VTK itself, as meshio would have them."""
     from meshio._vtk_common import vtk_to_meshio_type
     from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
@@ -200,7 +194,11 @@ def _of_vtk(module: str, reader: str, file: str) -> dict[str, Any]:
     return as_arrays(points, cells, vtk_arrays(grid.GetPointData()), vtk_arrays(grid.GetCellData()))
 
 
-def arrays_msh(file: str) -> dict[str, Any]:
+arrays_vtu = partial(_of_vtk, "vtkIOXML", "vtkXMLUnstructuredGridReader")
+arrays_vtk = partial(_of_vtk, "vtkIOLegacy", "vtkUnstructuredGridReader")
+
+
+def arrays_msh(file: str) -> Arrays:
     """Those of a file by Gmsh, where elements of several groups are there several times."""
     data = Path(file).read_bytes()
     version = _FORMAT.match(data)
@@ -249,12 +247,8 @@ def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
 
 
 def as_arrays(
-    points: NDArray[np.floating[Any]],
-    cells: Sequence[tuple[str, Integers]],
-    point_data: Mapping[str, NDArray[Any]],
-    cell_data: Mapping[str, NDArray[Any]],
-    group_names: Sequence[tuple[int, int, str]] = (),
-) -> dict[str, NDArray[Any]]:
+    points: Array, cells: Blocks, point_data: Arrays, cell_data: Arrays, group_names: Sequence[object] = ()
+) -> Arrays:
     """An `ExchangeFile` as the child hands it over: its names, and its arrays in their order."""
     names = [[kind for kind, _ in cells], [*point_data], [*cell_data], group_names]
     arrays = [points, *(rows for _, rows in cells), *point_data.values(), *cell_data.values()]
@@ -297,25 +291,23 @@ def triangles_of(path: Path) -> tuple[Surface, bytes]:
 # ---------------------------------------------------------------- the child
 
 
-def vtp(file: str) -> dict[str, Any]:
-    """In VTK's XML."""
-    return _triangulated(_read_by_vtk("vtkIOXML", "vtkXMLPolyDataReader", file))
+def _by_vtk(module: str, reader: str, file: str) -> Arrays:
+    return _triangulated(_read_by_vtk(module, reader, file))
 
 
-def obj(file: str) -> dict[str, Any]:
-    """Whatever else stands in it."""
-    return _triangulated(_read_by_vtk("vtkIOGeometry", "vtkOBJReader", file))
+vtp = partial(_by_vtk, "vtkIOXML", "vtkXMLPolyDataReader")
+obj = partial(_by_vtk, "vtkIOGeometry", "vtkOBJReader")
 
 
-def stl(file: str) -> dict[str, Any]:
+def stl(file: str) -> Arrays:
     """As text with decimal commas too."""
     data = Path(file).read_bytes()
     if b"\0" not in data:
         Path(file).write_bytes(re.sub(rb"(?<=\d),(?=\d)", b".", data))  # in this process' memory
-    return _triangulated(_read_by_vtk("vtkIOGeometry", "vtkSTLReader", file))
+    return _by_vtk("vtkIOGeometry", "vtkSTLReader", file)
 
 
-def ply(file: str) -> dict[str, Any]:
+def ply(file: str) -> Arrays:
     """Not by VTK, whose reader leaves arrays at points out, and crashes where a file is cut off."""
     head, _, body = Path(file).read_bytes().partition(b"end_header")
     header = [line.split() for line in head.decode("ascii", "replace").splitlines() if line.strip()]
@@ -345,7 +337,7 @@ def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[
     """Numbers at the points by name, and polygons, each with the number of its corners before them."""
     is_text, at = order == "=", 0
     body = np.array(body.split(), dtype=np.float64).tobytes() if is_text else body
-    points = np.empty(0)
+    points: NDArray[Any] = np.empty(0)
     polygons: list[int] = []
     starts = [*(k for k, line in enumerate(header) if line[0] == "element"), len(header)]
     for start, end in itertools.pairwise(starts):
@@ -374,7 +366,7 @@ def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[
     return points, polygons
 
 
-def _triangulated(data: Any) -> dict[str, Any]:
+def _triangulated(data: Any) -> Arrays:
     """Triangles of polygons and strips, with corners at one place as one, and arrays of a number at each point."""
     from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
     from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkTriangleFilter
@@ -404,7 +396,7 @@ def _triangulated(data: Any) -> dict[str, Any]:
     }
 
 
-def vtk_arrays(data: Any) -> dict[str, Any]:
+def vtk_arrays(data: Any) -> Arrays:
     """Arrays of points or cells by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
 
@@ -429,7 +421,7 @@ def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()
         raise UnreadableFile(f"cannot be read: {error.strerror or error}") from None
 
 
-@functools.lru_cache(maxsize=1)
+@lru_cache(maxsize=1)
 def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tuple[Any, ...]) -> MeshFile:
     mesh = read_exchange_file(path)
     points = np.asarray(mesh.points, dtype=np.float64)

@@ -18,13 +18,12 @@ from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.body.shape import Column, End, LoadKind, check_lengths
 from remodel_fenicsx.body.wall import (
     AngleOf,
-    CONFIGURATIONS,
     RoundWall,
     Wall,
     angle_columns,
     STRESSES,
-    stress_columns,
     check_layers,
+    columns_on_request,
     tube_layers,
 )
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
@@ -342,8 +341,6 @@ class Tube(RoundWall):
             by_case=False,
             of_one_tissue=True,
         ),
-        *itertools.chain.from_iterable(angle_columns(MEANS, name) for name in CONFIGURATIONS),
-        *stress_columns(MEANS),
         Column(
             "mean_hoop_stress",
             "stress",
@@ -356,7 +353,7 @@ class Tube(RoundWall):
             "outer less inner radius",
             lambda m: _mean_radius("outer")(m) - _mean_radius("inner")(m),
         ),
-        *RoundWall.columns_on_request,
+        *columns_on_request(MEANS),
     )
     axis_kinds = ("global", "cylindrical")
     number_of_elements = 1536
