@@ -20,7 +20,7 @@ import numpy.typing as npt
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx.body.gmsh_model import GeometryError, NamedGroups, gmsh_model, named_groups
+from remodel_fenicsx.body.gmsh_model import GeometryError, gmsh_model, named_groups
 from remodel_fenicsx.fem import compat
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
@@ -231,9 +231,7 @@ def build_domain(
     # with several threads Scotch parts the same mesh differently from run to run
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
     with ExitStack() as stack:
-        model: Any = None
-        groups: NamedGroups | None = None
-        failure: BaseException | None = None
+        model = groups = failure = None
         if comm.rank == 0:
             try:
                 model = stack.enter_context(gmsh_model(shape)).model
@@ -251,7 +249,7 @@ def build_domain(
     symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
     region = np.zeros(len(mesh.topology.original_cell_index), dtype=np.int32)
     region[cell_tags.indices] = cell_tags.values
-    drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups.faces, shape, dimensions, groups.regions
+    drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups[0], shape, dimensions, groups[1]
     domain = Domain(*drawn, region)
     return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # ghosts too
 

@@ -71,27 +71,18 @@ def gmsh_model(name: str) -> Iterator[Any]:
             gmsh.finalize()
 
 
-class NamedGroups(NamedTuple):
-    """Names and numbers of the physical groups of a model: its faces, and its regions, which share out its volumes."""
-
-    faces: dict[str, int]
-    regions: dict[str, int]
-
-
-def named_groups() -> NamedGroups:
-    """Those of the current model, once it is sure that dolfinx can take the model."""
+def named_groups() -> tuple[dict[str, int], dict[str, int]]:
+    """Faces and regions of the current model, which share out its volumes: their numbers by name."""
     # dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
-    found = NamedGroups(_groups(2), _groups(3))
-    kinds = gmsh.model.mesh.getElements(3)[0]
-    if not found.regions or len(kinds) != 1 or not found.faces:
-        counts = f"{len(found.regions)} named volumes, {len(kinds)} types of elements, {len(found.faces)} named faces"
-        raise GeometryError(counts)
+    faces, regions, kinds = _groups(2), _groups(3), gmsh.model.mesh.getElements(3)[0]
+    if not regions or len(kinds) != 1 or not faces:
+        raise GeometryError(f"{len(regions)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
     for _, volume in gmsh.model.getEntities(3):
         groups = gmsh.model.getPhysicalGroupsForEntity(3, volume)
         if len(groups) != 1 and len(gmsh.model.mesh.getElements(3, volume)[0]):
-            names = " and ".join(repr(name) for name, tag in found.regions.items() if tag in groups) or "no named one"
+            names = " and ".join(repr(name) for name, tag in regions.items() if tag in groups) or "no named one"
             raise GeometryError(f"volume {volume} is in {names}; each must be in one named volume")
-    return found
+    return faces, regions
 
 
 def _groups(dimension: int) -> dict[str, int]:

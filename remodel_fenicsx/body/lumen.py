@@ -245,13 +245,12 @@ def _in_planes(vectors: Array, points: Array, openings: Sequence[Integers]) -> A
 
 
 def _smoothed(normals: Array, surface: Surface, openings: Sequence[Integers]) -> Array:
-    """Each with the mean of those around it."""
+    """Each with those around it."""
     edges = np.unique(np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2), axis=0)
-    sums, counts = normals.copy(), np.ones(len(normals))
+    sums = normals.copy()
     for one, other in (edges.T, edges.T[::-1]):
         np.add.at(sums, one, normals[other])
-        np.add.at(counts, one, 1.0)
-    return _in_planes(sums / counts[:, None], surface.points, openings)
+    return _in_planes(sums, surface.points, openings)
 
 
 def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
@@ -289,10 +288,7 @@ def write_wall(
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: {len(read.triangles)} triangles are divided again, which takes minutes")
     found, near = remeshed(read, size)
-    depth = depth[near]
-    if len(read.triangles) > LARGE_SURFACE:
-        announce(f"{path}: the wall grows on {len(found.triangles)} triangles")
-    wall = grown(found, read, depth, shares or {"wall": 1.0}, through)
+    wall = grown(found, read, depth[near], shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
     names = list(shares) or ["wall"]

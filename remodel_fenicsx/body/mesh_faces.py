@@ -147,18 +147,12 @@ def rims(facets: Integers) -> list[Integers]:
     return [edges[alone[label == one]] for one in distinct(label)]
 
 
-def cap_vector(points: Array, rim: Integers) -> Array:
-    """Integral of x cross dx / 2 along a closed line of straight or parabolic edges: area times normal of a cap."""
-    a, b = points[rim[:, 0]], points[rim[:, 1]]
-    if rim.shape[1] == 2:
-        return np.cross(a, b).sum(axis=0) / 2
-    m = points[rim[:, 2]]
-    return (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6
-
-
 def cap_volume(points: Array, rim: Integers) -> float:
-    """Of the cone between the origin and a flat cap on a closed line."""
-    return float(points[rim[:, 0]].mean(axis=0) @ cap_vector(points, rim) / 3)
+    """Of the cone between the origin and a flat cap on a closed line of straight or parabolic edges."""
+    a, b = points[rim[:, 0]], points[rim[:, 1]]
+    m = points[rim[:, 2]] if rim.shape[1] == 3 else (a + b) / 2
+    vector = (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6  # area times normal
+    return float(a.mean(axis=0) @ vector / 3)
 
 
 def components(rows: Integers, nodes: int) -> Integers:

@@ -226,27 +226,27 @@ def objections(scene: ReducedScene, name: str) -> list[str]:
     if name not in shape.reductions:
         known = " or ".join(map(repr, shape.reductions)) or "none"
         return [f"a {shape.name} has no such reduction; it has {known}"]
-    reasons = [reason for rule in shape.reductions[name].rules if (reason := rule(scene)) is not None]
+    reasons = _reasons(shape.reductions[name].rules, scene)
     if scene.solver.unstable == "stop":
         reasons.append("solver.unstable = 'stop' needs the modes of the whole body")
     return reasons
 
 
-def _in_the_mean(scene: ReducedScene, name: str) -> list[str]:
-    reduction = scene.geometry.reductions.get(name)
-    rules = () if reduction is None else reduction.in_the_mean
+def _reasons(rules: Sequence[Rule], scene: ReducedScene) -> list[str]:
     return [reason for rule in rules if (reason := rule(scene)) is not None]
 
 
 def is_for_means(scene: ReducedScene, name: str) -> bool:
     """Whether a kinematics, where it is allowed, is right for means over many seeds alone."""
-    return bool(_in_the_mean(scene, name))
+    reductions = scene.geometry.reductions
+    return name in reductions and bool(_reasons(reductions[name].in_the_mean, scene))
 
 
 def only_for_means(scene: ReducedScene) -> list[str]:
     """Why the scene's own kinematics is right for means over many seeds alone, in words; nothing where it is exact."""
-    name = scene.model.kinematics
-    return [f"{name!r}: {reason}" for reason in _in_the_mean(scene, name)]
+    name, reductions = scene.model.kinematics, scene.geometry.reductions
+    reasons = _reasons(reductions[name].in_the_mean, scene) if name in reductions else []
+    return [f"{name!r}: {reason}" for reason in reasons]
 
 
 def for_means(scene: ReducedScene) -> str:

@@ -171,10 +171,7 @@ REDUCTIONS = {
 
 
 def _mean_radius(face: str) -> Callable[[Any], float]:
-    def value(m: Any) -> float:
-        return m.face_mean(face, np.linalg.norm(m.position[:, :2], axis=1), deformed=True)
-
-    return value
+    return lambda m: m.face_mean(face, np.linalg.norm(m.position[:, :2], axis=1), deformed=True)
 
 
 def _mean_hoop_stress(m: Any) -> float:
@@ -188,12 +185,10 @@ def _mean_hoop_stress(m: Any) -> float:
 def _layer_angle(share: float) -> AngleOf:
     """Mean angle over the elements that touch R_i + share (R_o - R_i)."""
 
-    def value(m: Any, angle: Array) -> float:
-        inner, outer = (m.domain.dimensions[f"{side}_radius"] for side in ("inner", "outer"))
-        radius = (1.0 - share) * inner + share * outer
-        return m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius))
+    def radius(dimensions: Mapping[str, float]) -> float:
+        return (1.0 - share) * dimensions["inner_radius"] + share * dimensions["outer_radius"]
 
-    return value
+    return lambda m, angle: m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius(m.domain.dimensions)))
 
 
 THICK_ELEMENTS = 0.2  # inner radii: at 0.25 the radial stress at the face of linear elements is 4 to 5 % off
@@ -401,7 +396,7 @@ class Tube(RoundWall):
         check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
         return self
 
-    def unresolved(self, mesh: Any, columns: Collection[str]) -> list[str]:
+    def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
         """Warn of stresses at the inner face of linear elements that are thick for its radius."""
         size = (self.outer_radius - self.inner_radius) / _counts(mesh)[1] / self.inner_radius
         at_face = [name for name in columns if name in {f"{component}_stress_inner" for component in STRESSES}]
