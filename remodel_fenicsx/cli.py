@@ -437,7 +437,7 @@ def _new(options: argparse.Namespace) -> None:
 @command(
     "wall",
     "wall lumen.stl --thickness 0.6 --size 0.9 -o vessel.msh",
-    option("surface FILE  The surface of the lumen, open at its ends: STL, PLY, VTP or OBJ.", type=Path),
+    option("surface FILE  The surface of the lumen, open at its ends: STL, VTP or OBJ.", type=Path),
     option(
         "--thickness VALUE  Thickness of the wall in the unit of the surface, or the name of an array at its points."
     ),

@@ -59,7 +59,7 @@ from typing import TYPE_CHECKING
 
 from remodel_fenicsx._lazy import on_demand
 from remodel_fenicsx.body import SHAPES as SHAPES, LoadKind as LoadKind, Shape as Shape
-from remodel_fenicsx.body.cube import box_domain as box_domain
+from remodel_fenicsx.body.box import box_domain as box_domain
 from remodel_fenicsx.body.shape import (
     COLUMNS as COLUMNS,
     COLUMNS_ON_REQUEST as COLUMNS_ON_REQUEST,

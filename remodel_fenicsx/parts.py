@@ -13,12 +13,11 @@ Examples
 
 from typing import TYPE_CHECKING
 
-from remodel_fenicsx.body.cube import Cube as Cube
+from remodel_fenicsx.body.box import Cube as Cube, Sheet as Sheet
 from remodel_fenicsx.body.domain import Domain as Domain
 from remodel_fenicsx.body.gmsh_model import GeometryError as GeometryError
 from remodel_fenicsx.body.loading import Loading as Loading
 from remodel_fenicsx.body.shape import columns_of as columns_of
-from remodel_fenicsx.body.sheet import Sheet as Sheet
 from remodel_fenicsx.body.tendon import Tendon as Tendon
 from remodel_fenicsx.body.tube import Tube as Tube
 from remodel_fenicsx.evolution.stepper import Step as Step, Stepper as Stepper, Watcher as Watcher, times as times

@@ -143,7 +143,7 @@ class ForkedChild:
 def read_in_a_fork(command: Sequence[str], **_: Any) -> subprocess.CompletedProcess[bytes]:
     """Stands for subprocess.run in `remodel_fenicsx.system.children`: a reader with its limits, in a fork."""
     reader, *words, memory = command[command.index("remodel_fenicsx.system.children") + 1 :]
-    for module in ("meshio", reader.partition(":")[0]):
+    for module in ("meshio", *reader.partition(":")[0].split()):
         importlib.import_module(module)
     with tempfile.TemporaryFile() as said, warnings.catch_warnings(action="ignore"):
         child = os.fork()

@@ -135,13 +135,10 @@ def ring(
 
 
 def fork(half_angle: float, size: float, radius: float = 1.0, wall: float = 0.4, length: float = 5.0) -> Domain:
-    """A trunk along z below the origin and two branches above, as Gmsh cuts and meshes it; "left" and "right"."""
+    """A trunk along z below the origin and two branches above, as Gmsh cuts and meshes it; both are its outlet."""
     branches = [half_angle * sign for sign in (-1.0, 1.0)]
-    ways = {"inlet": np.array([0.0, 0.0, -1.0])}
-    ways |= {
-        name: np.array([np.sin(angle), 0.0, np.cos(angle)])
-        for name, angle in zip(("left", "right"), np.radians(branches), strict=True)
-    }
+    ways = [np.array([0.0, 0.0, -1.0])]  # the inlet, then the outlets
+    ways += [np.array([np.sin(angle), 0.0, np.cos(angle)]) for angle in np.radians(branches)]
 
     def draw() -> None:
         import gmsh
@@ -149,20 +146,21 @@ def fork(half_angle: float, size: float, radius: float = 1.0, wall: float = 0.4,
         occ = gmsh.model.occ
 
         def solid(size: float) -> list[tuple[int, int]]:
-            parts = [(3, occ.addCylinder(0, 0, 0, *(length * way), size)) for way in ways.values()]
+            parts = [(3, occ.addCylinder(0, 0, 0, *(length * way), size)) for way in ways]
             fused, _ = occ.fuse([(3, occ.addSphere(0, 0, 0, size))], parts)
             return list(fused)
 
         body, _ = occ.cut(solid(radius + wall), solid(radius))
         occ.synchronize()
-        groups: dict[str, list[int]] = {name: [] for name in ("inner", "outer", *ways)}
+        groups: dict[str, list[int]] = {name: [] for name in FACES}
         for _, face in gmsh.model.getEntities(2):
             centre = np.array(occ.getCenterOfMass(2, face))
-            end = [name for name, way in ways.items() if abs(centre @ way - length) < 1e-6]
+            at_end = [abs(centre @ way - length) < 1e-6 for way in ways]
             (low, other), (high, last) = gmsh.model.getParametrizationBounds(2, face)
             place = np.array(gmsh.model.getValue(2, face, [(low + high) / 2, (other + last) / 2]))
-            away = min(float(np.linalg.norm(place - max(place @ way, 0.0) * way)) for way in ways.values())
-            groups[end[0] if end else "inner" if away < radius + wall / 2 else "outer"].append(face)
+            away = min(float(np.linalg.norm(place - max(place @ way, 0.0) * way)) for way in ways)
+            end = "inlet" if at_end[0] else "outlet" if any(at_end) else ""
+            groups[end or ("inner" if away < radius + wall / 2 else "outer")].append(face)
         for name, faces in groups.items():
             gmsh.model.addPhysicalGroup(2, faces, name=name)
         gmsh.model.addPhysicalGroup(3, [tag for _, tag in body], name="body")
@@ -173,10 +171,10 @@ def fork(half_angle: float, size: float, radius: float = 1.0, wall: float = 0.4,
     return build_domain(draw, "fork", {"size": length}, MPI.COMM_SELF)
 
 
-def found(domain: Domain, degree: int = 1, **ends: Any) -> tuple[LocalAxes, Quadrature]:
+def found(domain: Domain, degree: int = 1) -> tuple[LocalAxes, Quadrature]:
     """Local axes of a mesh, and the points."""
     quadrature = Quadrature(domain.mesh, degree)
-    return found_axes(domain, quadrature, **ends), quadrature
+    return found_axes(domain, quadrature), quadrature
 
 
 def apart(one: Array, other: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from remodel_fenicsx._lazy import on_demand, resolved
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.body.cube import Cube
+    from remodel_fenicsx.body.box import Cube
     from remodel_fenicsx.body.shape import LoadKind, Shape
     from remodel_fenicsx.body.tendon import Tendon
     from remodel_fenicsx.body.tube import Tube
@@ -25,10 +25,10 @@ class _Shapes(UserDict[str, Any]):
 
 SHAPES = _Shapes(
     {
-        "cube": "remodel_fenicsx.body.cube:Cube",
+        "cube": "remodel_fenicsx.body.box:Cube",
         "tendon": "remodel_fenicsx.body.tendon:Tendon",
         "tube": "remodel_fenicsx.body.tube:Tube",
-        "sheet": "remodel_fenicsx.body.sheet:Sheet",
+        "sheet": "remodel_fenicsx.body.box:Sheet",
         "mesh": "remodel_fenicsx.body.mesh_body:MeshBody",
         "solid": "remodel_fenicsx.body.mesh_body:Solid",
     }
@@ -37,7 +37,7 @@ SHAPES = _Shapes(
 
 # a reader of files, in a process of its own, needs none of them
 MODULES = {
-    "Cube": "body.cube",
+    "Cube": "body.box",
     "LoadKind": "body.shape",
     "Shape": "body.shape",
     "Tendon": "body.tendon",

@@ -10,9 +10,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
+import basix
 import dolfinx.fem
 import dolfinx.la
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.domain import Domain, cells_of, corners_of, dof_of_node
+from remodel_fenicsx.body.domain import Domain, cells_of, dof_of_node
 from remodel_fenicsx.body.mesh_faces import area_vectors
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import Positive, SolveStopped, of_all_ranks, over_ranks
@@ -48,15 +48,13 @@ SQUARE_TO_RADIAL = 10.0
 TINY = 1e-12  # of a squared length of about one: no direction is divided by zero
 
 
-def _fields(
-    domain: Domain,
-    quadrature: Quadrature,
-    inlets: Sequence[str],
-    outlets: Sequence[str],
-) -> list[Function]:
+FACES = ("inner", "outer", "inlet", "outlet")
+
+
+def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     """Radial and axial direction, lengths from inner and outer face, inlet and outlet: functions. Collective."""
     mesh, degree = domain.mesh, quadrature.element_degree
-    inner, outer, starts, ends = (facets_of(domain, names) for names in (["inner"], ["outer"], inlets, outlets))
+    inner, outer, starts, ends = map(domain.facets, FACES)
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
     dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
     stiffness = slopes(mesh, degree, dx)
@@ -93,13 +91,7 @@ def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Fu
     return found
 
 
-def _axial(
-    radial: Function,
-    dx: ufl.Measure,
-    starts: Facets,
-    ends: Facets,
-    thickness: float,
-) -> Function:
+def _axial(radial: Function, dx: ufl.Measure, starts: Facets, ends: Facets, thickness: float) -> Function:
     """The smoothest field: least integral of |grad a|^2 + k (a . r)^2 / thickness^2 with the ends' normals."""
     space, normal = radial.function_space, _unit(radial)
     weight = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2))
@@ -110,12 +102,7 @@ def _axial(
 
 
 def _length(
-    form: Positive,
-    direction: Expr,
-    dx: ufl.Measure,
-    facets: Facets,
-    sign: float,
-    multigrid: bool = False,
+    form: Positive, direction: Expr, dx: ufl.Measure, facets: Facets, sign: float, multigrid: bool = False
 ) -> Function:
     """The function, 0 on facets, whose gradient is nearest to a direction: along it alone, or as a vector."""
     test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(form.space.mesh, np.float64(sign))
@@ -137,7 +124,7 @@ def _held(space: FunctionSpace, facets: Facets, value: float) -> DirichletBC:
     return dolfinx.fem.dirichletbc(held, dofs, space)
 
 
-def _normal_to_ends(function: Any, starts: Facets, ends: Facets) -> Any:
+def _normal_to_ends(function: Function, starts: Facets, ends: Facets) -> DirichletBC:
     """Inward normals on the inlets, outward ones on the outlets: at nodes the mean over the facets by their area."""
     space, sums = function.function_space, dolfinx.fem.Function(function.function_space)
     values, layout = sums.x.array.reshape(-1, 3), space.dofmap.dof_layout
@@ -154,25 +141,21 @@ def _normal_to_ends(function: Any, starts: Facets, ends: Facets) -> Any:
 
 
 # ---------------------------------------------------------------- facets
-def facets_of(domain: Domain, names: Sequence[str]) -> Facets:
-    """Local facets of named faces, ascending, (n,)."""
-    found: Facets = np.unique(np.concatenate([domain.facet_tags.find(domain.faces[name]) for name in names]))
-    return found.astype(np.int32)
-
-
-def outward_areas(mesh: Any, facets: Facets) -> Array:
+def outward_areas(mesh: Mesh, facets: Facets) -> Array:
     """Area times outward normal of the facets between their corners, (n, 3); zero for those that another rank owns."""
-    cells, _ = cells_of(mesh, facets)
-    corners = mesh.geometry.x[corners_of(mesh, facets)]
-    around = corners[:, [0, 1, 3, 2]] if corners.shape[1] == 4 else corners  # dolfinx does not go around
-    vectors = area_vectors(around)
-    middles = mesh.geometry.x[geometry_dofmap(mesh)[cells]].mean(axis=1)
+    cells, number = cells_of(mesh, facets)
+    of_facets, nodes = np.array(basix.topology(mesh.basix_cell())[2]), geometry_dofmap(mesh)[cells]
+    if of_facets.shape[1] == 4:
+        of_facets = of_facets[:, [0, 1, 3, 2]]  # dolfinx does not go around
+    corners = mesh.geometry.x[np.take_along_axis(nodes, of_facets[number], axis=1)]
+    vectors = area_vectors(corners)
+    middles = mesh.geometry.x[nodes].mean(axis=1)
     outwards = np.sign(np.sum(vectors * (corners.mean(axis=1) - middles), axis=1))
     owned = facets < mesh.topology.index_map(2).size_local
     return vectors * (outwards * owned)[:, None]
 
 
-def area(mesh: Any, facets: Facets) -> float:
+def area(mesh: Mesh, facets: Facets) -> float:
     """Of facets, between their corners, over all ranks. Collective."""
     local = float(np.linalg.norm(outward_areas(mesh, facets), axis=1).sum())
     return float(over_ranks(mesh.comm, local, MPI.SUM))
@@ -194,15 +177,12 @@ class UndefinedAxes(SceneError):
     """More of the body than a few points has no local axes."""
 
 
-def found_axes(
-    domain: Domain, quadrature: Quadrature, inlets: Sequence[str] = ("inlet",), outlets: Sequence[str] = ("outlet",)
-) -> LocalAxes:
-    """Local axes of a mesh with faces "inner" and "outer", and ends. Collective."""
-    missing = [face for face in ("inner", "outer", *inlets, *outlets) if face not in domain.faces]
-    if missing:
+def found_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
+    """Local axes of a mesh with `FACES`. Collective."""
+    if missing := [face for face in FACES if face not in domain.faces]:
         raise UndefinedAxes(f"geometry.faces: the local axes of a wall need a face {', '.join(map(repr, missing))}")
     try:
-        radial, axial, *lengths = _fields(domain, quadrature, inlets, outlets)
+        radial, axial, *lengths = _fields(domain, quadrature)
     except SolveStopped as stopped:
         raise UndefinedAxes(f"geometry.faces: the local axes were not found: {stopped}") from stopped
     PETSc.garbage_cleanup(domain.mesh.comm)  # several ranks keep matrices that nobody has any more until then

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import basix.ufl
 import dolfinx.mesh
@@ -20,10 +20,14 @@ import numpy.typing as npt
 import ufl
 from mpi4py import MPI
 
-from remodel_fenicsx.body.gmsh_model import GeometryError, NamedGroups, gmsh_model, named_groups
+from remodel_fenicsx.body.gmsh_model import GeometryError, gmsh_model, named_groups
 from remodel_fenicsx.fem import compat
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
+
+if TYPE_CHECKING:
+    from dolfinx.fem import FunctionSpace
+    from dolfinx.mesh import Mesh, MeshTags
 
 Marker = Callable[[Array], Flags]
 
@@ -76,8 +80,8 @@ class Domain:
     ((27, 3), (8, 8))
     """
 
-    mesh: Any
-    facet_tags: Any
+    mesh: Mesh
+    facet_tags: MeshTags
     faces: dict[str, int]
     shape: str
     dimensions: dict[str, float]
@@ -108,6 +112,10 @@ class Domain:
     def size(self) -> float:
         """Largest dimension that is a length: the scale for tolerances on coordinates."""
         return max(value for name, value in self.dimensions.items() if name != "area")
+
+    def facets(self, face: str) -> npt.NDArray[np.int32]:
+        """Local facets of a named face, ascending, (n,)."""
+        return self.facet_tags.find(self.faces[face])
 
     def gather_elements(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
         """Bring what belongs to the elements to rank 0, in input order. Collective.
@@ -223,9 +231,7 @@ def build_domain(
     # with several threads Scotch parts the same mesh differently from run to run
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
     with ExitStack() as stack:
-        model: Any = None
-        groups: NamedGroups | None = None
-        failure: BaseException | None = None
+        model = groups = failure = None
         if comm.rank == 0:
             try:
                 model = stack.enter_context(gmsh_model(shape)).model
@@ -243,7 +249,7 @@ def build_domain(
     symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
     region = np.zeros(len(mesh.topology.original_cell_index), dtype=np.int32)
     region[cell_tags.indices] = cell_tags.values
-    drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups.faces, shape, dimensions, groups.regions
+    drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups[0], shape, dimensions, groups[1]
     domain = Domain(*drawn, region)
     return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # ghosts too
 
@@ -251,31 +257,19 @@ def build_domain(
 # ---------------------------------------------------------------- facets
 
 
-def cells_of(mesh: Any, facets: npt.NDArray[np.int32]) -> tuple[Integers, Integers]:
+def cells_of(mesh: Mesh, facets: npt.NDArray[np.int32]) -> tuple[Integers, Integers]:
     """The element behind each facet of the boundary, and the facet's number in it."""
     topology, dimension = mesh.topology, mesh.topology.dim
     for pair in ((dimension - 1, dimension), (dimension, dimension - 1), (dimension - 1, 0)):
         topology.create_connectivity(*pair)
-    to_cells, to_facets = topology.connectivity(dimension - 1, dimension), topology.connectivity(
-        dimension, dimension - 1
-    )
+    to_cells = topology.connectivity(dimension - 1, dimension)
     cells = to_cells.array[to_cells.offsets[facets]].astype(np.int64)
-    of_cells = to_facets.array.reshape(-1, len(_corners_of_facets(mesh)))
-    return cells, np.argmax(of_cells[cells] == facets[:, None], axis=1)
+    of_cells = topology.connectivity(dimension, dimension - 1)
+    number = of_cells.offsets[1] if len(cells) else 1  # facets of an element
+    return cells, np.argmax(of_cells.array.reshape(-1, number)[cells] == facets[:, None], axis=1)
 
 
-def corners_of(mesh: Any, facets: npt.NDArray[np.int32]) -> Integers:
-    """Local nodes at the corners of facets of the boundary, in dolfinx's order, (facets, corners of one)."""
-    cells, local = cells_of(mesh, facets)
-    return np.take_along_axis(compat.geometry_dofmap(mesh)[cells], _corners_of_facets(mesh)[local], axis=1)
-
-
-def _corners_of_facets(mesh: Any) -> Integers:
-    """Of an element, (facets, corners of one)."""
-    return np.array(basix.topology(basix.CellType[mesh.topology.cell_name()])[mesh.topology.dim - 1])
-
-
-def dof_of_node(mesh: Any, space: Any) -> Integers:
+def dof_of_node(mesh: Mesh, space: FunctionSpace) -> Integers:
     """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
     # the element and the geometry have the same degree: node k of an element is dof k of that element
     found = np.zeros(len(mesh.geometry.x), dtype=np.int64)

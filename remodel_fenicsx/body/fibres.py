@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,11 +24,14 @@ from remodel_fenicsx.system.children import LARGEST_FILE
 log = logging.getLogger(__name__)
 
 FIBRE_ENDINGS = (".vtu", ".xdmf", ".csv")
+SOLID = ("tetra", "hexa", "wedge")  # beginnings of the names of elements
 SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
 GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
-OF_TABLES = (*"xyz", "element", "angle", "weight", *(f"{name}_{c}" for name, parts in GROUPS.items() for c in parts))
+OF_GROUPS = {name: tuple(f"{name}_{c}" for c in parts) for name, parts in GROUPS.items()}
+SINGLE = ("element", "angle", "weight")
+OF_TABLES = (*"xyz", *SINGLE, *itertools.chain(*OF_GROUPS.values()))
 # ParaView writes the number of a component, and Points for places
 SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
 SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_"}
@@ -91,25 +95,16 @@ def read_fibre_file(path: Path) -> FibreFile:
 def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     """Columns by name: structure_tensor_xx ..., fibre_x ..., fibre_2_x ..., weight, angle; element, or x, y, z."""
     columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
-    left = dict.fromkeys(columns)
-
-    def together(name: str, *components: str) -> Array | None:
-        keys = [f"{name}_{c}" if name else c for c in components]
-        if not set(keys) <= set(columns):
-            return None
-        for key in keys:
-            left.pop(key, None)
-        return np.stack([columns[key] for key in keys], axis=1)
-
-    found = {"structure_tensor": together("structure_tensor", *ALL_COMPONENTS)}
-    if found["structure_tensor"] is None:
-        found["structure_tensor"] = together("structure_tensor", *SYMMETRIC_COMPONENTS)
-    found |= {name: together(name, *"xyz") for name in ("fibre", "fibre_2")}
-    found |= {name: together("", name) for name in ("angle", "weight")}
-    places, elements = together("", *"xyz"), together("", "element")
-    if left:
+    groups = {"structure_tensor": [f"structure_tensor_{c}" for c in SYMMETRIC_COMPONENTS]}, OF_GROUPS
+    groups += ({"places": "xyz"} | {name: (name,) for name in SINGLE},)
+    measured, used = {}, set()
+    for name, keys in itertools.chain(*map(dict.items, groups)):
+        if set(keys) <= set(columns):
+            measured[name] = np.stack([columns[key] for key in keys], axis=1)
+            used |= {*keys}
+    if left := [name for name in columns if name not in used]:
         raise UnreadableFile(f"has {', '.join(left)} without the other columns of x, y, z or of the tensor")
-    measured = {name: values for name, values in found.items() if values is not None}
+    places, elements = measured.pop("places", None), measured.pop("element", None)
     if not set(measured) & set(SOURCES):
         raise UnreadableFile(f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z")
     if elements is None:
@@ -127,16 +122,15 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
     """Arrays of the solid elements, or else of the points; and the file."""
     mesh = read_exchange_file(path)
     try:
-        solid = [n for n, (kind, _) in enumerate(mesh.cells) if kind.startswith(("tetra", "hexa", "wedge"))]
+        solid = [rows for kind, rows in mesh.cells if kind.startswith(SOLID)]
+        chosen = np.repeat([kind.startswith(SOLID) for kind, _ in mesh.cells], [len(rows) for _, rows in mesh.cells])
         of_cells = {
-            name: np.concatenate([_columns(blocks[n]) for n in solid])
-            for name, blocks in mesh.cell_data.items()
-            if name in MEASURED and solid
+            name: _columns(values)[chosen] for name, values in mesh.cell_data.items() if name in MEASURED and solid
         }
         of_points = {name: _columns(values) for name, values in mesh.point_data.items() if name in MEASURED}
         points = np.asarray(mesh.points, dtype=np.float64)
         points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])])
-        centres = [points[mesh.cells[n][1]].mean(axis=1) for n in solid]
+        centres = [points[rows].mean(axis=1) for rows in solid]
     except (ValueError, TypeError, IndexError) as error:
         raise UnreadableFile(f"has arrays that do not fit its elements: {' '.join(str(error).split())}") from error
     if set(of_cells) & set(SOURCES):

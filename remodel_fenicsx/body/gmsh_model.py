@@ -71,27 +71,18 @@ def gmsh_model(name: str) -> Iterator[Any]:
             gmsh.finalize()
 
 
-class NamedGroups(NamedTuple):
-    """Names and numbers of the physical groups of a model: its faces, and its regions, which share out its volumes."""
-
-    faces: dict[str, int]
-    regions: dict[str, int]
-
-
-def named_groups() -> NamedGroups:
-    """Those of the current model, once it is sure that dolfinx can take the model."""
+def named_groups() -> tuple[dict[str, int], dict[str, int]]:
+    """Faces and regions of the current model, which share out its volumes: their numbers by name."""
     # dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
-    found = NamedGroups(_groups(2), _groups(3))
-    kinds = gmsh.model.mesh.getElements(3)[0]
-    if not found.regions or len(kinds) != 1 or not found.faces:
-        counts = f"{len(found.regions)} named volumes, {len(kinds)} types of elements, {len(found.faces)} named faces"
-        raise GeometryError(counts)
+    faces, regions, kinds = _groups(2), _groups(3), gmsh.model.mesh.getElements(3)[0]
+    if not regions or len(kinds) != 1 or not faces:
+        raise GeometryError(f"{len(regions)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
     for _, volume in gmsh.model.getEntities(3):
         groups = gmsh.model.getPhysicalGroupsForEntity(3, volume)
         if len(groups) != 1 and len(gmsh.model.mesh.getElements(3, volume)[0]):
-            names = " and ".join(repr(name) for name, tag in found.regions.items() if tag in groups) or "no named one"
+            names = " and ".join(repr(name) for name, tag in regions.items() if tag in groups) or "no named one"
             raise GeometryError(f"volume {volume} is in {names}; each must be in one named volume")
-    return found
+    return faces, regions
 
 
 def _groups(dimension: int) -> dict[str, int]:
@@ -206,6 +197,7 @@ def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> Non
     if degree == 1:
         return
     mesh = gmsh.model.mesh
+    (straight,), _, _ = mesh.getElements(3)
     mesh.setOrder(degree)
     tags, coordinates, _ = mesh.getNodes()
     old = coordinates.reshape(-1, 3)
@@ -214,7 +206,7 @@ def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> Non
     (kind,), _, (nodes,) = mesh.getElements(3)
     _, _, _, count, local, corners = mesh.getElementProperties(kind)
     cells = row[nodes].reshape(-1, count)
-    weights = _corner_weights(local.reshape(count, 3)[corners:], corners)
+    weights = mesh.getBasisFunctions(straight, local[3 * corners :], "Lagrange")[1].reshape(-1, corners)
     mean = np.einsum("kc,ncd->nkd", weights, old[cells[:, :corners]])
     radius = np.hypot(*np.moveaxis(old[cells[:, :corners], :2], 2, 0)) @ weights.T
     chord = np.hypot(mean[..., 0], mean[..., 1])
@@ -224,12 +216,3 @@ def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> Non
     between, first = np.unique(cells[:, corners:], return_index=True)
     for index, point in zip(between, mean.reshape(-1, 3)[first], strict=True):
         mesh.setNode(tags[index], point, [])
-
-
-def _corner_weights(local: Array, corners: int) -> Array:
-    """Linear shape functions of the corners at Gmsh's reference coordinates (n, 3), (n, corners)."""
-    if corners == 4:
-        return np.column_stack((1.0 - local.sum(axis=1), local))
-    face = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-    signs = np.array([(*corner, height) for height in (-1, 1) for corner in face])
-    return np.prod(0.5 * (1.0 + signs[None] * local[:, None]), axis=2)

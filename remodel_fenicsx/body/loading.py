@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import dolfinx.fem
 import numpy as np
 import ufl
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
 from remodel_fenicsx.model.tensors import Array
+from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.tables import SceneError
+
+if TYPE_CHECKING:
+    from dolfinx.fem import Constant, DirichletBC, Function
+    from ufl.core.expr import Expr
+
+    Potential = Callable[[Function], ufl.Form]
 
 LoadValues = dict[str, float]
 
 
-def values_of_loads(loads: Mapping[str, Any], time: float) -> LoadValues:
+def values_of_loads(loads: Mapping[str, Load], time: float) -> LoadValues:
     """Magnitude of every load of a scene at a time."""
     return {name: load.value * load.factor(time) for name, load in loads.items()}
 
@@ -63,18 +71,20 @@ class Loading:
     ({'force': 10.0}, 4.0, 3)
     """
 
-    def __init__(self, domain: Domain, unknown: Any, kinematics: Kinematics | None = None):
+    def __init__(self, domain: Domain, unknown: Function, kinematics: Kinematics | None = None):
         self.domain, self.unknown, self.kinematics = domain, unknown, kinematics or FullKinematics()
         self.space = unknown.function_space
         self.weight = self.kinematics.weight(domain.mesh)
-        self.boundary_conditions: list[Any] = []
+        self.boundary_conditions: list[DirichletBC] = []
         self.values: LoadValues = {}
         self._setters: dict[str, list[Callable[[float], None]]] = {}
-        self._terms: list[Callable[[Any, Any], Any]] = []
-        self._potentials: list[Callable[[Any], Any]] = []
+        self._terms: list[Callable[[Function, Expr], ufl.Form]] = []
+        self._potentials: list[Potential] = []
         self._begins: dict[int, str] = {}  # where the strain is one number: the face from which it is counted
         self.has_caps = False
-        self.supports: dict[str, Any] = {}  # by face: the potential of its springs, a function of u; None: held
+        self.supports: dict[str, Potential | None] = (
+            {}
+        )  # by face: the potential of its springs, a function of u; None: held
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
@@ -129,7 +139,7 @@ class Loading:
         # on the sub-space's own dofs alone the value is a Constant, as for faces
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace))
 
-    def hold_facets(self, facets: Any, name: str | None = None, way: Any = None) -> None:
+    def hold_facets(self, facets: NDArray[np.int32], name: str | None = None, way: Array | None = None) -> None:
         """u = magnitude times `way` on local facets, of the full displacement.
 
         Parameters
@@ -209,7 +219,7 @@ class Loading:
         """
         pressure, normal, measure = self.magnitude(name), ufl.FacetNormal(self.domain.mesh), self.surface_measure(face)
 
-        def potential(u: Any) -> Any:
+        def potential(u: Function) -> ufl.Form:
             place = ufl.SpatialCoordinate(self.domain.mesh) + self.kinematics.displacement(u)
             across = ufl.as_vector([place[0], place[1], 0.0])
             cofactor = ufl.cofac(self.kinematics.deformation_gradient(u))
@@ -293,12 +303,12 @@ class Loading:
             Of kinematics that are not those of a mesh in three dimensions.
         """
         self._check_three_dimensional("displacements that are prescribed")
-        facets = self.domain.facet_tags.find(self.domain.faces[face])
+        facets = self.domain.facets(face)
         for component in components:
             subspace = self.kinematics.subspace(self.space, component)
             collapsed, _ = subspace.collapse()
             dofs = dolfinx.fem.locate_dofs_topological((subspace, collapsed), 2, facets)
-            value: Any = dolfinx.fem.Function(collapsed)
+            value = dolfinx.fem.Function(collapsed)
             self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
             self.follow(name, _setter(value, dofs[1], component, displacement))
 
@@ -316,7 +326,7 @@ class Loading:
         self.values[name] = 0.0
         setter(0.0)
 
-    def add_term(self, term: Callable[[Any, Any], Any]) -> None:
+    def add_term(self, term: Callable[[Function, Expr], ufl.Form]) -> None:
         """Any other load, as a term of the residual: minus its virtual work.
 
         Parameters
@@ -328,42 +338,42 @@ class Loading:
         """
         self._terms.append(term)
 
-    def add_potential(self, potential: Callable[[Any], Any]) -> None:
+    def add_potential(self, potential: Potential) -> None:
         """Any other load, as its potential: a function of the unknown that returns a UFL form."""
         self._potentials.append(potential)
 
-    def magnitude(self, name: str, scale: float = 1.0) -> Any:
+    def magnitude(self, name: str, scale: float = 1.0) -> Constant:
         """A Constant that is the named load's present magnitude times `scale`: what a term is made of."""
         constant = self.constant(0.0)
         self._take(name, constant, scale)
         return constant
 
-    def surface_measure(self, face: str) -> Any:
+    def surface_measure(self, face: str) -> ufl.Measure:
         """Measure over a named face of the mesh; times `weight` it is one over the body's face."""
         measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)
         degree = field_degree(self.space)
         return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
 
-    def measure_alone(self, face: str) -> Any:
+    def measure_alone(self, face: str) -> ufl.Measure:
         """As `surface_measure`, for forms of this face alone: they have the kernel of the same form of another face."""
-        facets = self.domain.facet_tags.find(self.domain.faces[face])
-        mesh, ones = self.domain.mesh, np.ones(len(facets), dtype=np.int32)
+        mesh, facets = self.domain.mesh, self.domain.facets(face)
+        ones = np.ones(len(facets), dtype=np.int32)
         tags = dolfinx.mesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
         measure = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
         return measure(1, metadata={"quadrature_degree": 2 * field_degree(self.space)})
 
-    def external_residual(self, test: Any) -> Any:
+    def external_residual(self, test: ufl.Argument) -> ufl.Form | None:
         """Minus the virtual work of the external forces, a UFL form; None without loads on faces or volumes."""
         virtual = self.kinematics.displacement(test)
         terms = [term(self.unknown, virtual) for term in self._terms]
         potentials = self.residual_of_potentials(test)
         terms += [] if potentials is None else [potentials]
-        return sum(terms[1:], terms[0]) if terms else None
+        return sum(terms) if terms else None
 
-    def residual_of_potentials(self, test: Any) -> Any:
+    def residual_of_potentials(self, test: ufl.Argument) -> ufl.Form | None:
         """The part of it that has a potential: springs, of own bodies; None where there is none."""
         terms = [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
-        return sum(terms[1:], terms[0]) if terms else None
+        return sum(terms) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:
         """Give the named loads new magnitudes.
@@ -390,16 +400,16 @@ class Loading:
         return self._integral(self.measure_alone(face))
 
     # ------------------------------------------------------------ inside
-    def _integral(self, measure: Any) -> float:
+    def _integral(self, measure: ufl.Measure) -> float:
         """Volume or area of the body."""
         local = dolfinx.fem.assemble_scalar(jit.form(self.constant(1.0) * self.weight * measure))
         return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
 
-    def constant(self, value: float) -> Any:
+    def constant(self, value: float) -> Constant:
         """A number as an argument of kernels, so that another one compiles nothing."""
         return dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(value))
 
-    def _take(self, name: str, constant: Any, scale: Any) -> None:
+    def _take(self, name: str, constant: Constant, scale: float | Array) -> None:
         """From now on the constant is the named load's magnitude times `scale`."""
 
         def set_value(magnitude: float) -> None:
@@ -411,20 +421,22 @@ class Loading:
         if not self.kinematics.three_dimensional:
             raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for {what} is 'full'")
 
-    def _prescribe_strain(self, component: int, value: Any) -> None:
+    def _prescribe_strain(self, component: int, value: Constant) -> None:
         number, _ = self.kinematics.uniform_unknown(self.space, component)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, number.dofmap.list.flatten(), number))
 
-    def _prescribe_face(self, face: str, component: int, value: Any) -> None:
+    def _prescribe_face(self, face: str, component: int, value: Constant) -> None:
         subspace = self.kinematics.subspace(self.space, component)
         if subspace is None:
             return
-        facets = self.domain.facet_tags.find(self.domain.faces[face])
-        dofs = dolfinx.fem.locate_dofs_topological(subspace, self.domain.mesh.topology.dim - 1, facets)
+        dimension = self.domain.mesh.topology.dim - 1
+        dofs = dolfinx.fem.locate_dofs_topological(subspace, dimension, self.domain.facets(face))
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
 
 
-def _setter(value: Any, dofs: Any, component: int, displacement: Callable[[float, Array], Array]) -> Any:
+def _setter(
+    value: Function, dofs: NDArray[np.int32], component: int, displacement: Callable[[float, Array], Array]
+) -> Callable[[float], None]:
     """Gives one component of the values on a face to a function of its own space."""
     places = value.function_space.tabulate_dof_coordinates()[dofs]
 

@@ -12,8 +12,18 @@ import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
-from remodel_fenicsx.body.mesh_file import ORDERS, Block, gmsh_text, in_place, split_quads, split_wedges
-from remodel_fenicsx.body.surface_file import SURFACES, Surface, triangles_of
+from remodel_fenicsx.body.mesh_file import (
+    ORDERS,
+    SURFACES,
+    Block,
+    Surface,
+    gmsh_text,
+    in_place,
+    of_gmsh,
+    split_quads,
+    split_wedges,
+    triangles_of,
+)
 from remodel_fenicsx.body.wall import shared_out
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
@@ -73,7 +83,7 @@ def _signed_volume(points: Array, triangles: Integers) -> float:
     """Inside of the triangles and flat caps on their openings."""
     places = points[triangles]
     sides = np.einsum("ni,ni->", places.mean(axis=1), area_vectors(places)) / 3
-    return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim, _ in rims(triangles)))
+    return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim in rims(triangles)))
 
 
 def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
@@ -88,15 +98,13 @@ def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
         reason = str(error).removeprefix(DAMAGED)
         raise SceneError(f"--size {size:g}: Gmsh could not divide the surface so: {reason}") from error
     points, triangles = found["points"], found["triangles"]
-    on_rims = np.isin(np.arange(len(points)), np.concatenate([rim for rim, _ in rims(triangles)]))
+    on_rims = np.isin(np.arange(len(points)), np.concatenate(rims(triangles)))
     divided = Surface(rounded(surface, points, on_rims), triangles, {})
     return oriented(divided, "the surface by Gmsh"), cKDTree(surface.points).query(points)[1]
 
 
 def by_gmsh(file: str) -> dict[str, Any]:
     """In the child process: points and triangles of a size, of those in a file."""
-    from remodel_fenicsx.body.gmsh_file import of_gmsh
-
     with np.load(file) as read, gmsh_model("wall") as gmsh:
         count, corners = len(read["points"]), read["triangles"].ravel() + 1
         gmsh.model.addDiscreteEntity(2, 1)
@@ -118,7 +126,7 @@ def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
     Phong's tessellation with the factor 1/2, which is exact where the surface is a parabola: T. Boubekeur and M. Alexa,
     Phong tessellation (2008).
     """
-    rims_of_it = [rim for rim, _ in rims(surface.triangles)]
+    rims_of_it = rims(surface.triangles)
     normals, found = _normals(surface, rims_of_it), np.empty_like(places)
     for simplices, chosen in ((surface.triangles, ~on_rims), (np.concatenate(rims_of_it), on_rims)):
         rows, flat = nearest(surface.points, simplices, places[chosen])
@@ -164,7 +172,7 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
     shares, ends = np.array(list(layers.values())), np.cumsum([0.0, *layers.values()])
     levels = np.concatenate([[0.0], *(np.linspace(ends[k], ends[k + 1], n + 1)[1:] for k, n in enumerate(counts))])
     levels /= shares.sum()
-    openings = [rim for rim, _ in rims(surface.triangles)]
+    openings = rims(surface.triangles)
     size, layer = len(surface.points), np.arange(len(levels) - 1)[:, None, None]
     wedges = np.concatenate([surface.triangles, surface.triangles + size], axis=1) + size * layer
     tetrahedra = split_wedges(wedges.reshape(-1, 6)).reshape(-1, 4)
@@ -211,17 +219,12 @@ def _straightened(points: Array, tetrahedra: Integers) -> int:
     done: set[int] = set()
     body: Any = SimpleNamespace(kind="tetrahedron", degree=2, points=points, cells=tetrahedra[:, ORDERS["tetra10"]])
     while True:
-        twisted = (jacobian_determinants(body) <= 0).any(axis=1)
-        edges = {
-            int(middle): cell[edge]
-            for cell in tetrahedra[twisted]
-            for middle, edge in zip(cell[4:], map(list, EDGES), strict=True)
-        }
-        if not edges.keys() - done:
+        twisted = tetrahedra[(jacobian_determinants(body) <= 0).any(axis=1)]
+        middles = twisted[:, 4:]
+        if done.issuperset(middles.ravel()):
             return len(done)
-        done |= edges.keys()
-        for middle, ends in edges.items():
-            points[middle] = points[ends].mean(axis=0)
+        done |= {*middles.ravel()}
+        points[middles] = points[twisted[:, EDGES]].mean(axis=2)
 
 
 def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
@@ -242,13 +245,12 @@ def _in_planes(vectors: Array, points: Array, openings: Sequence[Integers]) -> A
 
 
 def _smoothed(normals: Array, surface: Surface, openings: Sequence[Integers]) -> Array:
-    """Each with the mean of those around it."""
+    """Each with those around it."""
     edges = np.unique(np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2), axis=0)
-    sums, counts = normals.copy(), np.ones(len(normals))
+    sums = normals.copy()
     for one, other in (edges.T, edges.T[::-1]):
         np.add.at(sums, one, normals[other])
-        np.add.at(counts, one, 1.0)
-    return _in_planes(sums / counts[:, None], surface.points, openings)
+    return _in_planes(sums, surface.points, openings)
 
 
 def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
@@ -286,10 +288,7 @@ def write_wall(
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: {len(read.triangles)} triangles are divided again, which takes minutes")
     found, near = remeshed(read, size)
-    depth = depth[near]
-    if len(read.triangles) > LARGE_SURFACE:
-        announce(f"{path}: the wall grows on {len(found.triangles)} triangles")
-    wall = grown(found, read, depth, shares or {"wall": 1.0}, through)
+    wall = grown(found, read, depth[near], shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
     names = list(shares) or ["wall"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -19,19 +18,20 @@ from remodel_fenicsx.body.gmsh_model import LARGEST_LENGTH, SMALLEST_LENGTH, gms
 from remodel_fenicsx.body import mesh_faces
 from remodel_fenicsx.body.mesh_file import (
     READERS,
+    SURFACES,
     TAGS,
     MeshFile,
     assembled,
     distinct,
+    of_gmsh,
     read_mesh,
 )
-from remodel_fenicsx.body.surface_file import SURFACES
 from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
-from remodel_fenicsx.body.wall import CONFIGURATIONS, AngleOf, Walled, angle_columns, stress_columns
+from remodel_fenicsx.body.wall import AngleOf, Walled, angle_columns, columns_on_request
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
-from remodel_fenicsx.model.tensors import Array, Flags
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
@@ -79,9 +79,9 @@ def _faces(value: Any) -> Any:
 
 def _files(value: Any) -> list[str]:
     """Paths of a mesh and of its surfaces, of one or a list; nothing where they are none."""
-    files = list(value) if isinstance(value, (list, tuple)) else [value]
-    kinds = [READERS, *[SURFACES] * len(files[1:])]
-    return files if files and all(map(_ends_with, files, kinds)) else []
+    mesh, *surfaces = value if isinstance(value, (list, tuple)) and value else [value]
+    are_files = _ends_with(mesh, READERS) and all(_ends_with(one, SURFACES) for one in surfaces)
+    return [mesh, *surfaces] if are_files else []
 
 
 def _ends_with(file: Any, endings: Collection[str]) -> bool:
@@ -102,25 +102,23 @@ def _file(value: Any) -> Any:
 def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
     """The keys with surfaces that faces give as files, inner = { file = "lumen.vtp" }, after the mesh."""
     faces, file = geometry.get("faces"), geometry.get("file")
-    entries = dict(faces) if isinstance(faces, Mapping) else {}
-    own: dict[Any, Any] = {face: one.get("file") for face, one in entries.items() if isinstance(one, Mapping)}
-    own = {face: surface for face, surface in own.items() if _ends_with(surface, SURFACES)}
-    if not own:
-        return dict(geometry)
-    files = dict.fromkeys([*(file if isinstance(file, (list, tuple)) else [file]), *own.values()])
-    return {**geometry, "file": [*files], "faces": entries | {face: Path(one).stem for face, one in own.items()}}
+    files, found = file if isinstance(file, (list, tuple)) else [file], {}
+    for face, one in faces.items() if isinstance(faces, Mapping) else ():
+        if isinstance(one, Mapping) and _ends_with(one.get("file"), SURFACES):
+            files, found[face] = [*files, one["file"]], Path(one["file"]).stem
+    return {**geometry, "file": [*dict.fromkeys(files)], "faces": {**faces, **found}} if found else dict(geometry)
 
 
-def _numbers(kind: str, name: str, entries: Names, names: Mapping[str, int], there: set[int]) -> list[int]:
+def _numbers(key: str, entries: Names, names: Mapping[str, int], groups: Integers) -> list[int]:
     """Numbers in the file of what a scene gives as a face or a region, by name or number."""
-    found, word = [], {"face": "face", "region": "volume"}[kind]
-    for entry in entries:
-        number = names.get(entry, 0) if isinstance(entry, str) else entry
+    there = {*distinct(groups)} - {0}
+    found = [names.get(entry, 0) if isinstance(entry, str) else int(entry) for entry in entries]
+    for entry, number in zip(entries, found, strict=True):
         if number not in there:
-            listed = [*map(repr, names), *(str(other) for other in sorted(there - set(names.values())))]
+            listed = [*map(repr, names), *map(str, sorted(there - {*names.values()}))]
+            word = "face" if key.startswith("faces") else "volume"
             rule = f"the file has no such {word}; it has {', '.join(listed) or 'none'}"
-            raise SceneError(f"geometry.{kind}s.{name} = {shown(entry)}: {rule}")
-        found.append(int(number))
+            raise SceneError(f"geometry.{key} = {shown(entry)}: {rule}")
     return found
 
 
@@ -134,8 +132,7 @@ class FileBody(WithRegions, FromFile):
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"}
     )
     """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
-    `.stl`, `.ply`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your
-    own)."""
+    `.stl`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."""
     tags: str | None = Field(
         default=None,
         min_length=1,
@@ -282,12 +279,12 @@ class FileBody(WithRegions, FromFile):
 
     def _boundary(self, file: MeshFile) -> mesh_faces.Boundary:
         """With the faces of the body, and further named ones of the file under their own names."""
-        names, there = file.names[2], set(distinct(file.facet_groups)) - {0}
-        asked = {face: self.faces.get(face, (face,)) for face in dict.fromkeys([*self.face_names, *self.faces])}
-        groups = {face: _numbers("face", face, entries, names, there) for face, entries in asked.items()}
-        taken = set(itertools.chain.from_iterable(groups.values()))
-        others = {name: [n] for name, n in names.items() if n in there - taken and name not in groups}
-        return mesh_faces.boundary_of(file, groups, self.open_boundary, others)
+        names, found = file.names[2], file.facet_groups
+        asked = {face: (face,) for face in self.face_names} | self.faces
+        groups = {face: _numbers(f"faces.{face}", entries, names, found) for face, entries in asked.items()}
+        others = {*distinct(found)}.difference(*groups.values())
+        further = {name: [n] for name, n in names.items() if n in others and name not in groups}
+        return mesh_faces.boundary_of(file, groups, self.open_boundary, further)
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
         numbers = distinct(file.cell_groups)
@@ -297,7 +294,6 @@ class FileBody(WithRegions, FromFile):
                 f"{len(lost)} elements are in no named volume, the first is {lost[0]}; name all volumes, or none"
             )
         names = {number: name for name, number in file.names[3].items()}
-        names |= {self._volumes(file, name, entries[:1])[0]: name for name, entries in self.regions.items()}
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
 
     def _mesh(self) -> MeshFile:
@@ -305,17 +301,19 @@ class FileBody(WithRegions, FromFile):
         file = self._read()
         if not self.regions:
             return file
-        groups, taken = file.cell_groups.copy(), set()
+        groups, numbers = file.cell_groups.copy(), dict[str, int]()
         for name, entries in self.regions.items():
-            numbers = self._volumes(file, name, entries)
-            groups[np.isin(groups, numbers)] = numbers[0]
-            taken.add(numbers[0])
-        own = ~mesh_faces.again(file.corners, groups, taken)
-        return replace(file, cells=file.cells[own], cell_numbers=file.cell_numbers[own], cell_groups=groups[own])
-
-    def _volumes(self, file: MeshFile, region: str, entries: Names) -> list[int]:
-        """Numbers of the volumes that a region has in the file."""
-        return _numbers("region", region, entries, file.names[3], set(distinct(file.cell_groups)) - {0})
+            numbers[name], *others = _numbers(f"regions.{name}", entries, file.names[3], file.cell_groups)
+            groups[np.isin(groups, others)] = numbers[name]
+        own = ~mesh_faces.again(file.corners, groups, numbers.values())
+        others = {name: number for name, number in file.names[3].items() if number not in numbers.values()}
+        return replace(
+            file,
+            cells=file.cells[own],
+            cell_numbers=file.cell_numbers[own],
+            cell_groups=groups[own],
+            names={**file.names, 3: others | numbers},
+        )
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
         """Refuse faces that cannot be those of the body. On rank 0."""
@@ -358,8 +356,7 @@ class FileBody(WithRegions, FromFile):
             if load == "displacement" and kind not in HELD_ACROSS:
                 able = " or ".join(map(repr, HELD_ACROSS))
                 raise SceneError(f"{key}: its support ({kind!r}) lets it move; a face that is displaced must be {able}")
-            parts = [part for part in domain.parts if part.name == face]  # type: ignore[attr-defined]
-            if load == "displacement" and min(part.flatness for part in parts) < mesh_faces.NOT_AROUND:
+            if load == "displacement" and domain.boundary.goes_around(face):
                 raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
             if load == "displacement" and face in moved:
                 raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
@@ -397,41 +394,32 @@ class FileBody(WithRegions, FromFile):
 NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
 
 
-def _angle_at(face: str) -> AngleOf:
-    """Mean angle over the elements that have a facet on a face."""
+def _at(face: str, m: Any) -> Flags:
+    """Elements that have a facet on a face."""
+    from remodel_fenicsx.body.domain import cells_of
 
-    def elements(m: Any) -> Flags:
-        from remodel_fenicsx.body.axes import facets_of
-        from remodel_fenicsx.body.domain import cells_of
-
-        found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
-        found[cells_of(m.domain.mesh, facets_of(m.domain, [face]))[0]] = True
-        return found
-
-    def value(m: Any, angle: Array) -> float:
-        chosen = m.tool(("elements at", face), lambda: elements(m))
-        return m.quadrature.mean_of_known(angle, chosen)
-
-    return value
+    found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
+    found[cells_of(m.domain.mesh, m.domain.facets(face))[0]] = True
+    return found
 
 
-def _middle_angle(m: Any, angle: Array) -> float:
-    """Mean angle over the elements that are half-way through the wall; there are some in every mesh."""
+def _middle(m: Any) -> Flags:
+    """Elements that are half-way through the wall; there are some in every mesh."""
+    from remodel_fenicsx.fem.compat import geometry_dofmap
 
-    def elements() -> Flags:
-        from remodel_fenicsx.fem.compat import geometry_dofmap
+    depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+    return (depths.min(axis=1) <= 0.5 + NODES_AT_A_DEPTH) & (depths.max(axis=1) >= 0.5 - NODES_AT_A_DEPTH)
 
-        depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
-        low, high = depths.min(axis=1) - NODES_AT_A_DEPTH, depths.max(axis=1) + NODES_AT_A_DEPTH
-        return (low <= 0.5) & (high >= 0.5)
 
-    return m.quadrature.mean_of_known(angle, m.tool("middle elements", elements))
+def _mean_over(elements: Callable[[Any], Flags]) -> AngleOf:
+    """The mean over elements that are looked for once."""
+    return lambda m, values: m.quadrature.mean_of_known(values, m.tool(elements, lambda: elements(m)))
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
-    "inner": ("with a facet on the inner face", _angle_at("inner")),
-    "middle": ("half-way through the wall", _middle_angle),
-    "outer": ("with a facet on the outer face", _angle_at("outer")),
+    "inner": ("with a facet on the inner face", _mean_over(partial(_at, "inner"))),
+    "middle": ("half-way through the wall", _mean_over(_middle)),
+    "outer": ("with a facet on the outer face", _mean_over(partial(_at, "outer"))),
 }
 
 
@@ -442,11 +430,7 @@ class WalledMesh(Walled):
     """
 
     columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
-        *itertools.chain.from_iterable(angle_columns(MEANS_ON_A_MESH, name) for name in CONFIGURATIONS),
-        *stress_columns(MEANS_ON_A_MESH),
-        *Walled.columns_on_request,
-    )
+    columns_on_request: ClassVar[tuple[Column, ...]] = columns_on_request(MEANS_ON_A_MESH)
     axis_kinds = ("local", "global")
     constant_fields = CONSTANT_FIELDS
     defaults = {"cells": {"axes": "local"}}
@@ -572,8 +556,6 @@ SPLIT = {"tetrahedron": {3: 4, 2: 2}, "hexahedron": {3: 5, 2: 3}}
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     """A mesh of plane elements, split into halves along each edge, as often as asked for."""
-    from remodel_fenicsx.body.gmsh_file import of_gmsh
-
     with gmsh_model("file") as gmsh:
         model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
         for dimension, rows, groups in ((3, file.cells, file.cell_groups), (2, file.facets, file.facet_groups)):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TYPE_CHECKING
 
 import dolfinx.fem
 import dolfinx.graph
@@ -17,7 +17,7 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.axes import facets_of, harmonic, slopes
+from remodel_fenicsx.body.axes import harmonic, slopes
 from remodel_fenicsx.body.domain import Domain, cells_of, symbolic_mesh
 from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.loading import Loading
@@ -28,46 +28,44 @@ from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
 
+if TYPE_CHECKING:
+    from dolfinx.fem import Function
+    from dolfinx.mesh import Mesh, MeshTags
+    from ufl.core.expr import Expr
+
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MeshDomain(Domain):
     """A domain that knows more of its faces."""
 
-    parts: tuple[Face, ...] = ()
-    part_of_element: Mapping[str, Integers] = field(default_factory=dict)
-    rims: tuple[Integers, ...] = ()
-    volume: float = 0.0
+    boundary: Boundary
+    part_tags: MeshTags
+    rims: list[Integers]
 
-    def of_parts(self, face: str, name: str) -> Any:
+    def of_parts(self, face: str, name: str) -> Function:
         """`normal` or `centre` of each part of a face, as a function that is constant on the elements beside it."""
-        found: Any = dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, ("DG", 0, (3,))))
-        table = np.array([*(getattr(part, name) for part in self.parts), np.zeros(3)])
-        found.x.array.reshape(-1, 3)[found.function_space.dofmap.list.reshape(-1)] = table[self.part_of_element[face]]
+        found = dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, ("DG", 0, (3,))))
+        values, dofs = found.x.array.reshape(-1, 3), found.function_space.dofmap.list.reshape(-1)
+        for part, facets in self.facets_of_parts(face):
+            values[dofs[cells_of(self.mesh, facets)[0]]] = getattr(part, name)
         return found
 
-    def facets_of_parts(self, face: str) -> Iterator[tuple[Face, NDArray[np.int32]]]:
+    def facets_of_parts(self, face: str) -> list[tuple[Face, NDArray[np.int32]]]:
         """The parts of a face with their local facets."""
-        facets = facets_of(self, [face])
-        cells, _ = cells_of(self.mesh, facets)
-        for number, part in enumerate(self.parts):
-            if part.name == face:
-                yield part, facets[self.part_of_element[face][cells] == number]
+        parts = enumerate(self.boundary.faces)
+        return [(part, self.part_tags.find(number)) for number, part in parts if part.name == face]
 
     def area(self, face: str) -> float:
         """Of a named face, with plane facets."""
-        return sum(part.area for part in self.parts if part.name == face)
-
-    def middle(self, face: str) -> Array:
-        """Mean of the places of a named face, (3,)."""
-        return np.concatenate([part.places for part in self.parts if part.name == face]).mean(axis=0)
+        return self.boundary.area(face)
 
     @property
     def thickness(self) -> float:
         """Mean thickness of the wall: twice the volume over the areas of its faces; without them of a cube."""
-        area = self.area("inner") + self.area("outer")
-        return 2 * self.volume / area if area else float(np.cbrt(self.volume))
+        volume, area = self.boundary.volume, self.area("inner") + self.area("outer")
+        return 2 * volume / area if area else float(np.cbrt(volume))
 
     def length(self) -> float:
         """Of the body from inlet to outlet: volume over the integral of |grad psi|, psi harmonic from 0 to 1."""
@@ -77,7 +75,7 @@ class MeshDomain(Domain):
             return 0.0
         mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
-        psi = harmonic(slopes(mesh, degree, dx), *(facets_of(self, [face]) for face in ("inlet", "outlet")))
+        psi = harmonic(slopes(mesh, degree, dx), self.facets("inlet"), self.facets("outlet"))
         slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(mesh, np.float64(1.0))
         parts = [float(np.real(dolfinx.fem.assemble_scalar(jit.form(value * dx)))) for value in (one, slope)]
         volume, total = over_ranks(self.comm, np.array(parts), MPI.SUM)
@@ -90,34 +88,30 @@ def shared(
     """What rank 0 reads, on all ranks. Collective."""
     found = agreed(comm, lambda: read() if comm.rank == 0 else None)
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as in `domain`
-    told = None
+    told = cells = groups = None
+    points = np.empty((0, 3))
     if found is not None:
         file, boundary, regions = found
-        extent = float(np.ptp(file.points, axis=0).max())
-        told = (
-            *(file.kind, file.degree, file.cells.shape[1], extent, regions),
-            *(boundary.facets, tuple(boundary.faces), boundary.volume, tuple(rims_of(file, boundary, "inner"))),
-        )
-    kind, degree, nodes, extent, regions, facets, parts, volume, lines = comm.bcast(told)
-    symbolic = symbolic_mesh(kind, degree)
-    cells = np.empty((0, nodes), dtype=np.int64) if found is None else file.cells[:, node_order(file)]
-    points = np.empty((0, 3)) if found is None else file.points
-    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells, x=points, e=symbolic)
-    faces = {name: number for number, name in enumerate(dict.fromkeys(part.name for part in parts), start=1)}
-    values = np.repeat([faces[part.name] for part in parts], [len(part.facets) for part in parts])
-    tags = _tags_of_facets(mesh, facets[np.concatenate([part.facets for part in parts])], values)
-    domain = MeshDomain(
-        mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), parts, {}, lines, volume
+        points, cells, groups = file.points, file.cells[:, node_order(file)], file.cell_groups.astype(np.int32)
+        extent = float(np.ptp(points, axis=0).max())
+        told = file.kind, file.degree, cells[:0], extent, regions, boundary, rims_of(file, boundary, "inner")
+    kind, degree, none, extent, regions, boundary, lines = comm.bcast(told)
+    mesh = dolfinx.mesh.create_mesh(
+        comm, cells=none if cells is None else cells, x=points, e=symbolic_mesh(kind, degree)
     )
-    beside: dict[str, Any] = {name: None if found is None else np.full(len(cells), -1, np.int64) for name in faces}
-    for number, part in enumerate(parts if found is not None else ()):
-        beside[part.name][boundary.cell[part.facets]] = number
-    touched = {name: domain.scatter_elements(numbers) for name, numbers in beside.items()}
-    own = domain.scatter_elements(None if found is None else file.cell_groups.astype(np.int32))
-    return replace(domain, element_region=own, part_of_element=touched)
+    parts: list[Face] = boundary.faces
+    rows = np.concatenate([part.facets for part in parts])
+    numbers = np.repeat(np.arange(len(parts)), [len(part.facets) for part in parts])
+    of_parts = _tags_of_facets(mesh, boundary.facets[rows], numbers)
+    faces = {name: number for number, name in enumerate(dict.fromkeys(part.name for part in parts), start=1)}
+    of_faces = np.array([faces[part.name] for part in parts], dtype=np.int32)[of_parts.values]
+    tags = dolfinx.mesh.meshtags(mesh, of_parts.dim, of_parts.indices, of_faces)
+    more: dict[str, Any] = {"boundary": boundary, "part_tags": of_parts, "rims": lines}
+    domain = MeshDomain(mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), **more)
+    return replace(domain, element_region=domain.scatter_elements(groups))
 
 
-def _tags_of_facets(mesh: Any, corners: Integers, values: Integers) -> Any:
+def _tags_of_facets(mesh: Mesh, corners: Integers, values: Integers) -> MeshTags:
     """Tags of the facets with these corners, as rank 0 numbered the nodes. Collective."""
     dimension, here = mesh.topology.dim - 1, slice(None) if mesh.comm.rank == 0 else slice(0)
     for other in (0, dimension + 1):
@@ -128,8 +122,6 @@ def _tags_of_facets(mesh: Any, corners: Integers, values: Integers) -> Any:
 
 
 # ---------------------------------------------------------------- supports of faces
-Density = Callable[[Any], Any]
-
 GUIDE = (
     1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
 )
@@ -146,48 +138,30 @@ def add_support(
         for part, facets in loading.domain.facets_of_parts(face):  # type: ignore[attr-defined]
             loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
         loading.supports[face] = None
-    elif support.kind in _DENSITIES:
-        density = _DENSITIES[support.kind](loading, face, support, moves)
+    elif support.kind != "free":
+        density = _density(loading, face, support, moves)
         half, measure = loading.constant((support.stiffness or stiffness) / 2), loading.surface_measure(face)
 
-        def potential(u: Any) -> Any:
+        def potential(u: Function) -> ufl.Form:
             return half * density(loading.kinematics.displacement(u)) * loading.weight * measure
 
         loading.add_potential(potential)
         loading.supports[face] = potential
 
 
-def _guided(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N - d)^2 + (u . c)^2."""
+def _density(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Callable[[Expr], Expr]:
+    """What a face's springs store over half of their stiffness."""
     domain: Any = loading.domain
-    sliding = _sliding(loading, face, support, moves)
-    normal, centre = (domain.of_parts(face, name) for name in ("normal", "centre"))
-    around = ufl.cross(normal, ufl.SpatialCoordinate(loading.domain.mesh) - centre)
+    if support.kind == "elastic":  # (u . N)^2 + s |u - (u . N) N|^2, N of the place
+        share, across = loading.constant(support.tangential), ufl.FacetNormal(domain.mesh)
+        return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, across) ** 2
+    normal, way = domain.of_parts(face, "normal"), loading.magnitude(*moves) if moves else 0.0
+    if support.kind == "sliding":
+        return lambda u: (ufl.inner(u, normal) - way) ** 2
+    around = ufl.cross(normal, ufl.SpatialCoordinate(domain.mesh) - domain.of_parts(face, "centre"))
     # a Constant: a number in the kernel would be another kernel for each mesh
-    squared = ufl.inner(around, around) + loading.constant(1e-24 * loading.domain.size**2)
-    return lambda u: sliding(u) + ufl.inner(u, around) ** 2 / squared
-
-
-def _sliding(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N - d)^2."""
-    domain: Any = loading.domain
-    normal = domain.of_parts(face, "normal")
-    way = loading.magnitude(*moves) if moves else 0.0
-    return lambda u: (ufl.inner(u, normal) - way) ** 2
-
-
-def _elastic(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Density:
-    """(u . N)^2 + s |u - (u . N) N|^2, N of the place."""
-    share, normal = loading.constant(support.tangential), ufl.FacetNormal(loading.domain.mesh)
-    return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, normal) ** 2
-
-
-# what a face's springs store over half of their stiffness, by the kind of support
-_DENSITIES: dict[str, Callable[[Loading, str, Support, tuple[str, float] | None], Density]] = {
-    "guided": _guided,
-    "sliding": _sliding,
-    "elastic": _elastic,
-}
+    squared = ufl.inner(around, around) + loading.constant(1e-24 * domain.size**2)
+    return lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, around) ** 2 / squared
 
 
 # ---------------------------------------------------------------- rigid motions
@@ -195,10 +169,12 @@ _DENSITIES: dict[str, Callable[[Loading, str, Support, tuple[str, float] | None]
 
 def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
     """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that."""
-    if free := free_motions(domain.parts, supports):
+    if free := free_motions(domain.boundary.faces, supports):
         kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
         raise SceneError(f"supports ({kinds}): they leave the body free to move, in {free} of 6 rigid motions")
-    sliding = [part for part in domain.parts if supports.get(part.name, Support(kind="free")).kind == "sliding"]
+    sliding = [
+        part for part in domain.boundary.faces if supports.get(part.name, Support(kind="free")).kind == "sliding"
+    ]
     if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
         raise SceneError(
             "loads.elongation: both ends slide and are not parallel, so the elongation would only shift the body, "
@@ -208,7 +184,7 @@ def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongate
         warn_of_twist(name, support, domain.comm)
 
 
-def warn_of_twist(name: str, support: Support, comm: Any) -> None:
+def warn_of_twist(name: str, support: Support, comm: MPI.Intracomm) -> None:
     """Say so where springs may turn a body about its axis."""
     if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and comm.rank == 0:
         log.warning(
@@ -242,14 +218,11 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
 
 def _held_directions(support: Support, part: Face, places: Array) -> Array:
     """What a support holds at a place of each facet of a part, as projections (facets, 3, 3)."""
-    along = np.broadcast_to(np.outer(part.normal, part.normal), (len(part.places), 3, 3))
-    around = np.cross(part.normal, places - part.centre)
-    around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
-    own = part.normals
-    share, springs = support.tangential, np.einsum("fi,fj->fij", own, own)
-    return {
-        "guided": along + np.einsum("fi,fj->fij", around, around),
-        "sliding": along,
-        "held": np.broadcast_to(np.eye(3), along.shape),
-        "elastic": share * np.eye(3) + (1 - share) * springs,
-    }[support.kind]
+    share = {"held": 1.0, "elastic": support.tangential}.get(support.kind, 0.0)
+    normals = part.normals if support.kind == "elastic" else np.broadcast_to(part.normal, places.shape)
+    found: Array = share * np.eye(3) + (1 - share) * np.einsum("fi,fj->fij", normals, normals)
+    if support.kind == "guided":
+        around = np.cross(part.normal, places - part.centre)
+        around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
+        found += np.einsum("fi,fj->fij", around, around)
+    return found

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.mesh_file import MeshFile, as_rows, distinct, in_place
@@ -36,31 +37,27 @@ class FaceError(UnreadableFile):
         self.face = face
 
 
-@dataclass(frozen=True, eq=False)
 class Face:
-    """A connected part of a named face."""
+    """A connected part of a named face: its facets, and their corners, (facets, 3 or 4, 3)."""
 
-    name: str
-    facets: Integers
-    places: Array
-    normals: Array
-    area: float
-    normal: Array
-    centre: Array
-    corners: Array  # of the facets, (facets, 3 or 4, 3)
-
-    @property
-    def flatness(self) -> float:
-        """1 of a plane part, 0 of one that goes around: length of the mean of its normals."""
-        return float(np.linalg.norm(self.normals.mean(axis=0)))
+    def __init__(self, name: str, facets: Integers, corners: Array):
+        vectors = area_vectors(corners)
+        sizes, mean = np.linalg.norm(vectors, axis=1), vectors.sum(axis=0)
+        self.name, self.facets, self.corners, self.area = name, facets, corners, float(sizes.sum())
+        self.places, self.normals = corners.mean(axis=1), vectors / sizes[:, None]
+        self.normal = mean / max(float(np.linalg.norm(mean)), 1e-300)
+        self.centre = sizes @ self.places / self.area
+        # 1 of a plane part, 0 of one that goes around
+        self.flatness = float(np.linalg.norm(self.normals.mean(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Boundary:
-    """What bounds a body."""
+    """What bounds a body: facets, the elements behind them, and the names of their faces or ""."""
 
     facets: Integers
     cell: Integers
+    owner: NDArray[np.object_]
     faces: list[Face]
     volume: float
 
@@ -72,12 +69,15 @@ class Boundary:
         """Of a named face."""
         return sum(face.area for face in self.parts(name))
 
+    def goes_around(self, name: str) -> bool:
+        """Whether a part of a named face has no direction."""
+        return min(face.flatness for face in self.parts(name)) < NOT_AROUND
+
 
 def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Groups = MappingProxyType({})) -> Boundary:
     """Find the named faces on the boundary of the one body that a file holds, and others where they are faces."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
-    normals = area_vectors(places)
     owner = np.full(len(facets), "", dtype=object)
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
     for name, numbers in (*groups.items(), *others.items()):
@@ -106,18 +106,10 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Gro
     for name in (*groups, *others):
         rows = np.flatnonzero(owner == name)
         label = components(facets[rows], len(file.points))
-        for one in distinct(label):
-            part = rows[label == one]
-            size, mean, middles = (
-                np.linalg.norm(normals[part], axis=1),
-                normals[part].sum(axis=0),
-                places[part].mean(axis=1),
-            )
-            normal, centre = mean / max(float(np.linalg.norm(mean)), 1e-300), size @ middles / size.sum()
-            units = normals[part] / size[:, None]
-            faces.append(Face(name, part, middles, units, float(size.sum()), normal, centre, places[part]))
-    volume = float(np.einsum("fi,fi->", places.mean(axis=1), normals) / 3)
-    return Boundary(facets, cell, faces, volume)
+        parts = (rows[label == one] for one in distinct(label))
+        faces += [Face(name, part, places[part]) for part in parts]
+    volume = float(np.einsum("fi,fi->", places.mean(axis=1), area_vectors(places)) / 3)
+    return Boundary(facets, cell, owner, faces, volume)
 
 
 def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flags:
@@ -129,47 +121,38 @@ def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flag
 
 def through_the_wall(boundary: Boundary) -> bool:
     """Whether an element has facets on the inner and on the outer face."""
-    inner, outer = (
-        boundary.cell[np.concatenate([np.empty(0, np.int64), *(part.facets for part in boundary.parts(name))])]
-        for name in ("inner", "outer")
-    )
+    inner, outer = (boundary.cell[boundary.owner == name] for name in ("inner", "outer"))
     return bool(np.isin(inner, outer).any())
 
 
 def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle)."""
     # They run so that the normal of a flat cap on one points out of what the face encloses.
-    rows = np.concatenate([np.empty(0, dtype=np.int64), *(part.facets for part in boundary.parts(face))])
-    found = []
-    for edges, facets in rims(boundary.facets[rows]):
-        beside = zip(boundary.cell[rows[facets]], edges, strict=True)
-        middles = [[_middle(file, cell, pair) for cell, pair in beside]] if file.degree == 2 else []
-        found.append(np.column_stack([edges, *middles]))
-    return found
+    there = boundary.owner == face
+    lines = rims(boundary.facets[there])
+    if file.degree == 1:
+        return lines
+    element = basix.create_element(basix.ElementFamily.P, basix.CellType[file.kind], 2)
+    edges = file.cells[boundary.cell[there]][:, node_order(file)][:, np.array(element.entity_closure_dofs[1])]
+    middles = {frozenset(ends): middle for *ends, middle in as_rows(edges.reshape(-1, 3))}
+    return [np.column_stack([line, [middles[frozenset(ends)] for ends in as_rows(line)]]) for line in lines]
 
 
-def rims(facets: Integers) -> list[tuple[Integers, Integers]]:
-    """The closed lines in which facets end: edges (n, 2), as the facets go along them, and the facets' numbers."""
+def rims(facets: Integers) -> list[Integers]:
+    """The closed lines in which facets end, each as its edges (n, 2), as the facets go along them."""
     edges = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
     _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     alone = np.sort(first[count == 1])
     label = components(edges[alone], int(facets.max(initial=0)) + 1)
-    parts = [alone[label == one] for one in distinct(label)]
-    return [(edges[part], part // facets.shape[1]) for part in parts]
-
-
-def cap_vector(points: Array, rim: Integers) -> Array:
-    """Integral of x cross dx / 2 along a closed line of straight or parabolic edges: area times normal of a cap."""
-    a, b = points[rim[:, 0]], points[rim[:, 1]]
-    if rim.shape[1] == 2:
-        return np.cross(a, b).sum(axis=0) / 2
-    m = points[rim[:, 2]]
-    return (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6
+    return [edges[alone[label == one]] for one in distinct(label)]
 
 
 def cap_volume(points: Array, rim: Integers) -> float:
-    """Of the cone between the origin and a flat cap on a closed line."""
-    return float(points[rim[:, 0]].mean(axis=0) @ cap_vector(points, rim) / 3)
+    """Of the cone between the origin and a flat cap on a closed line of straight or parabolic edges."""
+    a, b = points[rim[:, 0]], points[rim[:, 1]]
+    m = points[rim[:, 2]] if rim.shape[1] == 3 else (a + b) / 2
+    vector = (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6  # area times normal
+    return float(a.mean(axis=0) @ vector / 3)
 
 
 def components(rows: Integers, nodes: int) -> Integers:
@@ -252,10 +235,3 @@ def area_vectors(places: Array) -> Array:
     if places.shape[1] == 3:
         return np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2
     return np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2
-
-
-def _middle(file: MeshFile, cell: Any, pair: Any) -> int:
-    """The node between two corners of an element of degree 2."""
-    element = basix.create_element(basix.ElementFamily.P, basix.CellType[file.kind], 2)
-    edges = file.cells[cell][node_order(file)][np.array(element.entity_closure_dofs[1])]  # ends, middle
-    return next(middle for *ends, middle in as_rows(edges) if {*ends} == {*pair.tolist()})

@@ -7,14 +7,15 @@ https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import importlib
 import itertools
 import json
 import logging
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -22,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.body.surface_file import of_vtk, triangles_of, vtk_arrays
+from remodel_fenicsx.body.gmsh_model import gmsh, gmsh_model
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.system.children import DAMAGED, read_guarded
@@ -111,22 +112,27 @@ def distinct(values: Integers) -> list[int]:
 
 # ---------------------------------------------------------------- files, by VTK and meshio
 
-READERS = {
-    ".msh": "remodel_fenicsx.body.gmsh_file:arrays_msh",
-    **{f".{kind}": f"{__name__}:arrays_{kind}" for kind in ("vtu", "vtk", "xdmf")},
-}
+READERS = {f".{kind}": f"{__name__}:arrays_{kind}" for kind in ("msh", "vtu", "vtk", "xdmf")}
+READERS[".msh"] = f"gmsh {READERS['.msh']}"  # imported before reading begins, for it looks into other files then
+_FORMAT = re.compile(rb"\$MeshFormat\s+(2\.2|4\.1) 0 \d+\s+\$EndMeshFormat")
+_SECTION = re.compile(rb"^\$(\w+)\s*?\n(.*?)^\$End\1\b", re.DOTALL | re.MULTILINE)
+_OLD_TAGS = re.compile(rb"(?m)^[ \t]*\d+([ \t]+\d+[ \t]+\d+[ \t]+(\d+)[ \t]+)\d+(?=[ \t])")
 SAVED_OTHERWISE = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
 TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
 """Arrays of numbers of faces and volumes: as meshio, VMTK and Medit call them."""
 
 
-class ExchangeFile(NamedTuple):
-    """What such a file holds: types of the elements by block with their rows of nodes, arrays, and the file itself."""
+Arrays = dict[str, NDArray[Any]]
+Blocks = list[tuple[str, Integers]]
 
-    points: NDArray[Any]
-    cells: list[tuple[str, NDArray[Any]]]
-    point_data: dict[str, NDArray[Any]]
-    cell_data: dict[str, list[NDArray[Any]]]
+
+class ExchangeFile(NamedTuple):
+    """What such a file holds: types of the elements with their rows of nodes, arrays over all, and the file itself."""
+
+    points: Array
+    cells: Blocks
+    point_data: Arrays
+    cell_data: Arrays
     group_names: list[tuple[int, int, str]]
     data: bytes
 
@@ -139,76 +145,202 @@ def read_exchange_file(path: Path) -> ExchangeFile:
     except UnreadableFile as error:
         is_exchanged = ending != ".msh" and str(error).startswith(DAMAGED)
         raise UnreadableFile(f"{error}{SAVED_OTHERWISE if is_exchanged else ''}") from None
-    types, points, cells, groups = json.loads(arrays["names"].tobytes())
-    return ExchangeFile(
-        arrays["points"],
-        [(kind, arrays[f"cells{n}"]) for n, kind in enumerate(types)],
-        {name: arrays[f"point_data{n}"] for n, name in enumerate(points)},
-        {name: [arrays[f"cell_data{n}_{m}"] for m in range(len(types))] for n, name in enumerate(cells)},
-        groups,
-        data,
-    )
+    names, points, *others = arrays.values()
+    (kinds, of_points, of_cells, groups), rest = json.loads(names.tobytes()), iter(others)
+    cells = [*zip(kinds, rest, strict=False)]  # each takes its share of the rest
+    data_of_points, data_of_cells = (dict(zip(one, rest, strict=False)) for one in (of_points, of_cells))
+    return ExchangeFile(points, cells, data_of_points, data_of_cells, groups, data)
 
 
 # what the child calls, without the modules of other formats
 
 
-def arrays_xdmf(file: str) -> dict[str, Any]:
+def arrays_xdmf(file: str) -> Arrays:
     """Those of a file in XDMF."""
     mesh = importlib.import_module("meshio.xdmf").read(file)
     cells = [_in_gmsh_order(block.type, block.data) for block in mesh.cells]
-    return as_arrays(mesh.points, cells, mesh.point_data, mesh.cell_data)
+    of_cells = {name: np.concatenate(values) for name, values in mesh.cell_data.items()}
+    return as_arrays(mesh.points, cells, mesh.point_data, of_cells)
 
 
-def arrays_vtu(file: str) -> dict[str, Any]:
-    """Those of a file in VTK's XML, however its writers pack numbers."""
-    return _of_vtk("vtkXMLUnstructuredGridReader", "vtkIOXML", file)
-
-
-def arrays_vtk(file: str) -> dict[str, Any]:
-    """Those of a file in VTK's old format, as text or not."""
-    return _of_vtk("vtkUnstructuredGridReader", "vtkIOLegacy", file)
-
-
-def _of_vtk(reader: str, module: str, file: str) -> dict[str, Any]:
-    """By VTK itself, as meshio would have them."""
-    from meshio._vtk_common import vtk_to_meshio_type
-
-    made, numbers = of_vtk(module, reader)(), of_vtk("util.numpy_support", "vtk_to_numpy")
+def _read_by_vtk(module: str, reader: str, file: str, is_surface: bool = True) -> Any:
+    made = getattr(importlib.import_module(f"vtkmodules.{module}"), reader)()
+    if is_surface:
+        made.AddObserver("WarningEvent", lambda *_: None)  # of colours behind the places of an OBJ, say
     made.SetFileName(file)
     for read_all in ("ReadAllScalarsOn", "ReadAllVectorsOn", "ReadAllTensorsOn", "ReadAllFieldsOn"):
         getattr(made, read_all, lambda: None)()
     made.Update()
-    grid = made.GetOutput()
+    return made.GetOutput()
+
+
+def _of_vtk(module: str, reader: str, file: str) -> Arrays:
+    """By VTK itself, as meshio would have them."""
+    from meshio._vtk_common import vtk_to_meshio_type
+    from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
+
+    grid = _read_by_vtk(module, reader, file, is_surface=False)
     if not grid.GetNumberOfCells():
         raise UnreadableFile("has no elements")
     types, nodes = numbers(grid.GetCellTypesArray()), numbers(grid.GetCells().GetConnectivityArray())
     starts = numbers(grid.GetCells().GetOffsetsArray())
     changes: Any = np.flatnonzero(np.diff(types)) + 1
-    cuts = [0, *changes.tolist(), len(types)]
-    cells, pieces = [], [slice(a, b) for a, b in itertools.pairwise(cuts)]
-    for piece in pieces:
-        rows = nodes[starts[piece.start] : starts[piece.stop]].reshape(piece.stop - piece.start, -1)
-        cells.append(_in_gmsh_order(vtk_to_meshio_type[int(types[piece.start])], rows))
-
-    of_cells = {name: [values[piece] for piece in pieces] for name, values in vtk_arrays(grid.GetCellData()).items()}
+    cells = []
+    for start, stop in itertools.pairwise([0, *changes.tolist(), len(types)]):
+        rows = nodes[starts[start] : starts[stop]].reshape(stop - start, -1)
+        cells.append(_in_gmsh_order(vtk_to_meshio_type[int(types[start])], rows))
     points = numbers(grid.GetPoints().GetData())
-    return as_arrays(points, cells, vtk_arrays(grid.GetPointData()), of_cells)
+    return as_arrays(points, cells, vtk_arrays(grid.GetPointData()), vtk_arrays(grid.GetCellData()))
+
+
+arrays_vtu = partial(_of_vtk, "vtkIOXML", "vtkXMLUnstructuredGridReader")
+arrays_vtk = partial(_of_vtk, "vtkIOLegacy", "vtkUnstructuredGridReader")
+
+
+def arrays_msh(file: str) -> Arrays:
+    """Those of a file by Gmsh, where elements of several groups are there several times."""
+    data = Path(file).read_bytes()
+    version = _FORMAT.match(data)
+    if version is None:  # Gmsh would run a script
+        raise UnreadableFile("is no mesh by Gmsh in format 2.2 or 4.1 as text (in Gmsh: Mesh.Binary = 0)")
+    if rest := _SECTION.sub(b"", data).split():
+        words = b" ".join(rest[:9])[:40].decode("ascii", "replace")
+        raise UnreadableFile(f"has {words!r} outside of its sections: is it cut off?")
+    is_old, number, sections = version[1] == b"2.2", itertools.count(1), dict(_SECTION.findall(data))
+    # lines of a section for each number at its head: Gmsh passes over what is not announced
+    for name, lines in {"Nodes": (1, 2), "Elements": (1, 1), "Entities": (1, 1, 1, 1)}.items():
+        head, *rows = sections.get(name.encode(), b"0").strip().splitlines()
+        if len(rows) != sum(count * int(number) for count, number in zip(lines, head.split(), strict=False)):
+            raise UnreadableFile(f"has other {name.lower()} than ${name} announces")
+    if is_old:  # its elements have groups of their own, not by the parts of the body, and an order
+        data = _OLD_TAGS.sub(lambda found: b"%d%b%b" % (next(number), found[1], found[2]), data)
+        Path(file).write_bytes(data)  # in this process' memory
+    with gmsh_model("file"):
+        gmsh.merge(file)
+        groups = gmsh.model.getPhysicalGroups()
+        names = [(*group, name) for group in groups if (name := gmsh.model.getPhysicalName(*group))]
+        points, blocks = of_gmsh(is_old)
+    groups = np.concatenate([[], *(block.groups for block in blocks)])
+    return as_arrays(points, [(block.kind, block.nodes) for block in blocks], {}, {TAGS[0]: groups}, names)
+
+
+def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
+    """Nodes of Gmsh's current model by their numbers, and its elements, those of several groups several times."""
+    model, found = gmsh.model, dict[str, list[Any]]()
+    tags, places, _ = model.mesh.getNodes()
+    order = np.argsort(tags)
+    for dimension, entity in model.getEntities():
+        if model.getType(dimension, entity).startswith("Ghost"):  # of other parts of the mesh
+            continue
+        groups: list[int] = [*model.getPhysicalGroupsForEntity(dimension, entity)]
+        for kind, numbers, nodes in zip(*model.mesh.getElements(dimension, entity), strict=True):
+            name = GMSH_KINDS.get(kind) or model.mesh.getElementProperties(kind)[0]
+            rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(numbers), -1)
+            found.setdefault(name, []).extend((numbers, np.full(len(rows), group), rows) for group in groups or [0])
+    blocks = []
+    for name, parts in found.items():
+        numbers, of_groups, rows = map(np.concatenate, zip(*parts, strict=True))
+        chosen = np.argsort(numbers) if by_number else slice(None)
+        blocks.append(Block(name, of_groups[chosen], rows[chosen]))
+    return np.reshape(places, (-1, 3))[order], blocks
 
 
 def as_arrays(
-    points: Any, cells: Any, point_data: Any, cell_data: Any, group_names: Sequence[tuple[int, int, str]] = ()
-) -> dict[str, Any]:
+    points: Array, cells: Blocks, point_data: Arrays, cell_data: Arrays, group_names: Sequence[object] = ()
+) -> Arrays:
+    """An `ExchangeFile` as the child hands it over: its names, and its arrays in their order."""
     names = [[kind for kind, _ in cells], [*point_data], [*cell_data], group_names]
-    found = {"names": np.frombuffer(json.dumps(names).encode(), np.uint8), "points": points}
-    found |= {f"cells{n}": rows for n, (_, rows) in enumerate(cells)}
-    found |= {f"point_data{n}": values for n, values in enumerate(point_data.values())}
-    blocks = enumerate(cell_data.values())
-    return found | {f"cell_data{n}_{m}": values for n, listed in blocks for m, values in enumerate(listed)}
+    arrays = [points, *(rows for _, rows in cells), *point_data.values(), *cell_data.values()]
+    listed = {str(number): values for number, values in enumerate(arrays)}
+    return {"names": np.frombuffer(json.dumps(names).encode(), np.uint8), **listed}
 
 
-def _in_gmsh_order(kind: str, rows: Any) -> tuple[str, Any]:
+def _in_gmsh_order(kind: str, rows: Integers) -> tuple[str, Integers]:
     return kind, rows[:, ORDERS.get(kind, slice(None))]
+
+
+# ---------------------------------------------------------------- surfaces
+
+ARRAY = "array "  # before the name of an array that a child hands over
+SURFACES = (".vtp", ".stl", ".obj")  # endings
+
+
+class Surface(NamedTuple):
+    """Triangles whose normals point out of the lumen, and arrays of numbers at their corners."""
+
+    points: Array
+    triangles: Integers
+    arrays: dict[str, Array]
+
+
+def triangles_of(path: Path) -> tuple[Surface, bytes]:
+    """The triangles of a file, whichever way they look, and the file."""
+    try:
+        found, data = read_guarded(path, f"{__name__}:{path.suffix[1:].lower()}")
+    except UnreadableFile as error:
+        raise UnreadableFile(f"{error}; save it again, in ParaView as VTP or binary STL") from None
+    points, triangles = found.pop("points").astype(np.float64), found.pop("triangles").astype(np.int64)
+    return Surface(points, triangles, {name.removeprefix(ARRAY): values for name, values in found.items()}), data
+
+
+# ---------------------------------------------------------------- the child
+
+
+def _by_vtk(module: str, reader: str, file: str) -> Arrays:
+    return _triangulated(_read_by_vtk(module, reader, file))
+
+
+vtp = partial(_by_vtk, "vtkIOXML", "vtkXMLPolyDataReader")
+obj = partial(_by_vtk, "vtkIOGeometry", "vtkOBJReader")
+
+
+def stl(file: str) -> Arrays:
+    """As text with decimal commas too."""
+    data = Path(file).read_bytes()
+    if b"\0" not in data:
+        Path(file).write_bytes(re.sub(rb"(?<=\d),(?=\d)", b".", data))  # in this process' memory
+    return _by_vtk("vtkIOGeometry", "vtkSTLReader", file)
+
+
+def _triangulated(data: Any) -> Arrays:
+    """Triangles of polygons and strips, with corners at one place as one, and arrays of a number at each point."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
+    from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkTriangleFilter
+
+    points = data.GetPoints()
+    cells = [
+        numbers(each.GetConnectivityArray()) for each in (data.GetPolys(), data.GetStrips()) if each.GetNumberOfCells()
+    ]
+    if not cells:
+        raise UnreadableFile("has no triangles or other polygons")
+    if min(each.min() for each in cells) < 0 or max(each.max() for each in cells) >= data.GetNumberOfPoints():
+        raise UnreadableFile("has polygons with corners that are not there")
+    if not np.isfinite(numbers(points.GetData())).all():
+        raise UnreadableFile("has points whose coordinates are not finite")
+    triangles, merged = vtkTriangleFilter(), vtkCleanPolyData()
+    triangles.SetInputData(data)
+    merged.SetInputConnection(triangles.GetOutputPort())
+    merged.SetTolerance(0.0)  # two corners at one place leave a line, which is passed over
+    merged.Update()
+    found = merged.GetOutput()
+    if not found.GetNumberOfPolys():
+        raise UnreadableFile("has no triangles with three different corners")
+    return {
+        "points": numbers(found.GetPoints().GetData()),
+        "triangles": numbers(found.GetPolys().GetConnectivityArray()).reshape(-1, 3),
+        **{ARRAY + name: values for name, values in vtk_arrays(found.GetPointData()).items() if values.ndim == 1},
+    }
+
+
+def vtk_arrays(data: Any) -> Arrays:
+    """Arrays of points or cells by name."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
+
+    found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
+    return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
+
+
+# ---------------------------------------------------------------- meshes
 
 
 def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()) -> MeshFile:
@@ -225,7 +357,7 @@ def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()
         raise UnreadableFile(f"cannot be read: {error.strerror or error}") from None
 
 
-@functools.lru_cache(maxsize=1)
+@lru_cache(maxsize=1)
 def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tuple[Any, ...]) -> MeshFile:
     mesh = read_exchange_file(path)
     points = np.asarray(mesh.points, dtype=np.float64)
@@ -234,10 +366,9 @@ def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tu
     names: dict[int, dict[str, int]] = {2: {}, 3: {}}
     for dimension, number, name in mesh.group_names:
         names.setdefault(dimension, {})[name] = number
-    blocks = [
-        Block(kind, groups, np.asarray(rows, dtype=np.int64))
-        for (kind, rows), groups in zip(mesh.cells, _tags(mesh, tags, bool(surfaces)), strict=True)
-    ]
+    ends = np.cumsum([len(rows) for _, rows in mesh.cells])
+    of_blocks = zip(mesh.cells, np.split(_tags(mesh, tags, bool(surfaces)), ends), strict=False)
+    blocks = [Block(kind, groups, np.asarray(rows, dtype=np.int64)) for (kind, rows), groups in of_blocks]
     found = assembled(points, blocks, {dimension: names[dimension] for dimension in (2, 3)}, mesh.data)
     for surface in surfaces:
         found = _with_surface(found, surface)
@@ -279,26 +410,22 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
     )
 
 
-def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> list[Integers]:
-    """Numbers of faces and volumes, block by block; 0 where there are none, if there may be none."""
-    arrays = mesh.cell_data
+def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> Integers:
+    """Numbers of faces and volumes; 0 where there are none, if there may be none."""
+    arrays, count = mesh.cell_data, sum(len(rows) for _, rows in mesh.cells)
     name = next((name for name in ((asked,) if asked else TAGS) if name in arrays), None)
     if name is None and asked is None and may_be_none:
-        return [np.zeros(len(rows), dtype=np.int64) for _, rows in mesh.cells]
+        return np.zeros(count, dtype=np.int64)
     if name is None:
         wanted = repr(asked) if asked else " or ".join(map(repr, TAGS))
         there = ", ".join(map(repr, arrays)) or "none"
         raise UnreadableFile(
             f"has no array {wanted} with the numbers of faces and volumes (geometry.tags); it has {there}"
         )
-    found = []
-    for values in arrays[name]:
-        numbers = np.asarray(values, dtype=np.float64)
-        numbers = numbers.reshape(len(numbers)) if numbers.shape == (len(numbers), 1) else numbers  # as Gmsh and VTK do
-        if numbers.ndim != 1 or not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any():
-            raise UnreadableFile(f"the array {name!r} has no whole number for each element")
-        found.append(numbers.astype(np.int64))
-    return found
+    numbers = np.asarray(arrays[name], dtype=np.float64)
+    if numbers.size != count or not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any():
+        raise UnreadableFile(f"the array {name!r} has no whole number for each element")
+    return numbers.reshape(-1).astype(np.int64)
 
 
 # ---------------------------------------------------------------- what all lead to

@@ -7,9 +7,9 @@ its own (`Shape.reductions`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +19,23 @@ from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.tensors import Array, Integers
-from remodel_fenicsx.schema.settings import LARGEST_MESH
+from remodel_fenicsx.schema.settings import (
+    LARGEST_MESH,
+    Cells,
+    Load,
+    Mesh,
+    Model,
+    Properties,
+    Region,
+    Remodeling,
+    Solver,
+    Supports,
+)
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
 
 
 # ---------------------------------------------------------------- whole bodies for pictures
@@ -58,12 +74,15 @@ def revolved(points: Array, quadrilaterals: Integers) -> Body:
     return _swept(np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1), quadrilaterals)
 
 
+_MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}  # order of the corners of a mirror image
+
+
 def mirrored_twice(points: Array, elements: Integers) -> Body:
     """The quarter x > 0, y > 0 and its images in the planes x = 0 and y = 0; nodes on the planes are shared."""
     signs = np.array([(1.0, 1.0, 1.0), (-1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, 1.0)])
-    every = (np.arange(4)[:, None, None] * len(points) + elements).reshape(-1, elements.shape[1])
-    points, elements = _shared((signs[:, None] * points).reshape(-1, 3), every)
-    return points, _oriented(points, elements)
+    ways = elements, elements[:, _MIRRORED[elements.shape[1]]]  # so that all volumes are positive
+    every = [ways[number % 2] + number * len(points) for number in range(4)]
+    return _shared((signs[:, None] * points).reshape(-1, 3), np.concatenate(every))
 
 
 def _shared(points: Array, elements: Integers) -> Body:
@@ -71,21 +90,6 @@ def _shared(points: Array, elements: Integers) -> Body:
     places = np.rint(points / (1e-7 * np.abs(points).max())).astype(np.int64)
     _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
     return points[first], np.ravel(number)[elements]
-
-
-# corners on the far (1) and near (-1) side in each of three directions, and the order of the mirror image
-_SIDES = {
-    8: ((-1, 1, 1, -1, -1, 1, 1, -1), (-1, -1, 1, 1, -1, -1, 1, 1), (-1, -1, -1, -1, 1, 1, 1, 1)),
-    4: ((-1, 1, 0, 0), (-1, 0, 1, 0), (-1, 0, 0, 1)),
-}
-_MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}
-
-
-def _oriented(points: Array, elements: Integers) -> Integers:
-    """The same hexahedra or tetrahedra, all of positive volume as VTK has them."""
-    size = elements.shape[1]
-    is_mirrored = np.linalg.det(np.array(_SIDES[size], dtype=np.float64) @ points[elements]) < 0
-    return np.where(is_mirrored[:, None], elements[:, _MIRRORED[size]], elements)
 
 
 def divided_along(points: Array, hexahedra: Integers) -> Body:
@@ -120,7 +124,29 @@ class Strut:
     inner_radius: float | None = None
 
 
-Rule = Callable[[Any], str | None]
+class ReducedScene(Protocol):
+    """What reductions ask of a scene."""
+
+    geometry: Any
+    mesh: Mesh
+    model: Model
+    cells: Cells
+    supports: Supports
+    regions: dict[str, Region]
+    loads: dict[str, Load]
+    remodeling: Remodeling
+    solver: Solver
+
+    @property
+    def has_random_cells(self) -> bool: ...
+    @property
+    def measured_cells(self) -> dict[str, Cells]: ...
+
+    def each_case(self) -> Sequence[ReducedScene]: ...
+    def properties(self) -> dict[str, Properties]: ...
+
+
+Rule = Callable[[ReducedScene], str | None]
 Turn = Callable[[Array], Array]
 POINTS = {
     ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
@@ -159,8 +185,8 @@ class Reduction:
     {'radial': 6, 'axisymmetric': 4, 'sector': 5}
     """
 
-    build: Callable[[Any, Any], Any]
-    elements: Callable[[Any], int]
+    build: Callable[[ReducedScene, MPI.Intracomm | None], Domain]
+    elements: Callable[[ReducedScene], int]
     rules: tuple[Rule, ...]
     turn: Turn
     whole: Callable[[Any, Array, Integers], Body] | None = None
@@ -175,7 +201,7 @@ class Choice:
     objections: dict[str, list[str]]
 
 
-def choice(scene: Any) -> Choice:
+def choice(scene: ReducedScene) -> Choice:
     """The scene's kinematics, or the cheapest that it allows where it leaves the choice."""
     # Under loads that press it chooses none that is reduced: what buckles leaves the symmetry.
     reductions = scene.geometry.reductions  # the cheapest first
@@ -188,7 +214,7 @@ def choice(scene: Any) -> Choice:
     return Choice(next(exact, "full"), found)
 
 
-def objections(scene: Any, name: str) -> list[str]:
+def objections(scene: ReducedScene, name: str) -> list[str]:
     """Why a kinematics would be wrong for a scene; nothing if it is right."""
     if not KINEMATICS[name].reduced:
         return []
@@ -196,30 +222,30 @@ def objections(scene: Any, name: str) -> list[str]:
     if name not in shape.reductions:
         known = " or ".join(map(repr, shape.reductions)) or "none"
         return [f"a {shape.name} has no such reduction; it has {known}"]
-    reasons = [reason for rule in shape.reductions[name].rules if (reason := rule(scene)) is not None]
+    reasons = _reasons(shape.reductions[name].rules, scene)
     if scene.solver.unstable == "stop":
         reasons.append("solver.unstable = 'stop' needs the modes of the whole body")
     return reasons
 
 
-def _in_the_mean(scene: Any, name: str) -> list[str]:
-    reduction = scene.geometry.reductions.get(name)
-    rules = () if reduction is None else reduction.in_the_mean
+def _reasons(rules: Sequence[Rule], scene: ReducedScene) -> list[str]:
     return [reason for rule in rules if (reason := rule(scene)) is not None]
 
 
-def is_for_means(scene: Any, name: str) -> bool:
+def is_for_means(scene: ReducedScene, name: str) -> bool:
     """Whether a kinematics, where it is allowed, is right for means over many seeds alone."""
-    return bool(_in_the_mean(scene, name))
+    reductions = scene.geometry.reductions
+    return name in reductions and bool(_reasons(reductions[name].in_the_mean, scene))
 
 
-def only_for_means(scene: Any) -> list[str]:
+def only_for_means(scene: ReducedScene) -> list[str]:
     """Why the scene's own kinematics is right for means over many seeds alone, in words; nothing where it is exact."""
-    name = scene.model.kinematics
-    return [f"{name!r}: {reason}" for reason in _in_the_mean(scene, name)]
+    name, reductions = scene.model.kinematics, scene.geometry.reductions
+    reasons = _reasons(reductions[name].in_the_mean, scene) if name in reductions else []
+    return [f"{name!r}: {reason}" for reason in reasons]
 
 
-def for_means(scene: Any) -> str:
+def for_means(scene: ReducedScene) -> str:
     """The cheapest kinematics with the body's means over many seeds of random cells; `auto` where there is none."""
     if threats(scene):
         return AUTO
@@ -227,7 +253,7 @@ def for_means(scene: Any) -> str:
     return next(found, AUTO)
 
 
-def explained(scene: Any) -> list[str]:
+def explained(scene: ReducedScene) -> list[str]:
     """The choice in words: why nothing cheaper, what it cannot show."""
     made = choice(scene)
     lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}"]
@@ -249,7 +275,7 @@ def explained(scene: Any) -> list[str]:
     ]
 
 
-def threats(scene: Any) -> list[str]:
+def threats(scene: ReducedScene) -> list[str]:
     """What may make a body buckle, in words: loads below zero (compression, suction)."""
     if not scene.geometry.reductions or not scene.geometry.buckles:
         return []
@@ -262,14 +288,14 @@ def threats(scene: Any) -> list[str]:
     return [f"{' and '.join(pressing)} press"] if pressing else []
 
 
-def elements(scene: Any, name: str) -> int:
+def elements(scene: ReducedScene, name: str) -> int:
     """How many hexahedra, or elements of fewer dimensions, a kinematics has."""
     if KINEMATICS[name].reduced:
         return scene.geometry.reductions[name].elements(scene)
     return scene.geometry.number_of_elements * scene.mesh.refinement**3
 
 
-def too_many_elements(scene: Any) -> str:
+def too_many_elements(scene: ReducedScene) -> str:
     """What is allowed where a body, or the part that stands for it, has too many elements; nothing elsewhere."""
     name, refinement = choice(scene).name, scene.mesh.refinement
     if (number := elements(scene, name)) <= LARGEST_MESH:
@@ -279,7 +305,7 @@ def too_many_elements(scene: Any) -> str:
     return f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
 
 
-def step_cost(scene: Any, name: str) -> float:
+def step_cost(scene: ReducedScene, name: str) -> float:
     """Of a step, in that of one point of a hexahedron; a rough figure from the number of quadrature points."""
     kinematics, mesh = KINEMATICS[name], scene.mesh
     element, number = kinematics.element(mesh.element), elements(scene, name)
@@ -288,7 +314,7 @@ def step_cost(scene: Any, name: str) -> float:
     return POINTS_OF_THE_REST + kinematics.cost * number * POINTS[element, mesh.degree]
 
 
-def _leaves_symmetry(scene: Any) -> str:
+def _leaves_symmetry(scene: ReducedScene) -> str:
     """What of a scene makes the full body leave the symmetric solution, in words."""
     remodeling = scene.remodeling
     if remodeling.coupling != "staggered" or scene.geometry.axis_kinds == ("global",):
@@ -313,17 +339,17 @@ def mirrored(places: Array) -> Array:
 
 
 # ---------------------------------------------------------------- rules
-def same_cells(scene: Any) -> str | None:
+def same_cells(scene: ReducedScene) -> str | None:
     """Random or measured cells are other ones in every element."""
     return unmeasured_cells(scene) or drawn_once(scene)
 
 
-def unmeasured_cells(scene: Any) -> str | None:
+def unmeasured_cells(scene: ReducedScene) -> str | None:
     """A file gives the cells of all elements."""
     return "cells.fibres gives other cells to each element" if scene.measured_cells else None
 
 
-def drawn_once(scene: Any) -> str | None:
+def drawn_once(scene: ReducedScene) -> str | None:
     """Random cells are other ones in every element."""
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if not scene.has_random_cells or (number == 1 and scene.mesh.element == "hexahedron"):
@@ -331,13 +357,13 @@ def drawn_once(scene: Any) -> str | None:
     return f"cells.initial = 'random' draws other cells for each of {number} elements"
 
 
-def symmetric_law(scene: Any) -> str | None:
+def symmetric_law(scene: ReducedScene) -> str | None:
     """A law that turns axes to one of two sides leaves the symmetry of body and loads."""
     law = scene.remodeling.law
     return None if LAWS[law].keeps_symmetry else f"remodeling.law = {law!r} may turn axes out of planes of symmetry"
 
 
-def round_about_z(scene: Any) -> str | None:
+def round_about_z(scene: ReducedScene) -> str | None:
     """Cells that are the same in every half-plane through the z axis."""
     axes = scene.cells.axes
     if axes == "cylindrical" or (axes == "global" and all(a == b == 0 for a, b, _ in _dimensions(scene))):
@@ -345,13 +371,13 @@ def round_about_z(scene: Any) -> str | None:
     return f"cells.axes = {axes!r}: the tube is not round, along x it differs from along the diagonal"
 
 
-def symmetric_planes(scene: Any) -> str | None:
+def symmetric_planes(scene: ReducedScene) -> str | None:
     """Cells whose mirror images in x = 0 and y = 0 are cells of the body."""
     axes = scene.cells.axes
     return None if axes in ("cylindrical", "global") else f"cells.axes = {axes!r} may have no planes of symmetry"
 
 
-def homogeneous(scene: Any) -> str | None:
+def homogeneous(scene: ReducedScene) -> str | None:
     """Cells that are the same everywhere, and stay so."""
     axes, lengths = scene.cells.axes, _dimensions(scene)
     if len(lengths) > 1:
@@ -366,7 +392,7 @@ def homogeneous(scene: Any) -> str | None:
     return None if stays else "cells.axes = 'cylindrical' makes cells, and stress, that are not the same everywhere"
 
 
-def free_ends(scene: Any) -> str | None:
+def free_ends(scene: ReducedScene) -> str | None:
     """Ends that move radially as all other sections do."""
     ends = scene.supports.ends
     return None if ends in ("free", "closed") else f"supports.ends = {ends!r}: the sections are not alike"
@@ -375,7 +401,7 @@ def free_ends(scene: Any) -> str | None:
 def known_loads(name: str) -> Rule:
     """Loads that the kinematics of this name has."""
 
-    def rule(scene: Any) -> str | None:
+    def rule(scene: ReducedScene) -> str | None:
         kinds = scene.geometry.loads
         unknown = [f"loads.{load}" for load in scene.loads if name not in kinds[load].reductions]
         return f"{', '.join(unknown)} would have to be applied to the whole body" if unknown else None
@@ -383,6 +409,6 @@ def known_loads(name: str) -> Rule:
     return rule
 
 
-def _dimensions(scene: Any) -> list[tuple[float, ...]]:
+def _dimensions(scene: ReducedScene) -> list[tuple[float, ...]]:
     """l1, l2, l3 of the first cell at the start, of each region."""
     return [tuple(map(float, properties.cells.dimensions(1)[0])) for properties in scene.properties().values()]

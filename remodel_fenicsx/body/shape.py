@@ -351,16 +351,20 @@ def columns_on_request(
 ) -> dict[str, Column]:
     """Columns by name that a history of this shape has only where a scene names them."""
     of_regions = [column for name in regions for column in shape.region_columns_on_request(name)]
-    of_supports = [_of_support(face) for face in held if re.fullmatch(NAME, face)]
+    of_supports = [
+        Column(f"support_force_{face}", "force", SUPPORT_FORCE.format(face), partial(_support_force, face))
+        for face in held
+        if re.fullmatch(NAME, face)
+    ]
     found = (*shape.columns_on_request, *of_regions, *of_supports)
     return COLUMNS_ON_REQUEST | {column.name: column for column in found}
 
 
-def _of_support(face: str) -> Column:
-    meaning = (
-        f"force by which the support of the face `{face}` pulls the body, along the mean outward normal of the face"
-    )
-    return Column(f"support_force_{face}", "force", meaning, lambda m: m.support_force(face))
+SUPPORT_FORCE = "force by which the support of the face `{}` pulls the body, along the mean outward normal of the face"
+
+
+def _support_force(face: str, m: Any) -> float:
+    return float(m.support_force(face))
 
 
 @dataclass(frozen=True)
@@ -387,8 +391,6 @@ class LoadKind:
         Whether the body's length is an unknown where a scene has it. Elsewhere its column is there on request.
     area
         Of a force: the reference area that carries it, from the shape.
-    doubtful
-        Magnitude from which on a value is hardly meant, and what may have been.
     instead_of
         Name of another load that a scene may have in its place, not beside it.
     of_one_strain
@@ -422,7 +424,6 @@ class LoadKind:
     value: Callable[[Any], float] | None = None
     frees_length: bool = False
     area: Callable[[Any], float] | None = None
-    doubtful: tuple[float, str] | None = None
     instead_of: str = ""
     of_one_strain: bool = False
 
@@ -631,7 +632,7 @@ class Shape(_Is):  # type: ignore[misc]
             lambda: self.depth(domain.mesh.geometry.x),
         )
 
-    def unresolved(self, mesh: Any, columns: Collection[str]) -> list[str]:
+    def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
         """Warn of columns whose values the elements of a mesh do not resolve, a line each.
 
         Parameters
@@ -952,14 +953,14 @@ def homogeneous_bar(
 ) -> reduced.Reduction:
     """The reduction "point" of a body between two faces across z, the same strain everywhere."""
 
-    def build(scene: Any, comm: Any = None) -> Domain:
+    def build(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
         from remodel_fenicsx.body.domain import lattice_domain
 
         shape, length = scene.geometry, scene.geometry.axial_length
         faces = {bottom: lambda x: np.isclose(x[2], 0.0), top: lambda x: np.isclose(x[2], length)}
         degree: int = scene.mesh.degree
         share = np.linspace(0.0, 1.0, degree + 1)[:, None]
-        points = (1.0 - share) * np.array([length, 0.0, 0.0]) + share * np.array([length, 0.0, length])
+        points = length * ([1.0, 0.0, 0.0] + share * [0.0, 0.0, 1.0])
         return lattice_domain(points, [1], degree, faces, shape.name, dimensions(shape), comm)
 
     rules = (reduced.same_cells, reduced.symmetric_law, reduced.homogeneous, reduced.known_loads("point"))

@@ -18,13 +18,12 @@ from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.body.shape import Column, End, LoadKind, check_lengths
 from remodel_fenicsx.body.wall import (
     AngleOf,
-    CONFIGURATIONS,
     RoundWall,
     Wall,
     angle_columns,
     STRESSES,
-    stress_columns,
     check_layers,
+    columns_on_request,
     tube_layers,
 )
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
@@ -47,17 +46,17 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 # ---------------------------------------------------------------- what stands for all of a tube
 
 
-def build_ray(scene: Any, comm: Any = None) -> Domain:
+def build_ray(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The wall on the x axis, as many elements as the body has through it."""
-    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:2], ("inner", "outer"))
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:2])
 
 
-def build_half_plane(scene: Any, comm: Any = None) -> Domain:
+def build_half_plane(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The wall in the half-plane y = 0, x > 0, with the body's elements through the wall and along."""
-    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:], ("bottom", "top", "inner", "outer"))
+    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:])
 
 
-def _in_half_plane(scene: Any, comm: Any, counts: tuple[int, ...], names: tuple[str, ...]) -> Domain:
+def _in_half_plane(scene: reduced.ReducedScene, comm: MPI.Intracomm | None, counts: tuple[int, ...]) -> Domain:
     from remodel_fenicsx.body.domain import lattice_domain
 
     shape, degree = scene.geometry, scene.mesh.degree
@@ -65,24 +64,25 @@ def _in_half_plane(scene: Any, comm: Any, counts: tuple[int, ...], names: tuple[
     along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [np.zeros(1)]
     z, radii = np.meshgrid(*along, wall.nodes(degree), indexing="ij")
     points = np.stack([radii.ravel(), np.zeros(radii.size), z.ravel()], axis=1)
-    places = {
+    faces = {
         "bottom": lambda x: np.isclose(x[2], 0.0, atol=1e-9 * shape.length),
         "top": lambda x: np.isclose(x[2], shape.length),
         "inner": lambda x: np.isclose(x[0], shape.inner_radius),
         "outer": lambda x: np.isclose(x[0], shape.outer_radius),
     }
-    faces = {name: places[name] for name in names}
+    if not counts[1:]:  # a ray has no ends
+        faces = {name: faces[name] for name in ("inner", "outer")}
     return wall.marked(lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm))
 
 
-def build_quarter(scene: Any, comm: Any = None) -> Domain:
+def build_quarter(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The body's elements with x > 0 and y > 0; one layer along z where all sections are alike."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)
     return whole_tube(scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1)
 
 
-def layers(scene: Any) -> int:
+def layers(scene: reduced.ReducedScene) -> int:
     """Elements of a quarter along z: one where nothing but u_z depends on z, which is linear in it."""
     alike = reduced.free_ends(scene) is None and reduced.same_cells(scene) is None
     return 1 if alike else PAPER[2] * scene.mesh.refinement
@@ -115,7 +115,7 @@ def _in_layers(points: Array, elements: Integers) -> reduced.Body:
     return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
 
 
-def springs_across(scene: Any) -> str | None:
+def springs_across(scene: reduced.ReducedScene) -> str | None:
     """Springs along the wall pull its sections out of their planes."""
     for face, support in scene.supports.faces.items():
         if support.tangential:
@@ -123,7 +123,7 @@ def springs_across(scene: Any) -> str | None:
     return None
 
 
-def mirrored_draws(scene: Any) -> str | None:
+def mirrored_draws(scene: reduced.ReducedScene) -> str | None:
     """Random cells of the quarter stand for those of the whole tube in the mean alone, and nearly."""
     if reduced.drawn_once(scene) is None:
         return None
@@ -171,10 +171,7 @@ REDUCTIONS = {
 
 
 def _mean_radius(face: str) -> Callable[[Any], float]:
-    def value(m: Any) -> float:
-        return m.face_mean(face, np.linalg.norm(m.position[:, :2], axis=1), deformed=True)
-
-    return value
+    return lambda m: m.face_mean(face, np.linalg.norm(m.position[:, :2], axis=1), deformed=True)
 
 
 def _mean_hoop_stress(m: Any) -> float:
@@ -188,12 +185,10 @@ def _mean_hoop_stress(m: Any) -> float:
 def _layer_angle(share: float) -> AngleOf:
     """Mean angle over the elements that touch R_i + share (R_o - R_i)."""
 
-    def value(m: Any, angle: Array) -> float:
-        inner, outer = (m.domain.dimensions[f"{side}_radius"] for side in ("inner", "outer"))
-        radius = (1.0 - share) * inner + share * outer
-        return m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius))
+    def radius(dimensions: Mapping[str, float]) -> float:
+        return (1.0 - share) * dimensions["inner_radius"] + share * dimensions["outer_radius"]
 
-    return value
+    return lambda m, angle: m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius(m.domain.dimensions)))
 
 
 THICK_ELEMENTS = 0.2  # inner radii: at 0.25 the radial stress at the face of linear elements is 4 to 5 % off
@@ -341,8 +336,6 @@ class Tube(RoundWall):
             by_case=False,
             of_one_tissue=True,
         ),
-        *itertools.chain.from_iterable(angle_columns(MEANS, name) for name in CONFIGURATIONS),
-        *stress_columns(MEANS),
         Column(
             "mean_hoop_stress",
             "stress",
@@ -355,7 +348,7 @@ class Tube(RoundWall):
             "outer less inner radius",
             lambda m: _mean_radius("outer")(m) - _mean_radius("inner")(m),
         ),
-        *RoundWall.columns_on_request,
+        *columns_on_request(MEANS),
     )
     axis_kinds = ("global", "cylindrical")
     number_of_elements = 1536
@@ -403,7 +396,7 @@ class Tube(RoundWall):
         check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
         return self
 
-    def unresolved(self, mesh: Any, columns: Collection[str]) -> list[str]:
+    def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
         """Warn of stresses at the inner face of linear elements that are thick for its radius."""
         size = (self.outer_radius - self.inner_radius) / _counts(mesh)[1] / self.inner_radius
         at_face = [name for name in columns if name in {f"{component}_stress_inner" for component in STRESSES}]

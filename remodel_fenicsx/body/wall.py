@@ -199,6 +199,12 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ..
     )
 
 
+def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+    """Of a body with these means: angles in other configurations, stresses, and what all walls have."""
+    angles = (angle_columns(means, name) for name in CONFIGURATIONS)
+    return (*itertools.chain(*angles), *stress_columns(means), *Walled.columns_on_request)
+
+
 def _stress(mean: AngleOf, component: int, m: Any) -> float:
     return mean(m, m.wall_stress[..., component])
 

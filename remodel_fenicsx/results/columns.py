@@ -369,7 +369,7 @@ class _LumenVolume:
     def __init__(self, observer: Observer):
         domain, state = observer.domain, observer.state
         self._rims, self._comm, self._size = domain.rims, domain.comm, domain.size  # type: ignore[attr-defined]
-        middle = domain.middle("inner")  # type: ignore[attr-defined]
+        middle = domain.boundary.parts("inner")[0].centre  # type: ignore[attr-defined]
         self._nodes = domain.gather_nodes(domain.mesh.geometry.x - middle)
         self._state = state
         place = ufl.SpatialCoordinate(domain.mesh) - dolfinx.fem.Constant(domain.mesh, middle)
@@ -393,13 +393,11 @@ class _SupportForce:
     """What springs do in a shift along the normal, or what is out of balance at nodes that are held."""
 
     def __init__(self, equilibrium: Equilibrium, face: str):
-        from remodel_fenicsx.body.mesh_faces import NOT_AROUND
-
         self._equilibrium, state = equilibrium, equilibrium.state
         self._unknown, loading = state.unknown, state.loading
         domain: Any = loading.domain  # a `MeshDomain`
         self._comm, potential = domain.comm, loading.supports[face]
-        if min(part.flatness for part in domain.parts if part.name == face) < NOT_AROUND:
+        if domain.boundary.goes_around(face):
             raise SceneError(
                 f"output.columns = 'support_force_{face}': the face goes around the body, so that there is no direction"
             )

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.body.reductions import AUTO, choice, objections, too_many_elements
+from remodel_fenicsx.body.reductions import AUTO, ReducedScene, choice, objections, too_many_elements
 from remodel_fenicsx.body.shape import FromFile, Unloads, WithRegions
 from remodel_fenicsx.body.wall import RoundWall, Walled
 from remodel_fenicsx.fem.formulations import FORMULATIONS
@@ -37,41 +37,24 @@ from remodel_fenicsx.schema.tables import fault, listed, named, quoted, shown
 if TYPE_CHECKING:
     from remodel_fenicsx.body.shape import Column, LoadKind, Shape
     from remodel_fenicsx.schema.settings import (
-        Cells,
-        Load,
         LoadCase,
         Material,
-        Mesh,
-        Model,
         Natural,
         Output,
-        Properties,
-        Region,
-        Remodeling,
-        Solver,
-        Supports,
         Time,
     )
 
 Faults = Iterator[tuple[str, str, object]]
 
 
-class CheckedScene(Protocol):
+class CheckedScene(ReducedScene, Protocol):
     """What rules ask of a scene."""
 
     geometry: Shape
-    mesh: Mesh
-    model: Model
     material: Material
-    cells: Cells
-    supports: Supports
     natural: Natural
-    regions: dict[str, Region]
-    loads: dict[str, Load]
     cases: tuple[LoadCase, ...]
-    remodeling: Remodeling
     time: Time
-    solver: Solver
     output: Output
 
     @property
@@ -86,12 +69,9 @@ class CheckedScene(Protocol):
     def lacking_fields(self) -> dict[str, str]: ...
     @property
     def load_kinds(self) -> dict[str, LoadKind]: ...
-    @property
-    def measured_cells(self) -> dict[str, Cells]: ...
 
     def each_case(self) -> Sequence[CheckedScene]: ...
     def columns(self) -> tuple[Column, ...]: ...
-    def properties(self) -> dict[str, Properties]: ...
 
 
 Rule = Callable[[CheckedScene], Faults]

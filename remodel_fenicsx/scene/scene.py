@@ -114,8 +114,6 @@ def doubts(
         key, kind, value = f"loads.{name}.value", geometry.loads_on(faces_of(loads))[name], load.largest(end)
         if words := convention_doubt(name, value):
             yield f"{key}: {words}"
-        elif kind.doubtful is not None and abs(value) >= kind.doubtful[0]:
-            yield f"{key}: {value:g} at its largest; {kind.doubtful[1]}"
         stress = abs(largest_stress(kind, value, geometry) or 0.0)
         if stress and (way := _beyond(stress / stiffness, LOAD)):
             yield (

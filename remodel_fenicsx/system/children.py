@@ -228,10 +228,11 @@ def read_as_child(reader: str, source: str, found: str, seconds: str, memory: st
         most = int(most) if highest == resource.RLIM_INFINITY else min(int(most), highest)
         resource.setrlimit(limit, (most, most))
     os.environ["OMP_NUM_THREADS"] = "1"
-    module, _, name = reader.partition(":")
+    modules, _, name = reader.partition(":")
     file = f"/proc/self/fd/{source}"
     try:
-        read: Callable[[str], dict[str, Any]] = getattr(importlib.import_module(module), name)
+        last = [importlib.import_module(module) for module in modules.split()][-1]  # libraries it needs come before
+        read: Callable[[str], dict[str, Any]] = getattr(last, name)
         if int(memory) < NO_LIMIT:  # a file of others
             _guard(file)
         arrays = read(file)

@@ -87,7 +87,8 @@ def test_station_is_a_share_of_the_length_of_a_bend() -> None:
 @pytest.mark.parametrize("kind, rms", [("hexahedron", 0.01), ("tetrahedron", 0.6)])
 def test_curved_elements_of_degree_two(kind: str, rms: float) -> None:
     domain = parts.tube(element=kind, degree=2, divisions=(16, 2, 2), length=2.0, comm=MPI.COMM_SELF)
-    made, quadrature = found(domain, 2, inlets=["bottom"], outlets=["top"])
+    domain.faces.update(inlet=domain.faces["bottom"], outlet=domain.faces["top"])
+    made, quadrature = found(domain, 2)
     x, (body, _) = quadrature.coordinates, BODIES["straight"]
     off = apart(made.axes[..., 0, :], body.directions(x)[0])
     assert np.sqrt(quadrature.mean(off**2)) < rms
@@ -126,7 +127,7 @@ def test_two_ranks_give_the_same(cases: Cases) -> None:
 # ---------------------------------------------------------------- forks
 def test_a_fork_has_the_directions_of_its_branches_and_few_points_without() -> None:
     """Three points in the crotch have none of their own; they get those of the nearest point that has some."""
-    made, quadrature = found(fork(35.0, size=0.35), inlets=["inlet"], outlets=["left", "right"])
+    made, quadrature = found(fork(35.0, size=0.35))
     assert made.undefined is not None and made.undefined.any()
     assert quadrature.mean(made.undefined.astype(float)) < 0.1 * MOST_UNDEFINED
     x, axes = quadrature.coordinates, made.axes

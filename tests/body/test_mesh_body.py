@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body import Tube
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_domain import free_motions
+from remodel_fenicsx.body.mesh_faces import Face
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
@@ -116,7 +116,7 @@ def test_element_and_degree_are_those_of_the_file(tmp_path: Path, element: str, 
     domain = scene.geometry.build(scene.mesh, MPI.COMM_SELF)
     assert domain.length() == pytest.approx(LENGTH, rel=1e-3)
     assert domain.mesh.geometry.cmap.degree == degree
-    assert {part.name: round(part.area, 3) for part in domain.parts} == {
+    assert {part.name: round(part.area, 3) for part in domain.boundary.faces} == {
         "inner": 18.369, "outer": 36.738, "inlet": 8.485, "outlet": 8.485
     }  # fmt: skip
 
@@ -145,7 +145,7 @@ SPRINGS = {"kind": "elastic", "stiffness": 1.0}
 ])  # fmt: skip
 def test_every_free_rigid_motion_counts(tube: Path, supports: Any, free: int) -> None:
     scene = scene_of(tube)
-    parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).parts
+    parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).boundary.faces
     chosen = {"inlet": Support(), "outlet": Support()} | {name: Support(**one) for name, one in supports.items()}
     assert free_motions(parts, chosen) == free
 
@@ -154,9 +154,8 @@ def test_every_free_rigid_motion_counts(tube: Path, supports: Any, free: int) ->
 def test_springs_on_one_or_two_facets_hold_a_body(tube: Path, number: int) -> None:
     """Any displacement that is linear in place is held on a triangle; at its middle alone three turns are not."""
     scene = scene_of(tube)
-    parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).parts
-    rows = {name: getattr(parts[0], name)[:number] for name in ("facets", "places", "normals", "corners")}
-    spot = replace(parts[0], name="spot", **rows)
+    parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).boundary.faces
+    spot = Face("spot", parts[0].facets[:number], parts[0].corners[:number])
     assert free_motions([*parts, spot], {"spot": Support(**SPRINGS)}) == 0
 
 

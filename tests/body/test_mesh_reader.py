@@ -103,7 +103,7 @@ def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, ca
     wedges = np.concatenate([np.hstack([triangles + k * size, triangles + (k + 1) * size]) for k in range(2)])
     quads = [
         np.concatenate([np.hstack([rim + k * size, rim[:, ::-1] + (k + 1) * size]) for k in range(2)])
-        for rim, _ in rims(triangles)
+        for rim in rims(triangles)
     ]
     cells = [("wedge", wedges), ("triangle", triangles), ("triangle", triangles + 2 * size)]
     cells += [("quad", quad) for quad in quads]

@@ -1,0 +1,300 @@
+"""Blocks: the unit cube, the paper's first specimen (Fig. 5), and the planar sheet of a biaxial test."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from remodel_fenicsx.body import gmsh_model as model
+from remodel_fenicsx.body.shape import (
+    Column,
+    LoadKind,
+    Shape,
+    axial_dead_force,
+    cauchy_columns,
+    check_lengths,
+    homogeneous_bar,
+    uniaxial_columns,
+)
+from remodel_fenicsx.body.reductions import box
+from remodel_fenicsx.model.cells import angle_to_axis
+from remodel_fenicsx.model.tensors import Array
+from remodel_fenicsx.schema.settings import Mesh
+from remodel_fenicsx.schema.units import FORCE, LENGTH
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from remodel_fenicsx.body.domain import Domain
+    from remodel_fenicsx.body.loading import Loading
+
+
+class Box(Shape):
+    """A block from the origin along x, y and z, which slides on the planes x = y = z = 0."""
+
+    face_names = ("x0", "x1", "y0", "y1", "z0", "z1")
+    _counts: ClassVar[tuple[int, int, int]]
+    reductions = {
+        "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape._lengths)),
+    }
+
+    @property
+    @abstractmethod
+    def sides(self) -> dict[str, float]:
+        """By their keys: along x, y and z, or one for all."""
+
+    @property
+    def _lengths(self) -> list[float]:
+        """Along x, y and z."""
+        return (3 * [*self.sides.values()])[:3]
+
+    @property
+    def axial_length(self) -> float:
+        """Along z."""
+        return self._lengths[2]
+
+    @property
+    def section_area(self) -> float:
+        """Across z."""
+        return self._lengths[0] * self._lengths[1]
+
+    @model_validator(mode="after")
+    def _can_be_meshed(self) -> Box:
+        check_lengths(self, self.sides)
+        return self
+
+    def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+        """So many elements along x, y and z, times the refinement; of the paper's cube one."""
+        return box_domain(self.name, self.sides, self._lengths, self._counts, mesh, comm)
+
+    def hold(self, loading: Loading) -> None:
+        """Symmetry planes x = y = z = 0."""
+        for component, face in enumerate(("x0", "y0", "z0")):
+            loading.hold_face(face, component)
+
+
+class Cube(Box):
+    """A cube, pulled along z: the homogeneous body of the paper's Fig. 5. It slides on the planes x = y = z = 0.
+
+    Its keyword arguments are the keys of `[geometry]`: `side` in the unit `length_unit`, or in any one unit.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> body = parts.Cube(side=2.0)
+    >>> domain = body.build(parts.Mesh(element="hexahedron", degree=1))
+    >>> domain.number_of_elements, sorted(domain.faces)
+    (1, ['x0', 'x1', 'y0', 'y1', 'z0', 'z1'])
+    >>> body.section_area, list(body.loads)
+    (4.0, ['force'])
+    """
+
+    loads = {"force": axial_dead_force("z1")}
+    columns = uniaxial_columns("z1", "side")
+    columns_on_request = cauchy_columns("x", "y", "z")
+    number_of_elements = 1
+    _counts: ClassVar[tuple[int, int, int]] = (1, 1, 1)
+
+    shape: Literal["cube"] = "cube"
+    """Which body it is."""
+    side: Annotated[float, LENGTH] = Field(default=1.0, gt=0)
+    """Length of an edge, in the scene's unit of length."""
+
+    @property
+    def sides(self) -> dict[str, float]:
+        """The one."""
+        return {"side": self.side}
+
+
+SIDES = "xy"
+
+
+def _gradient(row: int, column: int) -> Callable[[Any], float]:
+    """Volume mean of a component of F; of the length from edge to edge where it is on the diagonal."""
+    return lambda m: m.quadrature.mean(m.F[..., row, column])
+
+
+def _nominal(row: int, column: int) -> Callable[[Any], float]:
+    """Volume mean of P = J sigma F^-T."""
+
+    def value(m: Any) -> float:
+        def mean() -> Array:
+            stress = np.linalg.det(m.F)[..., None, None] * m.stress @ np.swapaxes(np.linalg.inv(m.F), -1, -2)
+            return np.array([[m.quadrature.mean(stress[..., i, j]) for j in range(3)] for i in range(3)])
+
+        return float(m.tool_of_step("nominal stress", mean)[row, column])
+
+    return value
+
+
+def _force(side: int) -> LoadKind:
+    axis, other = SIDES[side], SIDES[1 - side]
+    nominal = _nominal(side, side)
+
+    def area(shape: Any) -> float:
+        return float(getattr(shape, f"length_{other}") * shape.thickness)
+
+    return LoadKind(
+        lambda shape, loading, name: loading.add_dead_force(name, f"{axis}1", side, getattr(shape, f"length_{axis}")),
+        f"force along {axis} on the edge {axis} = length_{axis}: given, its direction stays, or what the edge bears",
+        FORCE,
+        value=lambda m: nominal(m) * area(m.observer.shape),
+        reductions=("point",),
+        area=area,
+        instead_of=f"elongation_{axis}",
+    )
+
+
+def _elongation(side: int) -> LoadKind:
+    axis, stretch = SIDES[side], _gradient(side, side)
+    return LoadKind(
+        lambda shape, loading, name: loading.add_prescribed_elongation(
+            name, f"{axis}1", side, getattr(shape, f"length_{axis}")
+        ),
+        f"engineering strain along {axis}: given, or what the sheet comes to",
+        value=lambda m: stretch(m) - 1.0,
+        above=-1.0,
+        reductions=("point",),
+        instead_of=f"force_{axis}",
+    )
+
+
+class Sheet(Box):
+    """A sheet in the plane of x and y, as biaxial tests have it. It slides on the planes x = y = z = 0.
+
+    Along x and along y a force or an elongation may be given, or neither: then the edge is free. Lengths: 1e-6 to 1e6,
+    one up to 10,000 times the other.
+
+    Its keyword arguments are the keys of `[geometry]`: lengths in the unit `length_unit`, or in any one unit.
+
+    Raises
+    ------
+    SceneError
+        If a value is not allowed: one line.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> body = parts.Sheet(length_x=20.0, length_y=10.0, thickness=0.5)
+    >>> list(body.loads)
+    ['force_x', 'force_y', 'elongation_x', 'elongation_y', 'shear']
+    >>> body.loads["force_x"].area(body), body.build(parts.Mesh()).number_of_elements
+    (5.0, 16)
+    """
+
+    loads = {
+        **{f"force_{axis}": _force(side) for side, axis in enumerate(SIDES)},
+        **{f"elongation_{axis}": _elongation(side) for side, axis in enumerate(SIDES)},
+        "shear": LoadKind(
+            lambda shape, loading, name: loading.add_prescribed_shear(name),
+            "shear F_xy of the sheet, by which places move along x with y; F_yx is 0",
+            reductions=("point",),
+            of_one_strain=True,
+        ),
+    }
+    columns = (
+        Column(
+            "fibre_angle",
+            "degrees",
+            "angle between chains and x in the reference body, mean over the volume",
+            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
+            by_case=False,
+        ),
+        Column("thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)),
+        *cauchy_columns("x", "y", "xy"),
+        *(
+            Column(
+                f"nominal_stress_{words}",
+                "stress",
+                f"first Piola-Kirchhoff stress P_{words * (3 - len(words))}, volume mean: along {words[0]} on edges "
+                f"across {words[-1]}",
+                _nominal(*place),
+            )
+            for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)), ("yx", (1, 0)))
+        ),
+    )
+    number_of_elements = 16
+    _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
+    depth_in_words = ("through the sheet", "lower face", "upper face")
+    angle_in_words = ("along x", "across x")
+    buckles = False  # it lies on z = 0
+
+    shape: Literal["sheet"] = "sheet"
+    """Which body it is."""
+    length_x: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
+    """Side along x."""
+    length_y: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
+    """Side along y."""
+    thickness: Annotated[float, LENGTH] = Field(default=1.0, gt=0)
+    """Side along z."""
+
+    @property
+    def sides(self) -> dict[str, float]:
+        """Along x, y and z, by their keys."""
+        return {"length_x": self.length_x, "length_y": self.length_y, "thickness": self.thickness}
+
+    def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
+        """To x."""
+        return angle_to_axis(dimensions, axes, np.array([1.0, 0.0, 0.0]))
+
+
+def box_domain(
+    shape: str,
+    dimensions: dict[str, float],
+    lengths: Sequence[float],
+    counts: Sequence[int],
+    mesh: Mesh,
+    comm: MPI.Intracomm | None = None,
+) -> Domain:
+    """A block from the origin along x, y and z, with the faces x0, x1, y0, y1, z0 and z1, meshed by Gmsh. Collective.
+
+    Parameters
+    ----------
+    shape
+        Name of the shape that it is a mesh of.
+    dimensions
+        The shape's dimensions by name, for `Domain`.
+    lengths
+        Along x, y and z, (3,), in the unit of length.
+    counts
+        Elements along x, y and z with refinement 1.
+    mesh
+        Settings of the elements.
+    comm
+        MPI communicator; default: all ranks.
+
+    Returns
+    -------
+    Domain
+        The mesh with its faces.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx import parts
+    >>> from remodel_fenicsx.extend import box_domain
+    >>> sheet = box_domain("sheet", {"width": 2.0}, (2.0, 2.0, 0.5), (4, 4, 1), parts.Mesh(refinement=2))
+    >>> sheet.number_of_elements, sheet.dimensions
+    (128, {'width': 2.0})
+    """
+    from remodel_fenicsx.body.domain import build_domain
+
+    x, y, z = (mesh.refinement * count for count in counts)
+
+    def draw() -> None:
+        corners = model.points(np.array(lengths[:2]) * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
+        y0, x1, y1, x0 = (model.line(corners[i], corners[(i + 1) % 4], n) for i, n in enumerate((x, y, x, y)))
+        section = model.block([y0, x1, y1, x0], corners, mesh.element)
+        sides = {"x0": x0, "x1": x1, "y0": y0, "y1": y1}
+        model.extrude([section], lengths[2], z, mesh.element, sides, ends=("z0", "z1"))
+        model.raise_degree(mesh.degree, np.zeros_like)
+
+    return build_domain(draw, shape, dimensions, comm)
