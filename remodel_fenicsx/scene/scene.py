@@ -28,7 +28,7 @@ from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue, neo_hookean
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene import presets, rules
+from remodel_fenicsx.scene import presets
 from remodel_fenicsx.schema.settings import (
     AS_GIVEN,
     COUPLINGS,
@@ -223,6 +223,9 @@ def _name(value: object) -> object:
     return value
 
 
+Faults = Iterator[tuple[str, str, object]]  # what a rule says of a scene: what is allowed, the key and its value
+
+
 class Scene(Table):
     """A whole scene: all keys above the first table, and the tables.
 
@@ -255,6 +258,7 @@ class Scene(Table):
     """
 
     renamed: ClassVar[Mapping[str, str]] = RENAMED
+    rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none."""
@@ -327,7 +331,9 @@ class Scene(Table):
         over = partial(Region.over, others=whole.whole())
         regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
         self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
-        rules.check(self)
+        for rule in self.rules:
+            for broken in rule(self):
+                raise fault(*broken)
         return self
 
     @property
