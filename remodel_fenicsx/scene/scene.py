@@ -572,6 +572,13 @@ class Scene(Table):
             "length overshoot in each step; set a shorter time.step or time.tolerance",
         ]
 
+    def _values(self) -> dict[str, Any]:
+        """All of them, from which the same scene can be made."""
+        return self.model_dump(exclude_none=True, exclude=None if self.is_as_run else {"format"})
+
+    def __reduce__(self) -> tuple[object, ...]:  # for other processes: keys of parts are in no class that they find
+        return scene_from_dict, (self._values(),)
+
     def with_values(self, changes: Mapping[str, object]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
 
@@ -582,7 +589,7 @@ class Scene(Table):
         SceneError
             One line: key, value, what is allowed.
         """
-        values = self.model_dump(exclude_none=True, exclude=None if self.is_as_run else {"format"})
+        values = self._values()
         for key, value in changes.items():
             if not isinstance(key, str):
                 raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")

@@ -12,11 +12,11 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Optional
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, create_model, model_validator
 
 from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
@@ -294,10 +294,9 @@ class Prestretch(Table):
     @property
     def stretches(self) -> tuple[float, float, float]:
         """Around, along and across."""
-        given = [self.circumferential, self.axial, self.radial]
-        known = [value for value in given if value is not None]
-        other = float(np.prod(known)) ** (-1 / (3 - len(known))) if len(known) < 3 else 1.0
-        around, along, across = (other if value is None else value for value in given)
+        given = (self.circumferential, self.axial, self.radial)
+        known = math.prod(value for value in given if value is not None)
+        around, along, across = (known ** (-1 / given.count(None)) if value is None else value for value in given)
         return around, along, across
 
 
@@ -362,16 +361,13 @@ class Natural(Table):
 
     @model_validator(mode="after")
     def _layers_lie_apart(self) -> Natural:
-        for index, layer in enumerate(self.layers):
-            for other in self.layers[:index]:
-                same = layer.region is not None and layer.region == other.region
-                if (layer.region is None) != (other.region is None):
-                    raise fault("some layers have a region and some a share of the wall: allowed is one kind",
-                                f"layers[{index}].region", layer.region)  # fmt: skip
-                apart = layer.share[0] >= other.share[1] or layer.share[1] <= other.share[0]
-                if same or (layer.region is None and not apart):
-                    place = layer.region if same else list(layer.share)
-                    raise fault("lies in another layer", f"layers[{index}]", place)
+        for (_, other), (index, layer) in itertools.combinations(enumerate(self.layers), 2):
+            if (layer.region is None) != (other.region is None):
+                rule = "some layers have a region and some a share of the wall: allowed is one kind"
+                raise fault(rule, f"layers[{index}].region", layer.region)
+            meet = layer.share[0] < other.share[1] and other.share[0] < layer.share[1]  # with regions all do
+            if meet and layer.region == other.region:
+                raise fault("lies in another layer", f"layers[{index}]", layer.region or list(layer.share))
         return self
 
 
@@ -778,46 +774,38 @@ class Properties(NamedTuple):
         return self.material.tissue(self.cells.end_to_end_length)
 
 
-def _as_in(table: type[Table], name: str, key: str) -> Any:
-    """A key of another table that may be left out: the value of that table holds then."""
-    field = copy.copy(table.model_fields[name])
-    field.default, field.description = None, f"As `{key}.{name}`, for this region. Default: that of the whole body."
-    return field
+def _for_regions(table: type[Table], key: str, *names: str) -> Any:
+    """A class with some keys of another table, each of which may be left out: the value of that table holds then."""
+    fields: Any = {}
+    for name in names:
+        field = copy.copy(table.model_fields[name])
+        field.default, field.description = None, f"As `{key}.{name}`, for this region. Default: that of the whole body."
+        fields[name] = Optional[field.annotation], field
+    return create_model(f"_Some_{key}", __base__=Table, **fields)
 
 
-class RegionMaterial(Table):
+_SomeMaterial = _for_regions(
+    Material, "material", "lame_lambda", "lame_mu", "chain_density", "contour_length", "persistence_length",
+    "initial_stiffness", "locking_stretch", "temperature", "matrix",
+)  # fmt: skip
+_SomeCells = _for_regions(Cells, "cells", "initial", "fibres", "fibres_sha256", "aligned_axis", "end_to_end_length")
+_SomeRemodeling = _for_regions(Remodeling, "remodeling", "kappa", "half_life")
+
+
+class RegionMaterial(_SomeMaterial):  # type: ignore[misc]
     """Keys of `[material]` that differ in the region. The other keys of `[material]` hold for the whole body.
 
     With `chain_density = 0` the region has no collagen: its angles are empty, and its cells stay. A region that has own
     numbers for a matrix of an extension names `matrix` too.
     """
 
-    lame_lambda: float | None = _as_in(Material, "lame_lambda", "material")
-    lame_mu: float | None = _as_in(Material, "lame_mu", "material")
-    chain_density: float | None = _as_in(Material, "chain_density", "material")
-    contour_length: float | None = _as_in(Material, "contour_length", "material")
-    persistence_length: float | None = _as_in(Material, "persistence_length", "material")
-    initial_stiffness: float | None = _as_in(Material, "initial_stiffness", "material")
-    locking_stretch: float | None = _as_in(Material, "locking_stretch", "material")
-    temperature: float | None = _as_in(Material, "temperature", "material")
-    matrix: str | None = _as_in(Material, "matrix", "material")
 
-
-class RegionCells(Table):
+class RegionCells(_SomeCells):  # type: ignore[misc]
     """Keys of `[cells]` that differ in the region. Axes and seed hold for the whole body."""
 
-    initial: InitialCells | None = _as_in(Cells, "initial", "cells")
-    fibres: str | None = _as_in(Cells, "fibres", "cells")
-    fibres_sha256: str | None = _as_in(Cells, "fibres_sha256", "cells")
-    aligned_axis: int | None = _as_in(Cells, "aligned_axis", "cells")
-    end_to_end_length: float | None = _as_in(Cells, "end_to_end_length", "cells")
 
-
-class RegionRemodeling(Table):
+class RegionRemodeling(_SomeRemodeling):  # type: ignore[misc]
     """Keys of `[remodeling]` that differ in the region. The law holds for the whole body."""
-
-    kappa: float | None = _as_in(Remodeling, "kappa", "remodeling")
-    half_life: float | None = _as_in(Remodeling, "half_life", "remodeling")
 
 
 class Region(Table):
@@ -942,15 +930,11 @@ class OnFace(NamedTuple):
 
 def faces_of(loads: Mapping[str, object]) -> dict[str, OnFace]:
     """Of the further loads among a scene's by name, tables as they were read or as they are."""
-
-    def said(load: object, key: str) -> Any:
-        return load.get(key) if isinstance(load, Mapping) else getattr(load, key, None)
-
-    found = {name: (said(load, "face"), said(load, "kind")) for name, load in loads.items()}
+    tables = {name: dict(load) for name, load in loads.items() if isinstance(load, (Mapping, Load))}
     return {
-        name: OnFace(face, "displacement" if kind == "displacement" else "pressure")
-        for name, (face, kind) in found.items()
-        if isinstance(face, str)
+        name: OnFace(load["face"], "displacement" if load.get("kind") == "displacement" else "pressure")
+        for name, load in tables.items()
+        if isinstance(load.get("face"), str)
     }
 
 

@@ -31,7 +31,7 @@ from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, SchemaV
 from remodel_fenicsx.errors import RemodelError, printable, shortened
 
 if TYPE_CHECKING:
-    from typing import SupportsIndex, TypeGuard
+    from typing import TypeGuard
 
     from pydantic.json_schema import JsonSchemaValue
 
@@ -69,8 +69,6 @@ class Table(BaseModel):
 
     Attributes
     ----------
-    widened
-        Where parts have brought keys: the class without these, and they.
     renamed
         Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
     further
@@ -79,7 +77,6 @@ class Table(BaseModel):
 
     renamed: ClassVar[Mapping[str, str]] = {}
     further: ClassVar[type[BaseModel] | None] = None
-    widened: ClassVar[Any] = None
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -98,11 +95,6 @@ class Table(BaseModel):
         if cls.further is not None:
             table["additionalProperties"] = handler(cls.further.__pydantic_core_schema__)
         return found
-
-    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[object, ...]:
-        if self.widened is None:
-            return super().__reduce_ex__(protocol)
-        return _unpickled, (self.widened, self.__getstate__())
 
     if not TYPE_CHECKING:  # the type checker reads the arguments from the fields
 
@@ -228,17 +220,7 @@ def _widened(table: type[Table], own: tuple[tuple[str, OwnNumber], ...], optiona
         name: (kind, Field(default=None if optional else number.default, gt=number.above, description=number.meaning))
         for name, number in own
     }
-    wide = create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
-    wide.widened = table, own, optional
-    return wide
-
-
-def _unpickled(widened: tuple[type[Table], tuple[tuple[str, OwnNumber], ...], bool], state: dict[str, object]) -> Table:
-    """A table whose class is made, and so has no place from which it could be imported."""
-    kind = _widened(*widened)
-    made = kind.__new__(kind)
-    made.__setstate__(state)
-    return made
+    return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
 
 
 def fault(rule: str, key: str = "", value: object = _MISSING) -> PydanticCustomError:
