@@ -200,7 +200,10 @@ def _parsed(arguments: list[str]) -> argparse.Namespace:
             silence = stack.enter_context(open(os.devnull, "w"))
             stack.enter_context(contextlib.redirect_stdout(silence))
             stack.enter_context(contextlib.redirect_stderr(silence))
-        load_extensions(getattr(first.parse_known_args(arguments)[0], "with"))
+        found, rest = first.parse_known_args(arguments)
+        load_extensions(getattr(found, "with"))
+        if rest[:1] == ["figures"]:
+            raise RemodelError("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8")
         return parser().parse_args(arguments)
 
 
@@ -267,13 +270,12 @@ WITH = f"""
         {EXTENSIONS})."""
 QUIET = "-q --quiet  Show no progress, only warnings."
 RUN_FOLDER = "folder DIR  The folder of a run."
-CHANGES = """
+SCENE_AND_CHANGES = """
+    file SCENE  The scene file (TOML); docs/scene.md lists its keys.
     --set KEY=VALUE*  Change one key of the scene, such as cells.seed=2 or time.end=10. May be
         repeated.
     --profile NAME  Mesh, step and element as measured for speed or accuracy: fast, balanced or
         reference."""
-SCENE_AND_CHANGES = f"""
-    file SCENE  The scene file (TOML); docs/scene.md lists its keys.{CHANGES}"""
 VIEWING = """
     --layers K  Show this many layers: of a tube from the inside, of others from the bottom
         (default: all).

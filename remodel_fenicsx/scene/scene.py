@@ -53,7 +53,7 @@ from remodel_fenicsx.schema.settings import (
     NO_PRESTRETCH,
     faces_of,
 )
-from remodel_fenicsx.schema.conventions import convention_doubt
+from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.tables import (
     IN_A_LIST,
     KeysOfParts,
