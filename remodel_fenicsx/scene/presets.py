@@ -26,9 +26,7 @@ if TYPE_CHECKING:
 
 _DATA = tomllib.loads(Path(__file__).with_name("presets.toml").read_text(encoding="utf-8"))
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
-    name: {
-        shape: merged(merged(_DATA["method"], body), preset["changes"]) for shape, body in _DATA["bodies"].items()
-    }
+    name: {shape: merged(merged(_DATA["method"], body), preset["changes"]) for shape, body in _DATA["bodies"].items()}
     for name, preset in _DATA["presets"].items()
 }
 """Preset name -> shape -> scene keys; they lie under the keys of the scene that names the preset."""
@@ -41,7 +39,7 @@ DEFAULT_LAW = "tensor"
 
 def default_method(values: Mapping[str, object]) -> dict[str, Any]:
     """What lies under the keys of a scene without a preset: the law, and what goes with the law that it has."""
-    is_default = _of(values, "remodeling", "law") in (None, DEFAULT_LAW)
+    is_default = said(values, "remodeling", "law") in (None, DEFAULT_LAW)
     return _DATA["presets"]["consistent"]["changes"] if is_default else {}
 
 
@@ -149,17 +147,17 @@ def parts_of(values: Values) -> Iterator[tuple[str, Values]]:
             yield name, region
 
 
-def with_part(values: Values, name: str, part: Values) -> dict[str, Any]:
-    """The values with what is said of the whole body, or of a region, replaced."""
-    return {**values, **(part if name == "" else {"regions": {**values["regions"], name: part}})}
+def with_part(values: Values, name: str, over: Values) -> dict[str, Any]:
+    """The values with others laid over what is said of the whole body, or of a region."""
+    return merged(values, {"regions": {name: over}} if name else over)
 
 
 def check_exclusive(own: Values) -> None:
     """Refuse a number of an experiment beside what it replaces."""
     for name, part in parts_of(own):
         for experiment in EXPERIMENTS:
-            value, key = _of(part, experiment.table, experiment.key), f"{place_of(name)}{experiment.table}"
-            if value is not None and _of(part, experiment.table, experiment.replaces) is not None:
+            value, key = said(part, experiment.table, experiment.key), f"{place_of(name)}{experiment.table}"
+            if value is not None and said(part, experiment.table, experiment.replaces) is not None:
                 rule = f"{key}.{experiment.replaces} is there too; one of them is enough"
                 raise fault(rule, f"{key}.{experiment.key}", value)
 
@@ -176,7 +174,7 @@ def with_own_numbers(part: S, properties: Callable[[S], Properties]) -> S:
 
 def without_coupling(base: dict[str, Any], over: Mapping[str, object]) -> None:
     """Take out of the values a coupling that extrapolates where what lies over them has a law without a target."""
-    law, coupling = str(_of(over, "remodeling", "law")), str(_of(base, "remodeling", "coupling"))
+    law, coupling = str(said(over, "remodeling", "law")), str(said(base, "remodeling", "coupling"))
     if law in LAWS and LAWS[law].target is None and coupling in COUPLINGS and COUPLINGS[coupling].needs_a_target:
         base["remodeling"] = {key: value for key, value in base["remodeling"].items() if key != "coupling"}
 
@@ -197,6 +195,7 @@ def place_of(name: str) -> str:
     return in_region(name and quoted(str(name)))
 
 
-def _of(part: Values, table: str, key: str) -> object:
+def said(part: Values, table: str, key: str) -> Any:
+    """What is said at a key of a table, as it was read; None where nothing is."""
     keys = part.get(table)
     return keys.get(key) if isinstance(keys, Mapping) else None

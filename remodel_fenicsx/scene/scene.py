@@ -62,6 +62,7 @@ from remodel_fenicsx.schema.tables import (
     Table,
     VariantOf,
     allowed,
+    choices,
     fault,
     is_number,
     quoted,
@@ -71,7 +72,6 @@ from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, 
 from remodel_fenicsx.schema.units import (
     FORCE,
     LENGTH_UNIT,
-    LENGTH_UNITS,
     LARGEST_NUMBER,
     STRESS,
     STRESS_UNIT,
@@ -163,19 +163,13 @@ def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
         )
 
 
-def _doubted_keys(value: Any, key: str = "") -> Iterator[str]:
-    """Yield a line on each number of a table, or list of numbers, that may be in another convention."""
-    if isinstance(value, Mapping):
-        for name, inner in value.items():
-            yield from _doubted_keys(inner, f"{key}.{name}" if key else name)
-        return
-    numbers = value if isinstance(value, (list, tuple)) else [value]
-    if numbers and all(isinstance(number, float) for number in numbers):
-        if words := convention_doubt(key, numbers):
+def _doubted_keys(values: Mapping[str, object]) -> Iterator[str]:
+    """Yield a line on each number of tables, or list of numbers, that may be in another convention."""
+    for key, value in leaves(values):
+        numbers = value if isinstance(value, (list, tuple)) else [value]
+        is_of_numbers = bool(numbers) and all(isinstance(number, float) for number in numbers)
+        if is_of_numbers and (words := convention_doubt(key, numbers)):
             yield f"{key}: {words}"
-    elif numbers is value:
-        for number, item in enumerate(value):
-            yield from _doubted_keys(item, f"{key}[{number}]")
 
 
 def chain_stress(material: Material, end_to_end_length: float) -> float:
@@ -316,7 +310,8 @@ class Scene(Table):
 
         def made(settings: Mapping[str, object]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
-            _check_sizes(values, "")
+            if large := [item for item in leaves(values) if is_number(item[1]) and abs(item[1]) > LARGEST_NUMBER]:
+                raise fault(NUMBER_TOO_LARGE, *large[0])
             with scene_units(_units(values, SHAPES[shape])):
                 return handler(_with_numbers_of_loads(values, SHAPES[shape]))
 
@@ -619,50 +614,39 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
     if written > FORMAT:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
-    return {**_without_columns(_with_turnover(values), COLUMNS_THAT_WENT), "format": FORMAT}
-
-
-def _with_turnover(values: Mapping[str, object]) -> Mapping[str, object]:
-    """Turnover as it was run: none without a time; by tension and without room where 0.3.0 wrote neither."""
-    remodeling: Any = values.get("remodeling")
-    turnover = remodeling.get("turnover") if isinstance(remodeling, Mapping) else None
-    if not isinstance(turnover, Mapping) or "rates" in turnover:
-        return values
-    turned = {"rates": "tension", "volume": 0.0, **turnover} if "time" in turnover else {}
-    return {**values, "remodeling": {**remodeling, "turnover": turned}}
-
-
-def _without_columns(values: Mapping[str, object], names: tuple[str, ...]) -> dict[str, object]:
-    output = values.get("output")
-    if not isinstance(output, Mapping) or not isinstance(asked := output.get("columns"), list | tuple):
-        return dict(values)
-    return {**values, "output": {**output, "columns": [name for name in asked if name not in names]}}
+    values = {**values, "format": FORMAT}
+    turnover, columns = presets.said(values, "remodeling", "turnover"), presets.said(values, "output", "columns")
+    if isinstance(turnover, Mapping) and "time" in turnover:  # as version 0.3.0 ran it, where it does not say
+        values = merged({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
+    if isinstance(columns, list | tuple):
+        values = merged(values, {"output": {"columns": [name for name in columns if name not in COLUMNS_THAT_WENT]}})
+    return values
 
 
 def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
     """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
     for name, part in presets.parts_of(values):
-        cells = part.get("cells")
-        if not isinstance(cells, Mapping) or cells.get("fibres") is None:
-            continue
-        if (said := cells.get("initial", MEASURED_CELLS)) != MEASURED_CELLS:
-            rule = f"{presets.place_of(name)}cells.initial = {shown(said)} is there too; one of them gives the cells"
-            raise fault(rule, f"{presets.place_of(name)}cells.fibres", cells["fibres"])
-        values = presets.with_part(values, name, {**part, "cells": {**cells, "initial": MEASURED_CELLS}})
+        fibres, initial = (presets.said(part, "cells", key) for key in ("fibres", "initial"))
+        if fibres is not None and initial not in (None, MEASURED_CELLS):
+            place = f"{presets.place_of(name)}cells"
+            raise fault(
+                f"{place}.initial = {shown(initial)} is there too; one of them gives the cells",
+                f"{place}.fibres",
+                fibres,
+            )
+        if fibres is not None:
+            values = presets.with_part(values, name, {"cells": {"initial": MEASURED_CELLS}})
     return values
 
 
 def _beside(values: dict[str, object], folder: Path) -> dict[str, object]:
     """The keys of a file in this folder, with the places of the files that they name."""
     for name, part in presets.parts_of(values):
-        cells = part.get("cells")
-        if isinstance(cells, Mapping) and isinstance(file := cells.get("fibres"), str):
-            values = presets.with_part(
-                values, name, {**part, "cells": {**cells, "fibres": str(folder.absolute() / file)}}
-            )
-    geometry = values.get("geometry")
-    if isinstance(geometry, Mapping) and isinstance(kind := geometry.get("shape"), str) and kind in SHAPES:
-        values = {**values, "geometry": SHAPES[kind].with_files_from(geometry, folder)}
+        if isinstance(file := presets.said(part, "cells", "fibres"), str):
+            values = presets.with_part(values, name, {"cells": {"fibres": str(folder.absolute() / file)}})
+    kind = presets.said(values, "geometry", "shape")
+    if isinstance(kind, str) and kind in SHAPES:
+        values = {**values, "geometry": SHAPES[kind].with_files_from(values["geometry"], folder)}
     return values
 
 
@@ -672,22 +656,13 @@ def _words(region: str) -> str:
 
 def _follow(values: dict[str, Any], changed: Mapping[str, object], is_whole: bool) -> None:
     """Take out what no longer fits to changed values; of a scene that has all values, a choice may be the run's own."""
-    tables = (values.get("output"), "times"), (values.get("time"), "end")
-    times, end = (table.get(key) if isinstance(table, dict) else None for table, key in tables)
+    times, end = presets.said(values, "output", "times"), presets.said(values, "time", "end")
     if "time.end" in changed and "output.times" not in changed and is_number(end) and isinstance(times, list | tuple):
         values["output"]["times"] = [time for time in times if not is_number(time) or time <= end]
         if (dropped := len(times) - len(values["output"]["times"])) and is_first_rank():
             log.warning("output.times: %d after time.end = %g dropped", dropped, end)
     if is_whole:
         presets.without_replaced(values, changed)
-
-
-def _check_sizes(value: object, key: str) -> None:
-    if isinstance(value, Mapping):
-        for name, inner in value.items():
-            _check_sizes(inner, f"{key}.{name}" if key else str(name))
-    elif is_number(value) and abs(value) > LARGEST_NUMBER:
-        raise fault(NUMBER_TOO_LARGE, key, value)
 
 
 def _check_name(key: str, name: object, names: Iterable[str]) -> None:
@@ -708,12 +683,12 @@ def _known_shape(geometry: object) -> str:
 def _units(values: Mapping[str, object], shape: type[Shape]) -> dict[str, str | None]:
     """The units that a scene chooses, by their keys."""
     units: dict[str, str | None] = {}
-    for key, table, known in ((STRESS_UNIT, Material, tuple(STRESS_UNITS)), (LENGTH_UNIT, shape, LENGTH_UNITS)):
-        table_name, name = key.split(".")
-        chosen, field = values.get(table_name), table.model_fields[name]
-        units[key] = chosen.get(name, field.default) if isinstance(chosen, Mapping) else field.default
-        if units[key] not in (*known, None):
-            raise fault(allowed(field), key, units[key])
+    for key, kind in ((STRESS_UNIT, Material), (LENGTH_UNIT, shape)):
+        table, name = key.split(".")
+        field, chosen = kind.model_fields[name], presets.said(values, table, name)
+        if chosen not in (*choices(field), None):
+            raise fault(allowed(field), key, chosen)
+        units[key] = field.default if chosen is None else chosen
     return units
 
 
@@ -917,13 +892,15 @@ def _ramp_times(load: Load | None) -> list[float]:
     return [] if load is None else [time for time, _ in load.ramp]
 
 
-def leaves(table: Mapping[str, object], free: Sequence[str], key: str = "") -> Iterator[tuple[str, object]]:
-    """(dotted key, value) of all values but those that are free."""
-    for name, value in table.items():
-        path = f"{key}.{name}" if key else name
-        if path in free or path.endswith("cells.fibres"):  # the SHA-256 beside it must stay
-            continue
-        if isinstance(value, Mapping):
-            yield from leaves(value, free, path)
-        else:
-            yield path, value
+def leaves(value: object, free: Sequence[str] = (), key: str = "") -> Iterator[tuple[str, object]]:
+    """(dotted key, value) of all values in tables and lists of tables, but those that are free."""
+    if key in free or key.endswith("cells.fibres"):  # the SHA-256 beside it must stay
+        return
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from leaves(inner, free, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)) and any(isinstance(entry, Mapping) for entry in value):
+        for number, inner in enumerate(value):
+            yield from leaves(inner, free, f"{key}[{number}]")
+    else:
+        yield key, value

@@ -222,7 +222,7 @@ class Material(Table):
     """Repulsive energy, which makes the reference state free of stress. 'axes': the paper's, in the stretches along the
     cell axes. 'log': of the structure tensor alone (A : ln C); the default with the law 'tensor'. 'length': of the
     length of the chains alone."""
-    stress_unit: Literal["Pa", "kPa", "MPa"] = "Pa"
+    stress_unit: Annotated[str, OneOf(STRESS_UNITS)] = "Pa"
     """Unit of every stress of the scene. Forces are in this unit times the unit of length squared."""
 
     @property

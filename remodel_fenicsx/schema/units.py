@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,25 +22,25 @@ from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from remodel_fenicsx.schema.tables import fault, shown
+from remodel_fenicsx.schema.tables import OneOf, fault, shown
 
 if TYPE_CHECKING:  # it takes half a second to start, and most scenes have no units
     from pydantic.json_schema import JsonSchemaValue
     import pint
 
 STRESS_UNIT, LENGTH_UNIT = "material.stress_unit", "geometry.length_unit"
-_LENGTH_UNITS = Literal["m", "cm", "mm", "um"]
-LENGTH_UNITS: tuple[str, ...] = get_args(_LENGTH_UNITS)
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+LENGTH_UNITS = tuple(METRES)
 LARGEST_NUMBER = 1e60  # products of four are no overflow
 NUMBER_TOO_LARGE = f"too large a number; must be at most {LARGEST_NUMBER:g}"
 _UNITS: ContextVar[Mapping[str, str | None] | None] = ContextVar(
     "units", default=None
 )  # of the scene that is validated
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
 # the type of geometry.length_unit, for every shape
 LengthUnit = Annotated[
-    _LENGTH_UNITS | None,
+    str | None,
+    OneOf(METRES),
     Field(
         description="Unit of every length of the scene. It is needed only where lengths or forces are given with "
         "units; without it lengths are in any one unit.",
