@@ -115,7 +115,6 @@ if TYPE_CHECKING:
     from remodel_fenicsx.evolution.coupling import Coupling as Coupling, Staggered as Staggered, Traits as Traits
     from remodel_fenicsx.fem.jit import form as form
     from remodel_fenicsx.results.columns import Measurement as Measurement
-    from remodel_fenicsx.scene.reference import markdown_reference as markdown_reference
     from remodel_fenicsx.solver.linear import EveryTangent as EveryTangent
     from remodel_fenicsx.evolution.stepper import WarnsOnce as WarnsOnce
 
@@ -125,7 +124,6 @@ _LATE = {
     "Measurement": "results.columns",
     "WarnsOnce": "evolution.stepper",
     "form": "fem.jit",
-    "markdown_reference": "scene.reference",
 }
 __getattr__ = on_demand(__name__, _LATE)
 if not TYPE_CHECKING:  # type checkers go by the imports
