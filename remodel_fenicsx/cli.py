@@ -139,7 +139,7 @@ def _add(found: argparse.ArgumentParser, *usage: str) -> None:
         else:
             kind = value.rstrip("!?+*")
             settings |= {"default": default or None, "type": KINDS.get(kind, str)} | MARKS[value[len(kind) :]]
-            settings |= {"choices": kind.split("|")} if "|" in kind else {"metavar": kind}
+            settings["choices" if "|" in kind else "metavar"] = kind.split("|") if "|" in kind else kind
         found.add_argument(*names, **settings)
 
 
@@ -451,7 +451,9 @@ def _wall(options: argparse.Namespace) -> None:
 
     path = options.output or options.surface.with_suffix(".msh")
     with _stopping("nothing is written"):
-        lines = write_wall(options.surface, path, options.thickness, options.layers or (), options.size, options.through)
+        lines = write_wall(
+            options.surface, path, options.thickness, options.layers or (), options.size, options.through
+        )
     _say("\n".join(lines))
 
 

@@ -784,12 +784,14 @@ def _for_regions(table: type[Table], key: str, *names: str) -> Any:
     return create_model(f"_Some_{key}", __base__=Table, **fields)
 
 
-_SomeMaterial = _for_regions(
+_SomeMaterial: Any = _for_regions(
     Material, "material", "lame_lambda", "lame_mu", "chain_density", "contour_length", "persistence_length",
     "initial_stiffness", "locking_stretch", "temperature", "matrix",
 )  # fmt: skip
-_SomeCells = _for_regions(Cells, "cells", "initial", "fibres", "fibres_sha256", "aligned_axis", "end_to_end_length")
-_SomeRemodeling = _for_regions(Remodeling, "remodeling", "kappa", "half_life")
+_SomeCells: Any = _for_regions(
+    Cells, "cells", "initial", "fibres", "fibres_sha256", "aligned_axis", "end_to_end_length"
+)
+_SomeRemodeling: Any = _for_regions(Remodeling, "remodeling", "kappa", "half_life")
 
 
 class RegionMaterial(_SomeMaterial):  # type: ignore[misc]
