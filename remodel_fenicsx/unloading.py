@@ -265,8 +265,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
             raise ArithmeticError("elements would turn inside out")
         domain = shared(lambda: (moved, shape.boundary(moved), regions or {}), comm)
         with unsaid(), contextlib.closing(Simulation(as_unloaded, comm, domain)) as simulation:
-            offset: Array = _missed(simulation, given, share) / extent
-        return offset
+            return np.divide(_missed(simulation, given, share), extent, dtype=np.float64)
 
     places, runs = found_unloaded(lambda _: given, missed, LEAST_MOVE, said, extent)
     path = folder / UNLOADED_MESH

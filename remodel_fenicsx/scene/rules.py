@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
 
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.reductions import AUTO, choice, objections, too_many_elements
@@ -20,7 +19,7 @@ from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
-from remodel_fenicsx.scene.scene import Faults, Scene
+from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.settings import (
     AT_REST,
     COUPLINGS,
@@ -32,7 +31,7 @@ from remodel_fenicsx.schema.settings import (
     in_region,
     laws_with_a_target,
 )
-from remodel_fenicsx.schema.tables import listed, named, quoted, shown
+from remodel_fenicsx.schema.tables import Faults, listed, named, quoted, shown
 
 
 def _shapes(kind: type, mark: str = ", ") -> str:

@@ -55,6 +55,7 @@ from remodel_fenicsx.schema.settings import (
 )
 from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.tables import (
+    Faults,
     IN_A_LIST,
     KeysOfParts,
     OneOf,
@@ -217,9 +218,6 @@ def _name(value: object) -> object:
     return value
 
 
-Faults = Iterator[tuple[str, str, object]]  # what a rule says of a scene: what is allowed, the key and its value
-
-
 class Scene(Table):
     """A whole scene: all keys above the first table, and the tables.
 
@@ -320,16 +318,14 @@ class Scene(Table):
         _check_name("profile", profile, presets.PROFILES)
         return _with_profile(profile, made)
 
-    @model_validator(mode="after")
-    def _tables_fit_together(self) -> Scene:
+    def faults(self) -> Faults:
+        """What its tables do not bear of each other, once numbers of experiments are those of the model."""
         whole = presets.with_own_numbers(self, Scene.whole)
         over = partial(Region.over, others=whole.whole())
         regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
         self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
         for rule in self.rules:
-            for broken in rule(self):
-                raise fault(*broken)
-        return self
+            yield from rule(self)
 
     @property
     def _stiffness_ratio(self) -> float:

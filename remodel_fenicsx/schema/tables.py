@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import NoneType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -24,6 +24,7 @@ from pydantic import (
     GetJsonSchemaHandler,
     ValidationError,
     create_model,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, SchemaValidator, core_schema
@@ -39,6 +40,7 @@ LONGEST_VALUE = 60  # characters of a value in an error
 # annotation of a tuple: what is a list in TOML becomes one
 IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
+Faults = Iterator[tuple[str, str, object]]  # what is allowed, a key, and its value; the first is told
 T = TypeVar("T")
 
 
@@ -82,6 +84,16 @@ class Table(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
+    def faults(self) -> Faults:
+        """What does not fit together in its keys: what is allowed, the key and its value."""
+        yield from ()
+
+    @model_validator(mode="after")
+    def _has_none(self) -> Self:
+        for broken in self.faults():
+            raise fault(*broken)
+        return self
+
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """With the meaning of each key, and without what scripts alone need."""
@@ -123,8 +135,19 @@ def _of_python(value: Any) -> object:
     return type(value)(map(_of_python, value)) if type(value) in (list, tuple) else value
 
 
+class Before:
+    """An annotation of a field whose values are looked at first."""
+
+    def __get_pydantic_core_schema__(self, source: type, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(functools.partial(self.seen, source), handler(source))
+
+    def seen(self, source: type, value: object) -> object:
+        """The value to take in place of one of a field of this type."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class OneOf:
+class OneOf(Before):
     """Annotation of a field whose value is one of a registry's keys, those registered later included."""
 
     registry: Collection[object]
@@ -136,29 +159,24 @@ class OneOf:
         """All that is allowed."""
         return [*self.also, *(name for name in self.registry if name not in (self.removed or ()))]
 
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(self._check, handler(source))
-
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"enum": self.choices}
 
-    def _check(self, value: Any) -> object:
-        if self.removed and value in self.removed and value not in self.registry:
-            raise fault(self.removed[value])
+    def seen(self, source: type, value: object) -> object:
+        """The value, if it is one of those."""
+        if isinstance(value, str) and value in (self.removed or ()) and value not in self.registry:
+            raise fault((self.removed or {})[value])
         if value is not None and value not in (*self.also, *self.registry):
             raise ValueError("not registered")
         return value
 
 
 @dataclass(frozen=True)
-class VariantOf:
+class VariantOf(Before):
     """Annotation of a field that is one of several tables, those registered later included."""
 
     registry: Mapping[str, type[BaseModel]]
     tag: str
-
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(self._table, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """The keys of any variant, which an editor completes, and those that each has."""
@@ -171,7 +189,8 @@ class VariantOf:
         known[self.tag]["enum"] = list(self.registry)
         return {"type": "object", "properties": known, "required": [self.tag], "allOf": chosen}
 
-    def _table(self, value: object) -> object:
+    def seen(self, source: type, value: object) -> object:
+        """The table of the variant that a table names."""
         if not isinstance(value, Mapping):
             return value
         name = value[self.tag]
@@ -188,16 +207,15 @@ class OwnNumber(Protocol):
 
 
 @dataclass(frozen=True)
-class KeysOfParts:
+class KeysOfParts(Before):
     """Annotation of a field that is a table: with the keys too that the parts chosen in it bring (`parameters`)."""
 
     registries: Mapping[str, Mapping[str, object]]  # by the key that names the part
     optional: bool = False  # whether the keys may be left out, as those of regions
 
-    def __get_pydantic_core_schema__(self, source: type[Table], handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(functools.partial(self._table, source), handler(source))
-
-    def _table(self, table: type[Table], value: object) -> object:
+    def seen(self, source: type, value: object) -> object:
+        """The table with the keys of its parts."""
+        table: type[Table] = source
         if not isinstance(value, Mapping):
             return value
         chosen = {key: value.get(key, table.model_fields[key].default) for key in self.registries}

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from remodel_fenicsx.errors import UnreadableFile, printable
-from remodel_fenicsx.schema.tables import SceneError, description, listed, quoted, shown
+from remodel_fenicsx.schema.tables import SceneError, listed, quoted, shown
 from remodel_fenicsx.schema.units import is_quantity
 from remodel_fenicsx.system.files import read_regular
 
@@ -126,25 +126,27 @@ def _lines(table: BaseModel | Mapping[str, object], place: str = "") -> Iterator
     """The lines of a table: TOML wants its own values before the tables in it."""
     fields = type(table).model_fields if isinstance(table, BaseModel) else {}
     inside: list[tuple[str, Any]] = []
-    for name, value in dict(table).items():
+    entries: dict[str, Any] = dict(table)
+    for name, value in entries.items():
         if isinstance(value, (BaseModel, dict)):
             inside.append((f"[{place}{quoted(name)}]", value))
         elif isinstance(value, tuple) and value and isinstance(value[0], BaseModel):
             inside += [(f"[[{place}{quoted(name)}]]", entry) for entry in value]
         elif value is not None:
-            yield from _wrapped(description(type(table), name) if name in fields else "")
+            yield from _wrapped((name in fields and fields[name].description) or "")
             yield f"{quoted(name)} = {tomlkit.item(value).as_string()}"
     for head, value in inside:
         lines = [*_lines(value, head.strip("[]") + ".")]
+        if fields and not lines:  # an empty table says nothing, but a name does
+            continue
         if isinstance(value, BaseModel) or lines[:1] != [""]:  # the tables in a plain one say that it is there
-            lines = ["", head, *lines]
-        if lines[2:] or not fields:  # an empty table says nothing, but a name does
-            yield from lines
+            yield from ("", head)
+        yield from lines
 
 
 @functools.cache
 def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, COMMENT_WIDTH + 2, initial_indent="# ", subsequent_indent="# ")
+    return textwrap.wrap(" ".join(text.split()), COMMENT_WIDTH + 2, initial_indent="# ", subsequent_indent="# ")
 
 
 # ---------------------------------------------------------------- tables of numbers

@@ -105,7 +105,7 @@ def _bar(title: str, total: int | None, done: float) -> RichProgress:
         refresh_per_second=4,
         redirect_stdout=sys.stdout.isatty(),
     )
-    found.add_task(title, total=total, completed=done, count="", state="starting", left="")
+    found.update(found.add_task(title, total=total, count="", state="starting", left=""), completed=done)
     return found
 
 
