@@ -515,7 +515,8 @@ def _unload(options: argparse.Namespace) -> None:
         raise scenes.SceneError("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'")
     place = options.output or Path(f"{options.scene.name}-unloaded")
     with _stopping("nothing is written"):
-        _say(f"{write_unloaded(options.scene, place)}\nscene of the unloaded body in {place / 'scene.toml'}")
+        write_unloaded(options.scene, place)
+    _say(f"scene of the unloaded body in {place / 'scene.toml'}")
 
 
 @command(

@@ -368,33 +368,22 @@ class _Report(Watcher):
 # The scene of an unloaded body, and local axes on the mesh.
 
 
-def write_unloaded(scene: Scene, folder: Path) -> str:
-    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found."""
+def write_unloaded(scene: Scene, folder: Path) -> None:
+    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one."""
     part = part_of(folder)
-    with RunLock(part):
+    with RunLock(part), hold_log(quiet=False):
         try:
             if folder.exists():
                 raise TakenError(folder, "folder")
             with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
-                found = unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False)
-                kept, files = with_files_kept(found)
-                for name, data in files.items():
-                    (part / name).write_bytes(data)
-                (part / SCENE).write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
-                (part / LOCK).unlink()
-                part.rename(folder)
-                return "unloaded: " + _in_words(scene, found)
+                kept, files = with_files_kept(unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False))
+            for name, data in files.items():
+                (part / name).write_bytes(data)
+            (part / SCENE).write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
+            (part / LOCK).unlink()
+            part.rename(folder)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-
-
-def _in_words(scene: Scene, found: Scene) -> str:
-    numbers, known = found.geometry.model_dump().items(), scene.geometry.model_dump()
-    words = [f"{name} {n:.6g} (loaded {known[name]:.6g})" for name, n in numbers if isinstance(n, float)]
-    if words:
-        return ", ".join(words)
-    before, after = (one.geometry.checked(one.mesh)[0].points for one in (scene, found))  # type: ignore[attr-defined]
-    return f"{len(after)} nodes, moved by {np.linalg.norm(after - before, axis=1).max():.6g} at most"
 
 
 def write_axes(scene: Scene, path: Path) -> str:

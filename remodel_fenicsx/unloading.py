@@ -26,6 +26,7 @@ from remodel_fenicsx.scene.scene import Scene, SceneError, too_soft
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.system.terminal import Line, unsaid
 
 log = logging.getLogger(__name__)
@@ -185,7 +186,7 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
     numbers, runs = found_unloaded(lambda share: np.log(_inverse(scene, given, share)), missed, LOADED_AGAIN, said)
     found = np.exp(numbers)
     unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
-    log.info("unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
+    log.log(NOTICE, "unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
     return _with_numbers(scene, found)
 
 
@@ -272,7 +273,8 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
     if file is not None:
         path.write_text(gmsh_text(places, file.blocks, file.names), encoding="ascii")
     comm.barrier()
-    log.info("unloaded: %s, found in %d iterations", UNLOADED_MESH, runs)
+    moved = np.linalg.norm(places - given, axis=1).max()
+    log.log(NOTICE, "unloaded: %d nodes, moved by %.6g at most, found in %d iterations", len(places), moved, runs)
     changes: dict[str, object] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
     changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
     if shape.regions:

@@ -50,7 +50,7 @@ from remodel_fenicsx.schema.settings import (
     Solver,
     Supports,
     Time,
-    NO_PRESTRETCH,
+    UNLOADED,
     faces_of,
 )
 from remodel_fenicsx.schema.units import convention_doubt
@@ -199,8 +199,6 @@ def _times(ratio: float) -> str:
 
 PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}  # which may bring keys of [material]
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
-RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
-"""Dotted key of an earlier format -> the key that has taken its place, for the error."""
 COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
 MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
 SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
@@ -249,7 +247,6 @@ class Scene(Table):
     remodel_fenicsx.schema.tables.SceneError: remodeling.kappa = -1.0: must be a finite number at least 0
     """
 
-    renamed: ClassVar[Mapping[str, str]] = RENAMED
     rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
@@ -472,15 +469,16 @@ class Scene(Table):
     @property
     def lacking_fields(self) -> dict[str, str]:
         """Fields that the body has not, each with the reason."""
-        found = {} if self.regions else {REGION: "the scene has no regions"}
-        same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
-        found |= dict.fromkeys(NO_PRESTRETCH, same) if self.natural.is_of_the_mesh else {}
-        if self.remodeling.turnover.grows:
-            found.pop(NATURAL_GRADIENT, None)
-        stays = "it changes only with remodeling.turnover, which is not set"
-        found |= {} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays)
-        room = "tissue grows only with a remodeling.turnover.volume above 0"
-        return found | ({} if self.remodeling.turnover.grows else {GROWTH: room})
+        turnover, same = self.remodeling.turnover, self.natural.is_of_the_mesh
+        stress_free = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
+        reasons: list[tuple[bool, Sequence[str], str]] = [
+            (not self.regions, (REGION,), "the scene has no regions"),
+            (same, (UNLOADED,), stress_free),
+            (same and not turnover.grows, (NATURAL_GRADIENT,), stress_free),
+            (not turnover.is_on, TURNED_OVER, "it changes only with remodeling.turnover, which is not set"),
+            (not turnover.grows, (GROWTH,), "tissue grows only with a remodeling.turnover.volume above 0"),
+        ]
+        return {name: reason for lacks, names, reason in reasons if lacks for name in names}
 
     @property
     def has_free_length(self) -> bool:
@@ -538,30 +536,26 @@ class Scene(Table):
             f"loads rise and afterwards, so rows have another one; {way}"
         ]
 
-    def _of_turnover(self) -> list[str]:
+    def _of_turnover(self) -> Iterator[str]:
         """Gains that do not rest, or slowly; explicit steps longer than its time, in which content overshoots."""
-        turnover, step, found = self.remodeling.turnover, self.time.step, dict[str, None]()
-        if not turnover.is_on:
-            return []
+        turnover, step = self.remodeling.turnover, self.time.step
+        if turnover.time is None:
+            return
         for name, properties in self.properties().items():
             power, slowly = turnover.rule.rest(properties.tissue)
             says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
-            least = 2 * turnover.gain / power if turnover.gain else math.inf
             if power <= 2:
-                found[
-                    f"{says}: does not come to rest with this deposition_stretch; rest needs more than {least:.3g}"
-                ] = None
+                least = 2 * turnover.gain / power if turnover.gain else math.inf
+                yield f"{says}: does not come to rest with this deposition_stretch; rest needs more than {least:.3g}"
             elif power < SLOW_REST:
                 words = "by a factor of e where collagen alone bears the loads, and sooner with a matrix"
-                found[f"{says}: comes to rest slowly, in a time of {slowly:.3g} {words}"] = None
+                yield f"{says}: comes to rest slowly, in a time of {slowly:.3g} {words}"
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
-        if chosen or COUPLINGS[self.remodeling.coupling].solves_cells or step <= (turnover.time or math.inf):
-            return [*found]
-        return [
-            *found,
-            f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
-            "length overshoot in each step; set a shorter time.step or time.tolerance",
-        ]
+        if not chosen and not COUPLINGS[self.remodeling.coupling].solves_cells and step > turnover.time:
+            yield (
+                f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and "
+                "natural length overshoot in each step; set a shorter time.step or time.tolerance"
+            )
 
     def _values(self) -> dict[str, Any]:
         """All of them, from which the same scene can be made."""
@@ -710,8 +704,7 @@ def _check_load_names(shape: str, loads: object) -> None:
             _check_load_on_face(kind, str(name), load)
         elif name not in names:
             key, listed = f"loads.{quoted(str(name))}", ", ".join(f"loads.{known}" for known in names)
-            rule = f"is now {RENAMED[key]}" if key in RENAMED else f"a {shape} has no such load; allowed: {listed}"
-            raise fault(rule, key, load)
+            raise fault(f"a {shape} has no such load; allowed: {listed}", key, load)
 
 
 def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object]) -> None:

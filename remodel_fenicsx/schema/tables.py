@@ -71,14 +71,11 @@ class Table(BaseModel):
 
     Attributes
     ----------
-    renamed
-        Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
     further
         Class of tables that may be there under any name beside the fields; None: there are none.
     """
 
-    renamed: ClassVar[Mapping[str, str]] = {}
-    further: ClassVar[type[BaseModel] | None] = None
+    further: ClassVar[type[Table] | None] = None
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -175,7 +172,7 @@ class OneOf(Before):
 class VariantOf(Before):
     """Annotation of a field that is one of several tables, those registered later included."""
 
-    registry: Mapping[str, type[BaseModel]]
+    registry: Mapping[str, type[Table]]
     tag: str
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -268,7 +265,7 @@ def is_number(value: object) -> TypeGuard[float]:
 # ---------------------------------------------------------------- one line for an error
 
 
-def one_line(error: ValidationError, table: type[BaseModel]) -> str:
+def one_line(error: ValidationError, table: type[Table]) -> str:
     """`key = value: what is allowed` of the first fault, with the number of further ones."""
     faults: dict[str, ErrorDetails] = {}  # where several kinds of values are allowed there is one for each kind
     for detail in sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden"):
@@ -282,7 +279,7 @@ def one_line(error: ValidationError, table: type[BaseModel]) -> str:
     return f"{text} (and {more} more fault{'s' if more > 1 else ''})" if more else text
 
 
-def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
+def _describe(detail: ErrorDetails, table: type[Table]) -> str:
     key, owner, field = locate(table, detail["loc"])
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "fault":
@@ -292,17 +289,15 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
     if kind == "worded":
         return _joined(key, context["text"])
     if kind == "extra_forbidden":
-        renamed: Mapping[str, str] = getattr(table, "renamed", {})
-        rule = f"is now {renamed[key]}" if key in renamed else f"unknown key; {_suggestion(key, owner, table)}"
-        return f"{key} = {shown(value)}: {rule}"
+        return f"{key} = {shown(value)}: unknown key; {_suggestion(key, owner, table)}"
     rule = detail["msg"] if field is None else allowed(field)
     return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {shown(value)}: {rule}"
 
 
-def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel], FieldInfo | None]:
+def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, type[Table], FieldInfo | None]:
     """Dotted key of a place in a table, the table class that owns it, and its field (None where there is none)."""
     key, owner, field = "", table, None
-    inside: type[BaseModel] | None = table  # the table of which the next item is a key
+    inside: type[Table] | None = table  # the table of which the next item is a key
     items = list(location)
     while items:
         item = items.pop(0)
@@ -314,7 +309,7 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
             continue
         key, owner, field = _joined(key, _step(item)), inside, inside.model_fields.get(str(item))
         if field is None:
-            inside = free_names(owner)
+            inside = owner.further
             if inside is not None:
                 owner, field = inside, FieldInfo.from_annotation(inside)
             continue
@@ -369,13 +364,13 @@ def _nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
     return difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
 
 
-def _nearest_key(key: str, owner: type[BaseModel]) -> str:
+def _nearest_key(key: str, owner: type[Table]) -> str:
     """The key of the same table that is most like an unknown one, or nothing."""
     parent, _, name = key.rpartition(".")
     return "".join(_joined(parent, near) for near in _nearest(name, owner.model_fields))
 
 
-def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str:
+def _suggestion(key: str, owner: type[Table], table: type[Table]) -> str:
     """The nearest key of the same table, else a key of the same name in another one, else all keys of the table."""
     parent, _, name = key.rpartition(".")
     if near := _nearest_key(key, owner):
@@ -390,14 +385,9 @@ def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str
 # ---------------------------------------------------------------- what a field allows
 
 
-def is_table(annotation: object) -> bool:
+def is_table(annotation: object) -> TypeGuard[type[Table]]:
     """Whether an annotation is a table class."""
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def free_names(table: object) -> type[BaseModel] | None:
-    """The class of the tables that a table may have under any name beside its fields, or None."""
-    return getattr(table, "further", None)
+    return isinstance(annotation, type) and issubclass(annotation, Table)
 
 
 def variant_of_field(field: FieldInfo) -> VariantOf | None:
@@ -438,7 +428,7 @@ def allowed(field: FieldInfo) -> str:
     return " ".join(filter(None, [f"must be {nouns[_kind(field)]}", " and ".join(bounds)]))
 
 
-def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[BaseModel]]]:
+def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[Table]]]:
     """Of a field: what stands after its key for a table in it, the variant, the class; NAME stands for a free name."""
     if several := variant_of_field(field):
         yield from (("", tag, kind) for tag, kind in several.registry.items())
@@ -447,10 +437,10 @@ def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[BaseModel]]]:
     yield from ((suffix, "", kind) for kind in (field.annotation, *get_args(field.annotation)) if is_table(kind))
 
 
-def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[BaseModel]]]:
+def sections(table: type[Table], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[Table]]]:
     """(dotted key, variant, class) of a table and of all tables in it; NAME stands for a free name."""
     yield key, variant, table
-    if (kind := free_names(table)) is not None:
+    if (kind := table.further) is not None:
         yield from sections(kind, _joined(key, "NAME"))
     for name, field in table.model_fields.items():
         for suffix, tag, inner in tables_in(field):
@@ -460,11 +450,11 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
 # ---------------------------------------------------------------- documentation
 
 
-def description(table: type[BaseModel], name: str) -> str:
+def description(table: type[Table], name: str) -> str:
     """What a field means, on one line."""
     return " ".join((table.model_fields[name].description or "").split())
 
 
-def meaning(table: type[BaseModel]) -> str:
+def meaning(table: type[Table]) -> str:
     """What a reader of scenes is told of a table: its docstring up to what scripts need."""
     return re.split(r"\n\nIts keyword arguments |\n\n\w+\n---", inspect.cleandoc(table.__doc__ or ""))[0]

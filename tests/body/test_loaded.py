@@ -105,7 +105,7 @@ def test_every_node_of_an_own_body_comes_back(
     of = own_scene(tmp_path)
     assert cli.main(["unload", str(of), "-o", str(tmp_path / "found")]) == 0
     said = capsys.readouterr()
-    assert "nodes, moved by 0.3647" in said.out and "unloaded: iteration 1, 100 % of the load" in said.err
+    assert "nodes, moved by 0.3647" in said.err and "unloaded: iteration 1, 100 % of the load" in said.err
     found = read_scene(tmp_path / "found" / "scene.toml")
     given = read_mesh(tmp_path / "loaded.msh").points
     np.testing.assert_allclose(nodes_of(found), given, rtol=0, atol=1e-9)
