@@ -24,7 +24,7 @@ from scipy.optimize import brentq, least_squares
 from remodel_fenicsx.extend import CHAINS
 from remodel_fenicsx.parts import Material
 from remodel_fenicsx.scene.presets import aligned_stiffness
-from remodel_fenicsx.schema.conventions import convention_doubt
+from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.text import read_columns
 
 Array = NDArray[np.float64]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import inspect
 import json
 import os
 import re
@@ -59,25 +60,19 @@ MAIN_EPILOG = (
 
 
 # ---------------------------------------------------------------- how a command is typed and ends
-Option = tuple[list[str], dict[str, Any]]  # arguments of `ArgumentParser.add_argument`
 Do = Callable[[argparse.Namespace], int | None]
 Needs = Sequence[Callable[[], str | None]]
 KINDS: dict[str, Callable[[str], object]] = {
     **dict.fromkeys(("DATA", "DIR", "FILE", "FOLDER", "SCENE"), Path),
-    **{"K": int, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
+    **{"K": int, "LENGTH": float, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
 }
-
-
-def option(line: str, **settings: object) -> Option:
-    """From a line as in the help: "-q --quiet", "--jobs N" or what has a place of its own, two spaces, its meaning."""
-    usage, _, text = line.partition("  ")
-    *names, value = usage.split()
-    if value.startswith("--no-"):
-        return [value], {"help": text, "action": "store_false", "dest": value[5:].replace("-", "_")}
-    if value.startswith("-"):
-        return [*names, value], {"help": text, "action": "store_true"}
-    shown = {} if "choices" in settings else {"metavar": value}
-    return names, {"help": text, "type": KINDS.get(value, str), **shown, **settings}
+MARKS: dict[str, dict[str, Any]] = {
+    "": {},
+    "!": {"required": True},
+    "?": {"nargs": "?"},
+    "+": {"nargs": "+"},
+    "*": {"action": "append", "default": []},
+}
 
 
 class Command(NamedTuple):
@@ -85,7 +80,7 @@ class Command(NamedTuple):
 
     do: Do
     example: str
-    options: Sequence[Option]
+    usage: Sequence[str]
     needs: Needs
     alone: bool
 
@@ -93,13 +88,13 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {}  # by name, in the order of the help
 
 
-def command(name: str, example: str, *options: Option, needs: Needs = (), alone: bool = False) -> Callable[[Do], Do]:
+def command(example: str, *usage: str, needs: Needs = (), alone: bool = False) -> Callable[[Do], Do]:
     """Of a function: makes it a command, whose help is its docstring."""
 
     # it gets the options, with the scene where the command takes one, and returns an exit code, or None for 0; it is
     # called where nothing that it needs is missing; where it works alone, on the first of several ranks only
     def listed(do: Do) -> Do:
-        COMMANDS[name] = Command(do, example, options, needs, alone)
+        COMMANDS[example.partition(" ")[0]] = Command(do, example, usage, needs, alone)
         return do
 
     return listed
@@ -125,12 +120,26 @@ def parser() -> argparse.ArgumentParser:
         about: dict[str, Any] = {"description": text, "epilog": epilog, "formatter_class": raw}
         if text:  # else it is for the processes of a study
             about["help"] = text.replace("%", "%%")
-        _add(commands.add_parser(name, **about), *each.options, WITH)
+        _add(commands.add_parser(name, **about), *each.usage, WITH)
     return found
 
 
-def _add(found: argparse.ArgumentParser, *options: Option) -> None:
-    for names, settings in options:
+def _add(found: argparse.ArgumentParser, *usage: str) -> None:
+    """Add the options of blocks with a line for each: names, its value with a mark and " = DEFAULT", meaning."""
+    for line in "\n".join(map(inspect.cleandoc, usage)).replace("\n    ", " ").splitlines():
+        words, _, text = line.partition("  ")
+        words, _, default = words.partition(" = ")
+        *names, value = words.split()
+        settings: dict[str, Any] = {"help": text}
+        if value.startswith("-"):
+            names.append(value)
+            settings["action"] = "store_true"
+            if value.startswith("--no-"):
+                settings |= {"action": "store_false", "dest": value[5:].replace("-", "_")}
+        else:
+            kind = value.rstrip("!?+*")
+            settings |= {"default": default or None, "type": KINDS.get(kind, str)} | MARKS[value[len(kind) :]]
+            settings["choices" if "|" in kind else "metavar"] = kind.split("|") if "|" in kind else kind
         found.add_argument(*names, **settings)
 
 
@@ -192,7 +201,7 @@ def _parsed(arguments: list[str]) -> argparse.Namespace:
             stack.enter_context(contextlib.redirect_stdout(silence))
             stack.enter_context(contextlib.redirect_stderr(silence))
         found, rest = first.parse_known_args(arguments)
-        load_extensions(found.extensions or ())
+        load_extensions(getattr(found, "with"))
         if rest[:1] == ["figures"]:
             raise RemodelError("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8")
         return parser().parse_args(arguments)
@@ -247,62 +256,51 @@ def _stopping(kept: str) -> Iterator[None]:
 
 
 # ---------------------------------------------------------------- what several commands take
-def _study(name: str) -> tuple[Option, ...]:
+def _study(name: str) -> str:
     """What those take that run a scene several times."""
-    text = "The same command goes on there: finished runs are used again."
-    return (
-        option(f"-o --output DIR  Put the results into this folder (default: results/NAME-{name}). {text}"),
-        option("--jobs N  Do at most N runs at a time (default: as many as there are cores)."),
-        QUIET,
-    )
+    return f"""
+    -o --output DIR  Put the results into this folder (default: results/NAME-{name}). The same
+        command goes on there: finished runs are used again.
+    --jobs N  Do at most N runs at a time (default: as many as there are cores).
+    {QUIET}"""
 
 
-def _drawn_in(name: str) -> Option:
-    text = f"Write to this new file, whose ending says the kind (default: DIR/{name}, numbered when taken)."
-    return option(f"-o --output FILE  {text}")
-
-
-WITH = option(
-    f"--with FILE.py  Run this Python file first, whose parts scenes may then name; repeatable (or {EXTENSIONS}).",
-    action="append",
-    dest="extensions",
-)
-QUIET = option("-q --quiet  Show no progress, only warnings.")
-RUN_FOLDER = option("folder DIR  The folder of a run.")
-SCENE_FILE = "file SCENE  The scene file (TOML); docs/scene.md lists its keys."
-CHANGES = (
-    option(
-        "--set KEY=VALUE  Change one key of the scene, such as cells.seed=2 or time.end=10. May be repeated.",
-        action="append",
-        default=[],
-    ),
-    option("--profile NAME  Mesh, step and element as measured for speed or accuracy: fast, balanced or reference."),
-)
-SCENE_AND_CHANGES = (option(SCENE_FILE), *CHANGES)
-VIEWING = (
-    option("--layers K  Show this many layers: of a tube from the inside, of others from the bottom (default: all)."),
-    option(
-        "--cut PART  Leave out the half in front of the middle, or only the quarter in front and to the right.",
-        choices=("half", "quarter"),
-    ),
-    option(
-        "--view VIEW  Look from the front, from above, or from X,Y,Z of the middle: --view=X,Y,Z (default: front).",
-        default="front",
-    ),
-)
+WITH = f"""
+    --with FILE.py*  Run this Python file first, whose parts scenes may then name; repeatable (or
+        {EXTENSIONS})."""
+QUIET = "-q --quiet  Show no progress, only warnings."
+RUN_FOLDER = "folder DIR  The folder of a run."
+SCENE_AND_CHANGES = """
+    file SCENE  The scene file (TOML); docs/scene.md lists its keys.
+    --set KEY=VALUE*  Change one key of the scene, such as cells.seed=2 or time.end=10. May be
+        repeated.
+    --profile NAME  Mesh, step and element as measured for speed or accuracy: fast, balanced or
+        reference."""
+VIEWING = """
+    --layers K  Show this many layers: of a tube from the inside, of others from the bottom
+        (default: all).
+    --cut half|quarter  Leave out the half in front of the middle, or only the quarter in front and
+        to the right.
+    --view VIEW = front  Look from the front, from above, or from X,Y,Z of the middle: --view=X,Y,Z
+        (default: %(default)s).
+    -o --output FILE  Write to this new file, whose ending says the kind (default: {} in DIR,
+        numbered when taken)."""
 COMPUTES, DRAWS = (reason_unusable,), (reason_undrawable,)
 
 
 # ---------------------------------------------------------------- the commands
 @command(
-    "run",
     "run artery.toml -o artery",
-    option(SCENE_FILE, nargs="?"),
-    option("--resume DIR  Go on with the run in DIR from its last checkpoint, in place of a new run of SCENE."),
-    *CHANGES,
-    option("-o --output DIR  Put the results into this folder, which must be new or empty (default: results/NAME)."),
-    option("--max-wall-time TIME  Stop before this time (30min, 2h) is over: after a whole step, with exit code 4."),
-    option("--no-report  Make no report.html at the end, as with output.report = false."),
+    SCENE_AND_CHANGES.replace("SCENE ", "SCENE? "),
+    """
+    --resume DIR  Go on with the run in DIR from its last checkpoint, in place of a new run of
+        SCENE.
+    -o --output DIR  Put the results into this folder, which must be new or empty (default:
+        results/NAME).
+    --max-wall-time TIME  Stop before this time (30min, 2h) is over: after a whole step, with exit
+        code 4.
+    --no-report  Make no report.html at the end, as with output.report = false.
+    """,
     QUIET,
 )
 def _run(options: argparse.Namespace) -> None:
@@ -324,7 +322,7 @@ def _run(options: argparse.Namespace) -> None:
     _say(f"results in {folder}")
 
 
-@command("status", "status artery", RUN_FOLDER)
+@command("status artery", RUN_FOLDER)
 def _status(options: argparse.Namespace) -> None:
     """Say where the run in DIR is, how fast it is, and whether it is alive."""
     from remodel_fenicsx.results.status import status
@@ -333,11 +331,13 @@ def _status(options: argparse.Namespace) -> None:
 
 
 @command(
-    "report",
     "report artery --open",
     RUN_FOLDER,
-    option("-o --output FILE  Write the page to this new file (default: DIR/report.html, which is made anew)."),
-    option("--open  Show the page in a browser."),
+    """
+    -o --output FILE  Write the page to this new file (default: DIR/report.html, which is made
+        anew).
+    --open  Show the page in a browser.
+    """,
     alone=True,
 )
 def _report(options: argparse.Namespace) -> None:
@@ -354,14 +354,13 @@ def _report(options: argparse.Namespace) -> None:
 
 
 @command(
-    "picture",
     "picture artery --time 0 25 150 --cut half",
     RUN_FOLDER,
-    *VIEWING,
-    _drawn_in("NAME-t150.png"),
-    option(
-        "--time T  Show these times beside each other, each the nearest recorded one (default: the last).", nargs="+"
-    ),
+    VIEWING.format("NAME-t150.png"),
+    """
+    --time T+  Show these times beside each other, each the nearest recorded one (default: the
+        last).
+    """,
     needs=DRAWS,
     alone=True,
 )
@@ -374,15 +373,13 @@ def _picture(options: argparse.Namespace) -> None:
 
 
 @command(
-    "animate",
     "animate artery -o artery.webp --frames 40",
     RUN_FOLDER,
-    *VIEWING,
-    _drawn_in("NAME-t0-t150.gif"),
-    option(
-        "--frames N  Show this many recorded times, 2 to 500 (default: %(default)s, or all where there are fewer).",
-        default=60,
-    ),
+    VIEWING.format("NAME-t0-t150.gif"),
+    """
+    --frames N = 60  Show this many recorded times, 2 to 500 (default: %(default)s, or all where
+        there are fewer).
+    """,
     needs=DRAWS,
     alone=True,
 )
@@ -394,7 +391,7 @@ def _animate(options: argparse.Namespace) -> None:
     _say(str(draw_animation(options.folder, options.frames, viewing, options.output)))
 
 
-@command("revolve", "revolve artery", RUN_FOLDER, alone=True)
+@command("revolve artery", RUN_FOLDER, alone=True)
 def _revolve(options: argparse.Namespace) -> None:
     """Write the fields of a reduced run in DIR on the whole body, for ParaView."""
     from remodel_fenicsx.results.whole_body import revolve
@@ -403,16 +400,15 @@ def _revolve(options: argparse.Namespace) -> None:
 
 
 @command(
-    "export",
     "export artery --format febio -o fibres.feb",
     RUN_FOLDER,
-    option(
-        "--format NAME  Write vtu (ParaView, meshio), febio (.feb), abaqus (.inp, CalculiX too) or csv.",
-        required=True,
-        choices=("vtu", "febio", "abaqus", "csv"),
-    ),
-    option("-o --output FILE  Write to this new file (default: fibres in DIR, with the ending of the format)."),
-    option("--time T  Take this recorded time (default: the last)."),
+    """
+    --format vtu|febio|abaqus|csv!  Write vtu (ParaView, meshio), febio (.feb), abaqus (.inp,
+        CalculiX too) or csv.
+    -o --output FILE  Write to this new file (default: fibres in DIR, with the ending of the
+        format).
+    --time T  Take this recorded time (default: the last).
+    """,
     alone=True,
 )
 def _export(options: argparse.Namespace) -> None:
@@ -423,10 +419,11 @@ def _export(options: argparse.Namespace) -> None:
 
 
 @command(
-    "new",
     "new kuhl-holzapfel-2007 --shape tube > mine.toml",
-    option("preset PRESET  The model: kuhl-holzapfel-2007, consistent or sun-2002."),
-    option("--shape SHAPE  The body: cube, tendon, sheet or tube (default: tube).", default="tube"),
+    """
+    preset PRESET  The model: kuhl-holzapfel-2007, consistent or sun-2002.
+    --shape SHAPE = tube  The body: cube, tendon, sheet or tube (default: %(default)s).
+    """,
 )
 def _new(options: argparse.Namespace) -> None:
     """Print a scene of a published model, with every key."""
@@ -435,20 +432,16 @@ def _new(options: argparse.Namespace) -> None:
 
 
 @command(
-    "wall",
     "wall lumen.stl --thickness 0.6 --size 0.9 -o vessel.msh",
-    option("surface FILE  The surface of the lumen, open at its ends: STL, VTP or OBJ.", type=Path),
-    option(
-        "--thickness VALUE  Thickness of the wall in the unit of the surface, or the name of an array at its points."
-    ),
-    option(
-        "--layers NAME=VALUE  Layers from the lumen outwards, each a region, with their thickness.",
-        nargs="+",
-        default=(),
-    ),
-    option("--size LENGTH  Length of an element along the wall, about its thickness.", type=float, required=True),
-    option("--through K  Elements through the wall, at least one a layer (default: %(default)s).", default=2),
-    option("-o --output FILE  Write to this new file (default: SURFACE.msh)."),
+    """
+    surface FILE  The surface of the lumen, open at its ends: STL, PLY, VTP or OBJ.
+    --thickness VALUE  Thickness of the wall in the unit of the surface, or the name of an array at
+        its points.
+    --layers NAME=VALUE+  Layers from the lumen outwards, each a region, with their thickness.
+    --size LENGTH!  Length of an element along the wall, about its thickness.
+    --through K = 2  Elements through the wall, at least one a layer (default: %(default)s).
+    -o --output FILE  Write to this new file (default: SURFACE.msh).
+    """,
     needs=COMPUTES,
     alone=True,
 )
@@ -458,11 +451,13 @@ def _wall(options: argparse.Namespace) -> None:
 
     path = options.output or options.surface.with_suffix(".msh")
     with _stopping("nothing is written"):
-        lines = write_wall(options.surface, path, options.thickness, options.layers, options.size, options.through)
+        lines = write_wall(
+            options.surface, path, options.thickness, options.layers or (), options.size, options.through
+        )
     _say("\n".join(lines))
 
 
-@command("validate", "validate artery.toml", *SCENE_AND_CHANGES)
+@command("validate artery.toml", SCENE_AND_CHANGES)
 def _validate(options: argparse.Namespace) -> None:
     """Check a scene without running it, and show what it means."""
     from remodel_fenicsx.body.reductions import explained
@@ -492,10 +487,9 @@ def _unseen_files(scene: Scene) -> str:
 
 
 @command(
-    "axes",
     "axes artery.toml -o artery-axes.vtu",
-    *SCENE_AND_CHANGES,
-    option("-o --output FILE  Write to this new file (default: NAME-axes.vtu)."),
+    SCENE_AND_CHANGES,
+    "-o --output FILE  Write to this new file (default: NAME-axes.vtu).",
     needs=COMPUTES,
 )
 def _axes(options: argparse.Namespace) -> None:
@@ -508,10 +502,9 @@ def _axes(options: argparse.Namespace) -> None:
 
 
 @command(
-    "unload",
     "unload scanned.toml -o unloaded",
-    *SCENE_AND_CHANGES,
-    option("-o --output FOLDER  Put its scene and mesh into this new folder (default: NAME-unloaded)."),
+    SCENE_AND_CHANGES,
+    "-o --output FOLDER  Put its scene and mesh into this new folder (default: NAME-unloaded).",
     needs=COMPUTES,
 )
 def _unload(options: argparse.Namespace) -> None:
@@ -522,13 +515,13 @@ def _unload(options: argparse.Namespace) -> None:
         raise scenes.SceneError("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'")
     place = options.output or Path(f"{options.scene.name}-unloaded")
     with _stopping("nothing is written"):
-        _say(f"{write_unloaded(options.scene, place)}\nscene of the unloaded body in {place / 'scene.toml'}")
+        write_unloaded(options.scene, place)
+    _say(f"scene of the unloaded body in {place / 'scene.toml'}")
 
 
 @command(
-    "schema",
     "schema -o scene.schema.json",
-    option("-o --output FILE  Write it to this new file (default: print it)."),
+    "-o --output FILE  Write it to this new file (default: print it).",
     alone=True,
 )
 def _schema(options: argparse.Namespace) -> None:
@@ -552,16 +545,16 @@ def _answer(study: Callable[..., tuple[Path, Answer]], *wishes: object) -> int:
 
 
 @command(
-    "sweep",
     "sweep mine.toml loads.pressure.value=2:6:5",
-    *SCENE_AND_CHANGES,
-    option(
-        "axes KEY=a:b:n  Vary a key: KEY=a:b:n takes n numbers from a to b, KEY=a,b,... these. Keys are combined.",
-        nargs="+",
-    ),
-    option("--latin N  Take N points of a Latin hypercube in place of all combinations. Each key is then KEY=a:b."),
-    option("--seed SEED  Draw the Latin hypercube from this seed (default: 1).", default=1),
-    *_study("sweep"),
+    SCENE_AND_CHANGES,
+    """
+    axes KEY=a:b:n+  Vary a key: KEY=a:b:n takes n numbers from a to b, KEY=a,b,... these. Keys are
+        combined.
+    --latin N  Take N points of a Latin hypercube in place of all combinations. Each key is then
+        KEY=a:b.
+    --seed SEED = 1  Draw the Latin hypercube from this seed (default: %(default)s).
+    """,
+    _study("sweep"),
     needs=COMPUTES + DRAWS,
 )
 def _sweep(options: argparse.Namespace) -> int:
@@ -576,11 +569,10 @@ def _sweep(options: argparse.Namespace) -> int:
 
 
 @command(
-    "ensemble",
     "ensemble artery.toml --seeds 32 -o seeds",
-    *SCENE_AND_CHANGES,
-    option("--seeds N  Use this many seeds (default: 32; at least 2).", default=32),
-    *_study("ensemble"),
+    SCENE_AND_CHANGES,
+    "--seeds N = 32  Use this many seeds (default: %(default)s; at least 2).",
+    _study("ensemble"),
     needs=COMPUTES + DRAWS,
 )
 def _ensemble(options: argparse.Namespace) -> int:
@@ -591,14 +583,13 @@ def _ensemble(options: argparse.Namespace) -> int:
 
 
 @command(
-    "trade",
     "trade artery.toml --budget 10min",
-    *SCENE_AND_CHANGES,
-    option(
-        "--budget TIME  Begin no run that would end after this wall time (default: 10min). Cheap runs come first.",
-        default=600.0,
-    ),
-    *_study("trade"),
+    SCENE_AND_CHANGES,
+    """
+    --budget TIME = 10min  Begin no run that would end after this wall time (default: %(default)s).
+        Cheap runs come first.
+    """,
+    _study("trade"),
     needs=COMPUTES + DRAWS,
 )
 def _trade(options: argparse.Namespace) -> int:
@@ -609,15 +600,17 @@ def _trade(options: argparse.Namespace) -> int:
 
 
 @command(
-    "fit",
     "fit tube.toml inflation.toml -o fitted",
-    *SCENE_AND_CHANGES,
-    option("data DATA  A TOML file with the unknowns and the tables of measurements; docs/fit.md explains it."),
-    option("--no-likelihood-profiles  Leave out the likelihood profiles of unknowns that depend on each other."),
-    option(
-        "--starts N  Start from N points: the given one, and others within a factor of two (default: 3).", default=3
-    ),
-    *_study("fit"),
+    SCENE_AND_CHANGES,
+    """
+    data DATA  A TOML file with the unknowns and the tables of measurements; docs/fit.md explains
+        it.
+    --no-likelihood-profiles  Leave out the likelihood profiles of unknowns that depend on each
+        other.
+    --starts N = 3  Start from N points: the given one, and others within a factor of two (default:
+        %(default)s).
+    """,
+    _study("fit"),
     needs=COMPUTES + DRAWS,
 )
 def _fit(options: argparse.Namespace) -> int:
@@ -629,11 +622,13 @@ def _fit(options: argparse.Namespace) -> int:
 
 
 @command(
-    "stability",
     "stability artery.toml --times 5 -o stable",
-    *SCENE_AND_CHANGES,
-    option("-o --output DIR  Put the results into this new or empty folder (default: results/NAME-stability)."),
-    option("--times N  Look at N times of the run (default: 10).", default=10),
+    SCENE_AND_CHANGES,
+    """
+    -o --output DIR  Put the results into this new or empty folder (default:
+        results/NAME-stability).
+    --times N = 10  Look at N times of the run (default: %(default)s).
+    """,
     QUIET,
     needs=DRAWS + COMPUTES,
 )
@@ -645,7 +640,7 @@ def _stability(options: argparse.Namespace) -> None:
     _say(f"{found.in_words()}\nresults in {place}")
 
 
-@command("info", "info", needs=COMPUTES)
+@command("info", needs=COMPUTES)
 def _info(options: argparse.Namespace) -> None:
     """Print the versions of the program and its libraries, the solvers and the BLAS."""
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
@@ -659,14 +654,14 @@ def _info(options: argparse.Namespace) -> None:
         _say(f"{name:16} {version}")
 
 
-@command(PART, "", option("file_of_part FILE  The task, which its answer replaces."), needs=COMPUTES)
+@command(PART, "file_of_part FILE  The task, which its answer replaces.", needs=COMPUTES)
 def _part(options: argparse.Namespace) -> None:
     from remodel_fenicsx.studies.fit import do_part
 
     do_part(options.file_of_part)
 
 
-@command(SERVE, "")
+@command(SERVE)
 def _serve(options: argparse.Namespace) -> int:
     return serve(main)
 

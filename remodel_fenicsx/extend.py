@@ -124,7 +124,6 @@ if TYPE_CHECKING:
     from remodel_fenicsx.evolution.life_cycle import Remodels as Remodels
     from remodel_fenicsx.fem.jit import form as form
     from remodel_fenicsx.results.columns import Measurement as Measurement
-    from remodel_fenicsx.scene.reference import markdown_reference as markdown_reference
     from remodel_fenicsx.solver.linear import EveryTangent as EveryTangent
     from remodel_fenicsx.evolution.stepper import WarnsOnce as WarnsOnce
 
@@ -135,7 +134,6 @@ _LATE = {
     "Remodels": "evolution.life_cycle",
     "WarnsOnce": "evolution.stepper",
     "form": "fem.jit",
-    "markdown_reference": "scene.reference",
 }
 __getattr__ = on_demand(__name__, _LATE)
 if not TYPE_CHECKING:  # type checkers go by the imports

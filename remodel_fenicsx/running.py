@@ -38,14 +38,14 @@ from remodel_fenicsx.results.run_folder import (
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
-from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation
+from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation, leaves
 from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.schema.text import read_toml
 from remodel_fenicsx.initial import checked_domain, mesh_of, with_choices
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.system import interrupts
+from remodel_fenicsx.system import NOTICE, interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
 from remodel_fenicsx.system.files import TakenError, part_of, read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE
@@ -191,10 +191,10 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
 
 def _check_whole(values: dict[str, Any], before: dict[str, Any], place: Path) -> None:
     """A scene as run has all values: one that was cut might still be valid, with defaults that nobody asked for."""
-    for table in (name for name, keys in before.items() if isinstance(keys, dict) and name != "loads"):
-        if lost := set(before[table]) - set(values.get(table, {})):
-            rule = f"lacks {table}.{min(lost)}, which the run had; write it as it was, or another value"
-            raise RecordingError(f"{place / SCENE}: {rule}")
+    had, has = (dict(leaves(scene, ("loads",))) for scene in (before, values))
+    if lost := had.keys() - has.keys():
+        rule = f"lacks {min(lost)}, which the run had; write it as it was, or another value"
+        raise RecordingError(f"{place / SCENE}: {rule}")
 
 
 @contextmanager
@@ -357,7 +357,7 @@ class _Report(Watcher):
         """Say it."""
         log.info("%s", ", ".join(f"{name} {value:.6g}" for name, value in step.row.items()))
         if (parts := step.work.substeps) > 1:
-            self.progress.message(f"time {step.time:g} solved in {parts} parts")
+            log.log(NOTICE, "time %g solved in %d parts", step.time, parts)
         loads = [f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row]
         state = ", ".join([f"t = {step.time:g}", *loads, f"{step.work.newton_iterations} Newton"])
         count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.chooses else None
@@ -368,33 +368,22 @@ class _Report(Watcher):
 # The scene of an unloaded body, and local axes on the mesh.
 
 
-def write_unloaded(scene: Scene, folder: Path) -> str:
-    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one; say what was found."""
+def write_unloaded(scene: Scene, folder: Path) -> None:
+    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one."""
     part = part_of(folder)
-    with RunLock(part):
+    with RunLock(part), hold_log(quiet=False):
         try:
             if folder.exists():
                 raise TakenError(folder, "folder")
             with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
-                found = unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False)
-                kept, files = with_files_kept(found)
-                for name, data in files.items():
-                    (part / name).write_bytes(data)
-                (part / SCENE).write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
-                (part / LOCK).unlink()
-                part.rename(folder)
-                return "unloaded: " + _in_words(scene, found)
+                kept, files = with_files_kept(unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False))
+            for name, data in files.items():
+                (part / name).write_bytes(data)
+            (part / SCENE).write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
+            (part / LOCK).unlink()
+            part.rename(folder)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-
-
-def _in_words(scene: Scene, found: Scene) -> str:
-    numbers, known = found.geometry.model_dump().items(), scene.geometry.model_dump()
-    words = [f"{name} {n:.6g} (loaded {known[name]:.6g})" for name, n in numbers if isinstance(n, float)]
-    if words:
-        return ", ".join(words)
-    before, after = (one.geometry.checked(one.mesh)[0].points for one in (scene, found))  # type: ignore[attr-defined]
-    return f"{len(after)} nodes, moved by {np.linalg.norm(after - before, axis=1).max():.6g} at most"
 
 
 def write_axes(scene: Scene, path: Path) -> str:

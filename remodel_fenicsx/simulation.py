@@ -15,8 +15,7 @@ from remodel_fenicsx.body.loading import LoadValues, values_of_loads
 from remodel_fenicsx.evolution.coupling import Maker
 from remodel_fenicsx.evolution.stepper import FixedSteps, Step, Stepper, Watcher, Way
 from remodel_fenicsx.fem.kinematics import NaturalConfiguration
-from remodel_fenicsx.initial import initial_states, meshed, natural_gradient
-from remodel_fenicsx.measured import in_files, measured_fibres
+from remodel_fenicsx.initial import in_files, initial_states, measured_fibres, meshed, natural_gradient
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Remodeling, Solver

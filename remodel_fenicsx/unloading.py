@@ -8,35 +8,26 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
-import dolfinx.fem
-import dolfinx.fem.petsc
 import numpy as np
-import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
-from petsc4py import PETSc
-from ufl.algorithms.map_integrands import map_integrands
 
 from remodel_fenicsx.body.domain import dof_of_node
-from remodel_fenicsx.body.mesh_faces import jacobian_determinants
+from remodel_fenicsx.body.mesh_domain import shared
+from remodel_fenicsx.body.mesh_faces import FaceError, jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFile, gmsh_text
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.body.wall import RoundWall
-from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import assemble_matrix, create_matrix, factorised, over_ranks, second_derivative
 from remodel_fenicsx.model.residual_stress import Loads, closing
 from remodel_fenicsx.fem.assembly import agreed
 from remodel_fenicsx.scene.scene import Scene, SceneError, too_soft
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.equilibrium import mandel_vector
+from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.system.terminal import Line, unsaid
-
-if TYPE_CHECKING:
-    from ufl.core.expr import Expr
 
 log = logging.getLogger(__name__)
 
@@ -104,12 +95,16 @@ def unloaded(
         return unloaded_mesh(scene, comm, folder, line.show)
 
 
-# ---------------------------------------------------------------- no unloaded shape
-# What is said where there is no unloaded shape, and the shares of the loads in which it is looked for.
+# ---------------------------------------------------------------- numbers that the loads bring to the given ones
+# By Broyden's method, whose first guess is that loaded numbers change as the unloaded ones do.
 
-Found = TypeVar("Found")
+Array = NDArray[np.float64]
+Said = Callable[[str], object]
 
-SHARES = (0.25, 0.5, 0.75, 1.0)  # of the loads, where they cannot be taken in one piece
+LEAST_SHARE = 1 / 16  # of the loads, in which they are taken where they cannot be in one piece
+MOST_LOADINGS = 30  # for one share of the loads
+ON_THE_WAY = 0.01  # relative: how far numbers may be off at a share of the loads
+REFUSALS = (ArithmeticError, FaceError, StepFailure, SceneError)
 
 
 class NoUnloadedShape(RemodelError, RuntimeError):
@@ -118,25 +113,50 @@ class NoUnloadedShape(RemodelError, RuntimeError):
     exit_code = SOLVE_FAILED
 
 
-def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
-    """What is found at all of the loads: in one piece, or in shares, each from the one before."""
-    refusals = (ArithmeticError, StepFailure, SceneError)
-    try:
-        return find(1.0, start)
-    except refusals as error:
-        log.info("unloading all loads at once failed (%s); they are now taken in parts", " ".join(str(error).split()))
-    done = 0.0
-    for share in SHARES:
+def found_unloaded(
+    start: Callable[[float], Array],
+    missed: Callable[[Array, float], Array],
+    tolerance: float,
+    said: Said,
+    scale: float = 1.0,
+) -> tuple[Array, int]:
+    """Numbers that the loads bring to the given ones, and how often they were loaded.
+
+    `start` guesses them at a share of the loads, `missed` says how far the given ones are from those loaded.
+    """
+    from scipy.optimize import NoConvergence, broyden1  # which no run needs
+
+    runs, words = 0, ""
+
+    def error(numbers: Array) -> Array:
+        nonlocal runs, words
+        runs += 1
+        said(f"iteration {runs}{words}, {100 * share:g} % of the loads")
+        found = missed(numbers, share)
+        words = f", off by {np.abs(found).max():.0e} before"
+        return found
+
+    how: dict[str, Any] = {"alpha": scale, "line_search": None, "maxiter": MOST_LOADINGS}
+    done, step = 0.0, 1.0
+    change: Any = 0.0  # of the start, per share of the loads
+    while done < 1.0:
+        share, words = min(done + step, 1.0), ""
         try:
-            start = find(share, start)
-        except refusals as error:
-            reason = " ".join(str(error).split())
-            raise NoUnloadedShape(
-                f"geometry.is = 'loaded': no unloaded body was found at {100 * share:g} % of the loads, there is "
-                f"one at {100 * done:g} %: {reason}; try lower loads, or a stiffer tissue"
-            ) from error
-        done = share
-    return start
+            first, nearly = start(share), tolerance if share == 1.0 else ON_THE_WAY
+            change = (broyden1(error, first + share * change, f_tol=nearly, **how) - first) / share
+            done = share
+        except (*REFUSALS, NoConvergence) as refusal:
+            reason = f"not found in {MOST_LOADINGS} iterations{words}"
+            if not isinstance(refusal, NoConvergence):
+                reason = " ".join(str(refusal).split())
+            log.info("unloading at %g %% of the loads failed (%s); they are now taken in parts", 100 * share, reason)
+            step /= 2
+            if step < LEAST_SHARE:
+                raise NoUnloadedShape(
+                    f"geometry.is = 'loaded': no unloaded body was found at {100 * share:g} % of the loads, there is "
+                    f"one at {100 * done:g} %: {reason}; try lower loads, or a stiffer tissue"
+                ) from refusal
+    return start(1.0) + change, runs
 
 
 # ---------------------------------------------------------------- the unloaded tube of a loaded one
@@ -145,11 +165,7 @@ def in_shares(find: Callable[[float, Found], Found], start: Found) -> Found:
 # by Broyden's method for their logarithms, from what inverse elastostatics of one radius says
 # (`model.residual_stress.closing`). There the loaded numbers change about as the unloaded ones do.
 
-Array = NDArray[np.float64]
-Said = Callable[[str], object]
-
 LOADED_AGAIN = 1e-9  # relative: how far the loaded numbers may be from those of the scene
-MOST_LOADINGS = 30  # runs for one share of the loads
 LOAD_STEPS = 10  # of a run to the end of the ramps
 # cells that stay; what says how to remodel goes with a law
 PASSIVE: dict[str, object] = {
@@ -159,36 +175,18 @@ PASSIVE: dict[str, object] = {
 
 
 def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
-    """By Broyden's method, from inverse elastostatics."""
-    from scipy.optimize import NoConvergence, broyden1  # which no run needs
-
+    """From inverse elastostatics."""
     shape: Any = scene.geometry
     inside = [radius for radius in _outer_radii(scene).values() if radius < shape.outer_radius]
     given = np.array([shape.inner_radius, *inside, shape.outer_radius, shape.length])
-    runs, found = 0, given
 
-    def find(share: float, correction: Any) -> Any:
-        """How far logarithms are from what inverse elastostatics says, from how far they were; the numbers too."""
-        first: Array = np.log(_inverse(scene, given, share))
+    def missed(numbers: Array, share: float) -> Array:
+        return np.log(given / _loaded(scene, comm, np.exp(numbers), share))
 
-        words, how = "", {"alpha": 1.0, "line_search": None, "maxiter": MOST_LOADINGS, "f_tol": LOADED_AGAIN}
-
-        def error(numbers: Array) -> Array:
-            nonlocal runs, found, words
-            runs, found = runs + 1, np.exp(numbers)
-            said(f"run {runs}{words}, {100 * share:g} % of the loads")
-            missed = np.log(given / _loaded(scene, comm, found, share))
-            words = f", off by {np.abs(missed).max():.0e} before"
-            return missed
-
-        try:
-            return broyden1(error, first + correction, **how) - first
-        except NoConvergence as failure:
-            raise ArithmeticError(f"not found in {MOST_LOADINGS} runs{words}") from failure
-
-    in_shares(find, np.zeros(len(given)))
+    numbers, runs = found_unloaded(lambda share: np.log(_inverse(scene, given, share)), missed, LOADED_AGAIN, said)
+    found = np.exp(numbers)
     unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
-    log.info("unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
+    log.log(NOTICE, "unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
     return _with_numbers(scene, found)
 
 
@@ -248,17 +246,11 @@ def _with_numbers(scene: Scene, numbers: Array) -> Scene:
 
 
 # ---------------------------------------------------------------- the unloaded mesh of a loaded one
-# The places of all nodes, by Newton's method.
-#  The residual is that of the unloaded body under its loads, displaced to the given places. Its derivative by the
-# places of the unloaded nodes is that of inverse elastostatics (Govindjee and Mihalic 1996): with X the unloaded
-# places, moved by w, and x = X + u the given ones,
-#     F = (1 + grad u) (1 + grad w)^-1,    dV = det(1 + grad w) dX,
-# derived by w at w = 0. A pressure stays as it is, for the loaded face does not move.
+# The places of all nodes. The residual is that of the unloaded body under its loads, displaced to the given places.
+# How far these are from the loaded ones is what one Newton step of that body adds to its displacement.
 
 UNLOADED_MESH = "unloaded.msh"
-LEAST_MOVE = 1e-10  # of the body's extent: the last change of a place
-MOST_MOVES = 20  # Newton iterations for one share of the loads
-LEAST_STEP = 1 / 64  # of a Newton step that keeps elements whole and chains shorter than their contour length
+LEAST_MOVE = 1e-10  # of the body's extent: how far a node may be from its given place
 
 
 def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -> Scene:
@@ -266,48 +258,28 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
     shape: Any = scene.geometry
     file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
     given: Array = comm.bcast(None if file is None else file.points)
+    extent, as_unloaded = float(np.ptp(given, axis=0).max()), scene.with_values({"geometry.is": "unloaded"})
+
+    def missed(places: Array, share: float) -> Array:
+        moved: Any = file and replace(file, points=places)
+        if not comm.bcast(moved is None or _is_whole(moved)):
+            raise ArithmeticError("elements would turn inside out")
+        domain = shared(lambda: (moved, shape.boundary(moved), regions or {}), comm)
+        with unsaid(), contextlib.closing(Simulation(as_unloaded, comm, domain)) as simulation:
+            return np.divide(_missed(simulation, given, share), extent, dtype=np.float64)
+
+    places, runs = found_unloaded(lambda _: given, missed, LEAST_MOVE, said, extent)
     path = folder / UNLOADED_MESH
+    if file is not None:
+        path.write_text(gmsh_text(places, file.blocks, file.names), encoding="ascii")
+    comm.barrier()
+    moved = np.linalg.norm(places - given, axis=1).max()
+    log.log(NOTICE, "unloaded: %d nodes, moved by %.6g at most, found in %d iterations", len(places), moved, runs)
     changes: dict[str, object] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
     changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
     if shape.regions:
         numbers: dict[str, int] = comm.bcast(regions)
         changes["geometry.regions"] = {name: [numbers[name]] for name in shape.regions}
-    iterations = 0
-
-    def write(places: Array) -> None:
-        if file is not None:
-            path.write_text(gmsh_text(places, file.blocks, file.names), encoding="ascii")
-        comm.barrier()
-
-    def find(share: float, start: Array) -> Array:
-        nonlocal iterations
-        places, step, length, words = start, np.zeros_like(start), 1.0, ""
-        for _ in range(MOST_MOVES):
-            iterations += 1
-            said(f"iteration {iterations}{words}, {100 * share:g} % of the loads")
-            write(places)
-            with unsaid(), contextlib.closing(Simulation(scene.with_values(changes), comm)) as simulation:
-                found = _newton_step(simulation, given, share)
-            if found is None:  # too far: back to half of the way
-                length /= 2
-                if length < LEAST_STEP or not step.any():
-                    raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
-                places = places - length * step
-                continue
-            size, length = float(np.abs(found).max()), 1.0
-            words = f", moved by {size:.0e} before"
-            while not comm.bcast(file is None or _is_whole(replace(file, points=places + length * found))):
-                length /= 2
-                if length < LEAST_STEP:
-                    raise ArithmeticError("elements would turn inside out")
-            step = found
-            places = places + length * step
-            if size <= LEAST_MOVE * float(np.ptp(given, axis=0).max()):
-                return places
-        raise ArithmeticError(f"nodes still move by {size:.2g} after {MOST_MOVES} iterations")
-
-    write(in_shares(find, given))
-    log.info("unloaded: %s, found in %d Newton iterations", UNLOADED_MESH, iterations)
     return scene.with_values(changes)
 
 
@@ -329,76 +301,17 @@ def _is_whole(file: MeshFile) -> bool:
     return bool((determinants * np.sign(determinants.mean()) > 0).all())
 
 
-def _newton_step(simulation: Simulation, given: Array, share: float) -> Array | None:
-    """How the unloaded nodes move, (nodes, 3) in the order of the file, on all ranks; None beyond the limits."""
-    domain, state, scene = simulation.domain, simulation.state, simulation.scene
-    equilibrium, unknown = simulation.stepper.coupling.equilibrium, simulation.unknown
-    loads = simulation.load_values(scene.end_of_ramps)
-    state.loading.set({name: share * value for name, value in loads.items()})
+def _missed(simulation: Simulation, given: Array, share: float) -> Array:
+    """How far the given places are from the loaded ones, (nodes, 3) in the order of the file, on all ranks."""
+    domain, coupling, unknown = simulation.domain, simulation.stepper.coupling, simulation.unknown
+    loads = simulation.load_values(simulation.scene.end_of_ramps)
+    simulation.loading.set({name: share * value for name, value in loads.items()})
     dofs = dof_of_node(domain.mesh, unknown.function_space)
     unknown.x.array.reshape(-1, 3)[dofs] = given[domain.node_number] - domain.mesh.geometry.x
-    if not equilibrium.extension().admissible:
-        return None
-    move = dolfinx.fem.Function(unknown.function_space)
-    tangents = [jit.form(form) for form in _tangents(simulation, move)]
-    prescribed = equilibrium.prescribed_values()
-    held = dolfinx.fem.Function(unknown.function_space)
-    fixed = np.isfinite(prescribed)
-    held.x.array[fixed] = (unknown.x.array - prescribed)[fixed]
-    blocks = np.flatnonzero(fixed.reshape(-1, 3).all(axis=1)).astype(np.int32)
-    conditions = [dolfinx.fem.dirichletbc(held, blocks)]
-    matrix = create_matrix(tangents[0])
-    assemble_matrix(matrix, tangents, conditions)
-    right, external = unknown.x.petsc_vec.duplicate(), unknown.x.petsc_vec.duplicate()
-    equilibrium.assemble_internal(right)
-    equilibrium.assemble_external(external)
-    right.axpy(1.0, external)
-    right.scale(-1.0)
-    lift = right.duplicate()
-    with lift.localForm() as local:
-        local.set(0.0)
-    for tangent in tangents:
-        dolfinx.fem.petsc.apply_lifting(lift, [tangent], bcs=[conditions])
-    lift.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-    right.axpy(1.0, lift)
-    dolfinx.fem.petsc.set_bc(right, conditions)
-    solver = factorised(matrix)
-    solver.solve(right, move.x.petsc_vec)
-    move.x.scatter_forward()
-    for thing in (solver, matrix, right, external, lift):
-        thing.destroy()
-    if over_ranks(domain.comm, not np.isfinite(move.x.array).all(), MPI.LOR):
-        return None
-    found: Array = domain.comm.bcast(domain.gather_nodes(move.x.array.reshape(-1, 3)[dofs]))
+    if not coupling.equilibrium.extension().admissible:
+        raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
+    change = coupling.newton.answer(coupling.equilibrium, 0)
+    found: Array = domain.comm.bcast(domain.gather_nodes(-change.reshape(-1, 3)[dofs]))
+    if not np.isfinite(found).all():
+        raise ArithmeticError("the tangent is singular")
     return found
-
-
-def _tangents(simulation: Simulation, move: dolfinx.fem.Function) -> list[ufl.Form]:
-    """Derivative of the residual by the unloaded places, UFL forms to be added up; `move` is zero."""
-    # Compiled one by one: in one kernel they take the compiler minutes.
-    state, unknown = simulation.state, simulation.unknown
-    equilibrium, kinematics, mesh = simulation.stepper.coupling.equilibrium, state.kinematics, simulation.domain.mesh
-    test, trial = ufl.TestFunction(move.function_space), ufl.TrialFunction(move.function_space)
-    back = ufl.Identity(3) - ufl.grad(move)  # (1 + grad w)^-1 and, below, det(1 + grad w), to first order
-    F = kinematics.elastic(ufl.dot(kinematics.deformation_gradient(unknown), back))
-    weight = kinematics.stress_free_weight(mesh)
-    energies = state.dilatation.energies(equilibrium.tissue, F, [state.cells.ufl_cell], weight)
-    forms = [second_derivative(energy, unknown, test, trial, move) for energy in energies]
-
-    def larger(density: Expr) -> Expr:
-        return ufl.derivative(density, unknown, test) * ufl.div(trial)
-
-    forms += [map_integrands(larger, energy) for energy in energies]
-    pointwise = equilibrium.pointwise
-    if pointwise is not None:
-        pointwise.update(stiffness=True)
-        virtual, increment = ufl.derivative(F, unknown, test), ufl.derivative(F, move, trial)
-        work = pointwise.residual(unknown, F, test)
-        strains = [mandel_vector(ufl.sym(ufl.dot(ufl.transpose(F), way))) for way in (increment, virtual)]
-        stiffness = ufl.inner(ufl.dot(pointwise.stiffness, strains[0]), strains[1])
-        changes = ufl.derivative(work, move, trial) + stiffness + work * ufl.div(trial)
-        forms.append(changes * weight * equilibrium.quadrature.dx)
-    supports = state.loading.residual_of_potentials(test)
-    if supports is not None:  # of fixed direction: u shrinks by what the unloaded place moves
-        forms.append(-ufl.derivative(supports, unknown, trial))
-    return forms

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from docs.making.pages import filled, lines
-from remodel_fenicsx.extend import SHAPES, Dimension, markdown_reference
+from docs.making.reference import markdown_reference, paragraphs
+from remodel_fenicsx.extend import SHAPES, Dimension
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES, RANDOM_CELLS
-from remodel_fenicsx.scene.reference import paragraphs
 from remodel_fenicsx.schema.tables import sections, shown
 from remodel_fenicsx.schema.units import dimension_of
 

@@ -15,7 +15,7 @@ from remodel_fenicsx.body.mesh_file import in_place, read_exchange_file
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
-from remodel_fenicsx.schema.conventions import convention_doubt
+from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.text import read_columns
 from remodel_fenicsx.system.files import read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE

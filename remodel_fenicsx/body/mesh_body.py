@@ -235,7 +235,7 @@ class FileBody(WithRegions, FromFile):
             limits = f"allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, geometry.length_unit)"
             raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
         try:
-            boundary = self._boundary(file)
+            boundary = self.boundary(file)
         except mesh_faces.FaceError as error:
             raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
         except UnreadableFile as error:
@@ -257,7 +257,7 @@ class FileBody(WithRegions, FromFile):
         file = refined(file, mesh.refinement, mesh.degree)
         words = "the faces of the body stay plane as in the file"
         log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
-        return file, self._boundary(file)
+        return file, self.boundary(file)
 
     def _read(self) -> MeshFile:
         try:
@@ -277,7 +277,7 @@ class FileBody(WithRegions, FromFile):
         entry: Names = self.faces.get(face, (face,))
         return entry[0] if len(entry) == 1 else list(entry)
 
-    def _boundary(self, file: MeshFile) -> mesh_faces.Boundary:
+    def boundary(self, file: MeshFile) -> mesh_faces.Boundary:
         """With the faces of the body, and further named ones of the file under their own names."""
         names, found = file.names[2], file.facet_groups
         asked = {face: (face,) for face in self.face_names} | self.faces

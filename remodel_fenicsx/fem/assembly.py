@@ -42,16 +42,6 @@ TOLERANCE = 1e-12  # relative, of the linear solve: what comes of it has ten dig
 ITERATION_LIMIT = 20_000  # lines of a thousand elements need some thousands
 
 
-def factorised(matrix: PETSc.Mat) -> PETSc.KSP:
-    """A solver by factors, of a matrix that need not be symmetric."""
-    solver = PETSc.KSP().create(matrix.comm)
-    solver.setOperators(matrix)
-    solver.setType(PETSc.KSP.Type.PREONLY)
-    solver.getPC().setType(PETSc.PC.Type.LU)
-    solver.getPC().setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
-    return solver
-
-
 def rigid_motions(space: FunctionSpace, matrix: PETSc.Mat) -> PETSc.NullSpace:
     """Those of the space of a vector, which multigrid must know of its matrix."""
     place = matrix.createVecRight()
@@ -279,33 +269,25 @@ class Remembered(Generic[T]):
 # ---------------------------------------------------------------- the tangent of an energy
 
 
-def second_derivative(
-    energy: ufl.Form,
-    unknown: Function,
-    test: Expr,
-    trial: Expr,
-    other: Function | None = None,
-) -> ufl.Form:
+def second_derivative(energy: ufl.Form, unknown: Function, test: Expr, trial: Expr) -> ufl.Form:
     """Derivative of an energy by its unknowns, twice; its kernel takes a third of the time."""
     # An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d I_m D I_n. Left to
     # itself UFL puts test and trial function through every operation of W, and each of these is then 81 at a point in
     # three dimensions. Here they are operations on numbers, and each pair of invariants that W couples has one dyad.
-    other = unknown if other is None else other
-    return map_integrands(lambda density: _of_density(density, unknown, test, trial, other), energy)
+    return map_integrands(lambda density: _of_density(density, unknown, test, trial), energy)
 
 
-def _of_density(density: Expr, unknown: Function, test: Expr, trial: Expr, other: Function) -> Expr:
+def _of_density(density: Expr, unknown: Function, test: Expr, trial: Expr) -> Expr:
     found = invariants(density, unknown)
     if not found:
-        return ufl.derivative(ufl.derivative(density, unknown, test), other, trial)
+        return ufl.derivative(ufl.derivative(density, unknown, test), unknown, trial)
     by_number = [(ufl.variable(invariant), invariant) for invariant in found]
     function = ufl.replace(density, {invariant: number for number, invariant in by_number})
-    ways = ((unknown, test), (other, trial))
-    changes = [[ufl.derivative(invariant, by, way) for invariant in found] for by, way in ways]
+    changes = [[ufl.derivative(invariant, unknown, way) for invariant in found] for way in (test, trial)]
     total = ufl.as_ufl(0)
     for (number, _), change in zip(by_number, changes[0], strict=True):
         slope = ufl.diff(function, number)
-        total += slope * ufl.derivative(change, other, trial)
+        total += slope * ufl.derivative(change, unknown, trial)
         for (partner, _), its_change in zip(by_number, changes[1], strict=True):
             total += ufl.diff(slope, partner) * (change * its_change)
     return total

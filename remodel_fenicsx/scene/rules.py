@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Protocol
 
 from remodel_fenicsx.body import SHAPES
-from remodel_fenicsx.body.reductions import AUTO, ReducedScene, choice, objections, too_many_elements
+from remodel_fenicsx.body.reductions import AUTO, choice, objections, too_many_elements
 from remodel_fenicsx.body.shape import FromFile, Unloads, WithRegions
 from remodel_fenicsx.body.wall import RoundWall, Walled
 from remodel_fenicsx.fem.formulations import FORMULATIONS
@@ -21,6 +19,7 @@ from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
+from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.settings import (
     AT_REST,
     COUPLINGS,
@@ -32,56 +31,7 @@ from remodel_fenicsx.schema.settings import (
     in_region,
     laws_with_a_target,
 )
-from remodel_fenicsx.schema.tables import fault, listed, named, quoted, shown
-
-if TYPE_CHECKING:
-    from remodel_fenicsx.body.shape import Column, LoadKind, Shape
-    from remodel_fenicsx.schema.settings import (
-        LoadCase,
-        Material,
-        Natural,
-        Output,
-        Time,
-    )
-
-Faults = Iterator[tuple[str, str, object]]
-
-
-class CheckedScene(ReducedScene, Protocol):
-    """What rules ask of a scene."""
-
-    geometry: Shape
-    material: Material
-    natural: Natural
-    cases: tuple[LoadCase, ...]
-    time: Time
-    output: Output
-
-    @property
-    def formulation(self) -> str: ...
-    @property
-    def has_free_length(self) -> bool: ...
-    @property
-    def column_names(self) -> list[str]: ...
-    @property
-    def last_hold(self) -> tuple[float, float] | None: ...
-    @property
-    def lacking_fields(self) -> dict[str, str]: ...
-    @property
-    def load_kinds(self) -> dict[str, LoadKind]: ...
-
-    def each_case(self) -> Sequence[CheckedScene]: ...
-    def columns(self) -> tuple[Column, ...]: ...
-
-
-Rule = Callable[[CheckedScene], Faults]
-
-
-def check(scene: CheckedScene) -> None:
-    """Raise the fault of the first rule that a scene breaks."""
-    for rule in RULES:
-        for broken in rule(scene):
-            raise fault(*broken)
+from remodel_fenicsx.schema.tables import Faults, listed, named, quoted, shown
 
 
 def _shapes(kind: type, mark: str = ", ") -> str:
@@ -89,7 +39,7 @@ def _shapes(kind: type, mark: str = ", ") -> str:
     return named(SHAPES, lambda shape: issubclass(shape, kind)).replace(", ", mark)
 
 
-def named_regions(scene: CheckedScene) -> Faults:
+def named_regions(scene: Scene) -> Faults:
     """Regions of bodies that have some; their names are parts of the names of columns."""
     shape = scene.geometry
     for name in scene.regions:
@@ -103,7 +53,7 @@ def named_regions(scene: CheckedScene) -> Faults:
             yield f"the column {min(twice)!r} has another meaning; choose another name", key, None
 
 
-def tissue_of_regions(scene: CheckedScene) -> Faults:
+def tissue_of_regions(scene: Scene) -> Faults:
     """The keys of a region together with those of the whole body."""
     law, turnover = LAWS[scene.remodeling.law], scene.remodeling.turnover
     for name, (material, cells, kappa) in scene.properties().items():
@@ -133,7 +83,7 @@ def tissue_of_regions(scene: CheckedScene) -> Faults:
             yield rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch
 
 
-def meshed_body(scene: CheckedScene) -> Faults:
+def meshed_body(scene: Scene) -> Faults:
     """Sizes and layers that the shape can have."""
     scene.geometry.check_size(scene.mesh)
     if isinstance(scene.geometry, WithRegions):
@@ -141,14 +91,14 @@ def meshed_body(scene: CheckedScene) -> Faults:
     yield from ()
 
 
-def loads_beside_others(scene: CheckedScene) -> Faults:
+def loads_beside_others(scene: Scene) -> Faults:
     """One of two loads in whose place the other stands."""
     for name, load in scene.loads.items():
         if (other := scene.load_kinds[name].instead_of) in scene.loads:
             yield f"not allowed beside loads.{other}: either", f"loads.{name}", load.value
 
 
-def loaded_body(scene: CheckedScene) -> Faults:
+def loaded_body(scene: Scene) -> Faults:
     """Bodies whose unloaded shape can be found."""
     if not scene.geometry.is_loaded:
         return
@@ -167,7 +117,7 @@ def loaded_body(scene: CheckedScene) -> Faults:
         yield rule, key, value
 
 
-def same_strain(scene: CheckedScene) -> Faults:
+def same_strain(scene: Scene) -> Faults:
     """Loads that are the strain of the whole body."""
     made = choice(scene)
     for name, load in scene.loads.items():
@@ -177,7 +127,7 @@ def same_strain(scene: CheckedScene) -> Faults:
             yield rule, f"loads.{name}.value", load.value
 
 
-def directions_of_matrices(scene: CheckedScene) -> Faults:
+def directions_of_matrices(scene: Scene) -> Faults:
     """Directions of a matrix that turn with a round wall."""
     if not isinstance(scene.geometry, RoundWall) or not KINEMATICS[choice(scene).name].three_dimensional:
         return
@@ -190,7 +140,7 @@ def directions_of_matrices(scene: CheckedScene) -> Faults:
             yield rule, f"{in_region(name)}material.matrix", properties.material.matrix
 
 
-def parts_of_the_energy(scene: CheckedScene) -> Faults:
+def parts_of_the_energy(scene: Scene) -> Faults:
     """A formulation that takes W apart needs its parts."""
     name, matrix = scene.mesh.formulation, scene.material.matrix
     if name != AUTO and FORMULATIONS[name].takes_parts and not scene.material.tells_volume_apart:
@@ -198,14 +148,14 @@ def parts_of_the_energy(scene: CheckedScene) -> Faults:
         yield rule, "mesh.formulation", name
 
 
-def axes_of_the_shape(scene: CheckedScene) -> Faults:
+def axes_of_the_shape(scene: Scene) -> Faults:
     """Axes that a shape has."""
     shape, axes = scene.geometry, scene.cells.axes
     if axes not in shape.axis_kinds:
         yield f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.axis_kinds))}", "cells.axes", axes
 
 
-def supports_of_the_shape(scene: CheckedScene) -> Faults:
+def supports_of_the_shape(scene: Scene) -> Faults:
     """Supports that a shape can have."""
     shape, ends, faces = scene.geometry, scene.supports.ends, scene.geometry.supported_faces
     if ends not in shape.ends:
@@ -222,7 +172,7 @@ def supports_of_the_shape(scene: CheckedScene) -> Faults:
             yield "allowed here is 'elastic'", f"{key}.kind", support.kind
 
 
-def cells_of_the_loaded_body(scene: CheckedScene) -> Faults:
+def cells_of_the_loaded_body(scene: Scene) -> Faults:
     """Cells that have come to rest in the loaded body."""
     key, cells, shape = "natural.cells", scene.natural.cells, scene.geometry
     if cells != "equilibrium":
@@ -233,7 +183,7 @@ def cells_of_the_loaded_body(scene: CheckedScene) -> Faults:
         yield "needs time.end = 'equilibrium'", key, cells
 
 
-def measured_natural_state(scene: CheckedScene) -> Faults:
+def measured_natural_state(scene: Scene) -> Faults:
     """Prestretch from the file of the cells."""
     natural, key = scene.natural, "natural.fibres"
     if not natural.fibres:
@@ -246,7 +196,7 @@ def measured_natural_state(scene: CheckedScene) -> Faults:
         yield "must be false unless mesh.formulation is 'displacement'", key, True
 
 
-def natural_state(scene: CheckedScene) -> Faults:
+def natural_state(scene: Scene) -> Faults:
     """Bodies with residual stress, with cells that the closing knows."""
     natural, shape, able, none = scene.natural, scene.geometry, Walled, "none"
     if natural.is_of_the_mesh or natural.fibres:
@@ -268,7 +218,7 @@ def natural_state(scene: CheckedScene) -> Faults:
             yield f"must be {none} unless {other} is {possible}", key, value
 
 
-def loads_of_the_body(scene: CheckedScene) -> Faults:
+def loads_of_the_body(scene: Scene) -> Faults:
     """Times at which steps end, values that the body can have, and a length that is prescribed or unknown."""
     time = scene.time
     for name, load in scene.loads.items():
@@ -286,7 +236,7 @@ def loads_of_the_body(scene: CheckedScene) -> Faults:
                     yield f"must be greater than {least:g} at every time; {words}", f"{key}.value", load.value
 
 
-def weights_and_factors(scene: CheckedScene) -> Faults:
+def weights_and_factors(scene: Scene) -> Faults:
     """Load cases that are shares of one whole, and factors on loads that there are."""
     for index, case in enumerate(scene.cases):
         for name, factor in case.loads.items():
@@ -299,7 +249,7 @@ def weights_and_factors(scene: CheckedScene) -> Faults:
         yield rule, f"cases[{len(scene.cases) - 1}].weight", scene.cases[-1].weight
 
 
-def coupling_and_mean(scene: CheckedScene) -> Faults:
+def coupling_and_mean(scene: Scene) -> Faults:
     """What the coupling and the mean over load cases ask of the rest."""
     remodeling, coupling = scene.remodeling, COUPLINGS[scene.remodeling.coupling]
     if (missing := coupling.missing(scene)) is not None:
@@ -313,7 +263,7 @@ def coupling_and_mean(scene: CheckedScene) -> Faults:
         yield f"with [[cases]] must be one of: {able}", "remodeling.coupling", remodeling.coupling
 
 
-def growth(scene: CheckedScene) -> Faults:
+def growth(scene: Scene) -> Faults:
     """Which bodies grow, and from when."""
     turnover, time = scene.remodeling.turnover, scene.time
     if not turnover.grows:
@@ -338,7 +288,7 @@ def growth(scene: CheckedScene) -> Faults:
         time.check_hit(start, key)
 
 
-def equilibrium(scene: CheckedScene) -> Faults:
+def equilibrium(scene: Scene) -> Faults:
     """An equilibrium of the cells that depends on no way there."""
     law, parts, key, end = scene.remodeling.law, scene.properties().items(), "time.end", scene.time.end
     if not scene.time.is_equilibrium:
@@ -354,7 +304,7 @@ def equilibrium(scene: CheckedScene) -> Faults:
         yield f"{', '.join(still)} = 0: the cells never change", key, end
 
 
-def unknown_length(scene: CheckedScene) -> Faults:
+def unknown_length(scene: Scene) -> Faults:
     """Multigrid has no place for one more unknown."""
     method = scene.solver.method
     if scene.has_free_length and method == "iterative":
@@ -363,7 +313,7 @@ def unknown_length(scene: CheckedScene) -> Faults:
         yield rule, "solver.method", method
 
 
-def times_of_output(scene: CheckedScene) -> Faults:
+def times_of_output(scene: Scene) -> Faults:
     """Times at which there are rows."""
     for index, moment in enumerate(scene.output.times):
         key = f"output.times[{index}]"
@@ -374,7 +324,7 @@ def times_of_output(scene: CheckedScene) -> Faults:
         scene.time.check_hit(moment, key)
 
 
-def fields_of_the_body(scene: CheckedScene) -> Faults:
+def fields_of_the_body(scene: Scene) -> Faults:
     """Fields that the run will have."""
     fields = scene.output.fields
     for field, reason in scene.lacking_fields.items():
@@ -382,7 +332,7 @@ def fields_of_the_body(scene: CheckedScene) -> Faults:
             yield reason, "output.fields", field
 
 
-def columns_of_the_history(scene: CheckedScene) -> Faults:
+def columns_of_the_history(scene: Scene) -> Faults:
     """Columns that the run will have."""
     shape, turnover, key = scene.geometry, scene.remodeling.turnover, "output.columns"
     of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
@@ -400,27 +350,27 @@ def columns_of_the_history(scene: CheckedScene) -> Faults:
             yield f"no such column on request; allowed for shape {shape.name!r} are {names}", key, name
 
 
-def kinematics(scene: CheckedScene) -> Faults:
+def kinematics(scene: Scene) -> Faults:
     """Kinematics that are right for the scene."""
     name = scene.model.kinematics
     if name != AUTO and (reasons := objections(scene, name)):
         yield "; ".join(reasons), "model.kinematics", name
 
 
-def number_of_elements(scene: CheckedScene) -> Faults:
+def number_of_elements(scene: Scene) -> Faults:
     """As many elements as Gmsh and memory bear."""
     if not isinstance(scene.geometry, FromFile) and (rule := too_many_elements(scene)):
         yield rule, "mesh.refinement", scene.mesh.refinement
 
 
-def names_of_columns(scene: CheckedScene) -> Faults:
+def names_of_columns(scene: Scene) -> Faults:
     """A name for each column of the history."""
     for name, count in Counter(column.name for column in scene.columns()).items():
         if count > 1:
             yield "there are two columns of this name; parts of your own need other names", name, None
 
 
-RULES: tuple[Rule, ...] = (
+RULES = (
     named_regions,
     tissue_of_regions,
     meshed_body,

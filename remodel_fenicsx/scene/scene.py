@@ -28,7 +28,7 @@ from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue, neo_hookean
 from remodel_fenicsx.model.laws import LAWS
-from remodel_fenicsx.scene import presets, rules
+from remodel_fenicsx.scene import presets
 from remodel_fenicsx.schema.settings import (
     AS_GIVEN,
     COUPLINGS,
@@ -51,11 +51,12 @@ from remodel_fenicsx.schema.settings import (
     Solver,
     Supports,
     Time,
-    NO_PRESTRETCH,
+    UNLOADED,
     faces_of,
 )
-from remodel_fenicsx.schema.conventions import convention_doubt
+from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.tables import (
+    Faults,
     IN_A_LIST,
     KeysOfParts,
     OneOf,
@@ -63,6 +64,7 @@ from remodel_fenicsx.schema.tables import (
     Table,
     VariantOf,
     allowed,
+    choices,
     fault,
     is_number,
     quoted,
@@ -72,7 +74,6 @@ from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, 
 from remodel_fenicsx.schema.units import (
     FORCE,
     LENGTH_UNIT,
-    LENGTH_UNITS,
     LARGEST_NUMBER,
     STRESS,
     STRESS_UNIT,
@@ -162,19 +163,13 @@ def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
         )
 
 
-def _doubted_keys(value: Any, key: str = "") -> Iterator[str]:
-    """Yield a line on each number of a table, or list of numbers, that may be in another convention."""
-    if isinstance(value, Mapping):
-        for name, inner in value.items():
-            yield from _doubted_keys(inner, f"{key}.{name}" if key else name)
-        return
-    numbers = value if isinstance(value, (list, tuple)) else [value]
-    if numbers and all(isinstance(number, float) for number in numbers):
-        if words := convention_doubt(key, numbers):
+def _doubted_keys(values: Mapping[str, object]) -> Iterator[str]:
+    """Yield a line on each number of tables, or list of numbers, that may be in another convention."""
+    for key, value in leaves(values):
+        numbers = value if isinstance(value, (list, tuple)) else [value]
+        is_of_numbers = bool(numbers) and all(isinstance(number, float) for number in numbers)
+        if is_of_numbers and (words := convention_doubt(key, numbers)):
             yield f"{key}: {words}"
-    elif numbers is value:
-        for number, item in enumerate(value):
-            yield from _doubted_keys(item, f"{key}[{number}]")
 
 
 def chain_stress(material: Material, end_to_end_length: float) -> float:
@@ -203,8 +198,6 @@ def _times(ratio: float) -> str:
 
 PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}  # which may bring keys of [material]
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
-RENAMED = {"mesh.cell": "mesh.element", "loads.stretch": "loads.elongation", "solver.profile": "solver.method"}
-"""Dotted key of an earlier format -> the key that has taken its place, for the error."""
 COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
 MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
 SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
@@ -253,7 +246,7 @@ class Scene(Table):
     remodel_fenicsx.schema.tables.SceneError: remodeling.kappa = -1.0: must be a finite number at least 0
     """
 
-    renamed: ClassVar[Mapping[str, str]] = RENAMED
+    rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none."""
@@ -311,7 +304,8 @@ class Scene(Table):
 
         def made(settings: Mapping[str, object]) -> Scene:
             values = merged(merged(base, presets.nested(settings)), own)
-            _check_sizes(values, "")
+            if large := [item for item in leaves(values) if is_number(item[1]) and abs(item[1]) > LARGEST_NUMBER]:
+                raise fault(NUMBER_TOO_LARGE, *large[0])
             with scene_units(_units(values, SHAPES[shape])):
                 return handler(_with_numbers_of_loads(values, SHAPES[shape]))
 
@@ -320,14 +314,14 @@ class Scene(Table):
         _check_name("profile", profile, presets.PROFILES)
         return _with_profile(profile, made)
 
-    @model_validator(mode="after")
-    def _tables_fit_together(self) -> Scene:
+    def faults(self) -> Faults:
+        """What its tables do not bear of each other, once numbers of experiments are those of the model."""
         whole = presets.with_own_numbers(self, Scene.whole)
         over = partial(Region.over, others=whole.whole())
         regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
         self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
-        rules.check(self)
-        return self
+        for rule in self.rules:
+            yield from rule(self)
 
     @property
     def _stiffness_ratio(self) -> float:
@@ -474,15 +468,16 @@ class Scene(Table):
     @property
     def lacking_fields(self) -> dict[str, str]:
         """Fields that the body has not, each with the reason."""
-        found = {} if self.regions else {REGION: "the scene has no regions"}
-        same = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
-        found |= dict.fromkeys(NO_PRESTRETCH, same) if self.natural.is_of_the_mesh else {}
-        if self.remodeling.turnover.grows:
-            found.pop(NATURAL_GRADIENT, None)
-        stays = "it changes only with remodeling.turnover, which is not set"
-        found |= {} if self.remodeling.turnover.is_on else dict.fromkeys(TURNED_OVER, stays)
-        room = "tissue grows only with a remodeling.turnover.volume above 0"
-        return found | ({} if self.remodeling.turnover.grows else {GROWTH: room})
+        turnover, same = self.remodeling.turnover, self.natural.is_of_the_mesh
+        stress_free = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
+        reasons: list[tuple[bool, Sequence[str], str]] = [
+            (not self.regions, (REGION,), "the scene has no regions"),
+            (same, (UNLOADED,), stress_free),
+            (same and not turnover.grows, (NATURAL_GRADIENT,), stress_free),
+            (not turnover.is_on, TURNED_OVER, "it changes only with remodeling.turnover, which is not set"),
+            (not turnover.grows, (GROWTH,), "tissue grows only with a remodeling.turnover.volume above 0"),
+        ]
+        return {name: reason for lacks, names, reason in reasons if lacks for name in names}
 
     @property
     def has_free_length(self) -> bool:
@@ -540,30 +535,33 @@ class Scene(Table):
             f"loads rise and afterwards, so rows have another one; {way}"
         ]
 
-    def _of_turnover(self) -> list[str]:
+    def _of_turnover(self) -> Iterator[str]:
         """Gains that do not rest, or slowly; explicit steps longer than its time, in which content overshoots."""
-        turnover, step, found = self.remodeling.turnover, self.time.step, dict[str, None]()
-        if not turnover.is_on:
-            return []
+        turnover, step = self.remodeling.turnover, self.time.step
+        if turnover.time is None:
+            return
         for name, properties in self.properties().items():
             power, slowly = turnover.rule.rest(properties.tissue)
             says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
-            least = 2 * turnover.gain / power if turnover.gain else math.inf
             if power <= 2:
-                found[
-                    f"{says}: does not come to rest with this deposition_stretch; rest needs more than {least:.3g}"
-                ] = None
+                least = 2 * turnover.gain / power if turnover.gain else math.inf
+                yield f"{says}: does not come to rest with this deposition_stretch; rest needs more than {least:.3g}"
             elif power < SLOW_REST:
                 words = "by a factor of e where collagen alone bears the loads, and sooner with a matrix"
-                found[f"{says}: comes to rest slowly, in a time of {slowly:.3g} {words}"] = None
+                yield f"{says}: comes to rest slowly, in a time of {slowly:.3g} {words}"
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
-        if chosen or COUPLINGS[self.remodeling.coupling].solves_cells or step <= (turnover.time or math.inf):
-            return [*found]
-        return [
-            *found,
-            f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and natural "
-            "length overshoot in each step; set a shorter time.step or time.tolerance",
-        ]
+        if not chosen and not COUPLINGS[self.remodeling.coupling].solves_cells and step > turnover.time:
+            yield (
+                f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and "
+                "natural length overshoot in each step; set a shorter time.step or time.tolerance"
+            )
+
+    def _values(self) -> dict[str, Any]:
+        """All of them, from which the same scene can be made."""
+        return self.model_dump(exclude_none=True, exclude=None if self.is_as_run else {"format"})
+
+    def __reduce__(self) -> tuple[object, ...]:  # for other processes: keys of parts are in no class that they find
+        return scene_from_dict, (self._values(),)
 
     def with_values(self, changes: Mapping[str, object]) -> Scene:
         """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
@@ -575,7 +573,7 @@ class Scene(Table):
         SceneError
             One line: key, value, what is allowed.
         """
-        values = self.model_dump(exclude_none=True, exclude=None if self.is_as_run else {"format"})
+        values = self._values()
         for key, value in changes.items():
             if not isinstance(key, str):
                 raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
@@ -605,50 +603,39 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
     if written > FORMAT:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
-    return {**_without_columns(_with_turnover(values), COLUMNS_THAT_WENT), "format": FORMAT}
-
-
-def _with_turnover(values: Mapping[str, object]) -> Mapping[str, object]:
-    """Turnover as it was run: none without a time; by tension and without room where 0.3.0 wrote neither."""
-    remodeling: Any = values.get("remodeling")
-    turnover = remodeling.get("turnover") if isinstance(remodeling, Mapping) else None
-    if not isinstance(turnover, Mapping) or "rates" in turnover:
-        return values
-    turned = {"rates": "tension", "volume": 0.0, **turnover} if "time" in turnover else {}
-    return {**values, "remodeling": {**remodeling, "turnover": turned}}
-
-
-def _without_columns(values: Mapping[str, object], names: tuple[str, ...]) -> dict[str, object]:
-    output = values.get("output")
-    if not isinstance(output, Mapping) or not isinstance(asked := output.get("columns"), list | tuple):
-        return dict(values)
-    return {**values, "output": {**output, "columns": [name for name in asked if name not in names]}}
+    values = {**values, "format": FORMAT}
+    turnover, columns = presets.said(values, "remodeling", "turnover"), presets.said(values, "output", "columns")
+    if isinstance(turnover, Mapping) and "time" in turnover:  # as version 0.3.0 ran it, where it does not say
+        values = merged({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
+    if isinstance(columns, list | tuple):
+        values = merged(values, {"output": {"columns": [name for name in columns if name not in COLUMNS_THAT_WENT]}})
+    return values
 
 
 def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
     """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
     for name, part in presets.parts_of(values):
-        cells = part.get("cells")
-        if not isinstance(cells, Mapping) or cells.get("fibres") is None:
-            continue
-        if (said := cells.get("initial", MEASURED_CELLS)) != MEASURED_CELLS:
-            rule = f"{presets.place_of(name)}cells.initial = {shown(said)} is there too; one of them gives the cells"
-            raise fault(rule, f"{presets.place_of(name)}cells.fibres", cells["fibres"])
-        values = presets.with_part(values, name, {**part, "cells": {**cells, "initial": MEASURED_CELLS}})
+        fibres, initial = (presets.said(part, "cells", key) for key in ("fibres", "initial"))
+        if fibres is not None and initial not in (None, MEASURED_CELLS):
+            place = f"{presets.place_of(name)}cells"
+            raise fault(
+                f"{place}.initial = {shown(initial)} is there too; one of them gives the cells",
+                f"{place}.fibres",
+                fibres,
+            )
+        if fibres is not None:
+            values = presets.with_part(values, name, {"cells": {"initial": MEASURED_CELLS}})
     return values
 
 
 def _beside(values: dict[str, object], folder: Path) -> dict[str, object]:
     """The keys of a file in this folder, with the places of the files that they name."""
     for name, part in presets.parts_of(values):
-        cells = part.get("cells")
-        if isinstance(cells, Mapping) and isinstance(file := cells.get("fibres"), str):
-            values = presets.with_part(
-                values, name, {**part, "cells": {**cells, "fibres": str(folder.absolute() / file)}}
-            )
-    geometry = values.get("geometry")
-    if isinstance(geometry, Mapping) and isinstance(kind := geometry.get("shape"), str) and kind in SHAPES:
-        values = {**values, "geometry": SHAPES[kind].with_files_from(geometry, folder)}
+        if isinstance(file := presets.said(part, "cells", "fibres"), str):
+            values = presets.with_part(values, name, {"cells": {"fibres": str(folder.absolute() / file)}})
+    kind = presets.said(values, "geometry", "shape")
+    if isinstance(kind, str) and kind in SHAPES:
+        values = {**values, "geometry": SHAPES[kind].with_files_from(values["geometry"], folder)}
     return values
 
 
@@ -658,22 +645,13 @@ def _words(region: str) -> str:
 
 def _follow(values: dict[str, Any], changed: Mapping[str, object], is_whole: bool) -> None:
     """Take out what no longer fits to changed values; of a scene that has all values, a choice may be the run's own."""
-    tables = (values.get("output"), "times"), (values.get("time"), "end")
-    times, end = (table.get(key) if isinstance(table, dict) else None for table, key in tables)
+    times, end = presets.said(values, "output", "times"), presets.said(values, "time", "end")
     if "time.end" in changed and "output.times" not in changed and is_number(end) and isinstance(times, list | tuple):
         values["output"]["times"] = [time for time in times if not is_number(time) or time <= end]
         if (dropped := len(times) - len(values["output"]["times"])) and is_first_rank():
             log.warning("output.times: %d after time.end = %g dropped", dropped, end)
     if is_whole:
         presets.without_replaced(values, changed)
-
-
-def _check_sizes(value: object, key: str) -> None:
-    if isinstance(value, Mapping):
-        for name, inner in value.items():
-            _check_sizes(inner, f"{key}.{name}" if key else str(name))
-    elif is_number(value) and abs(value) > LARGEST_NUMBER:
-        raise fault(NUMBER_TOO_LARGE, key, value)
 
 
 def _check_name(key: str, name: object, names: Iterable[str]) -> None:
@@ -694,12 +672,12 @@ def _known_shape(geometry: object) -> str:
 def _units(values: Mapping[str, object], shape: type[Shape]) -> dict[str, str | None]:
     """The units that a scene chooses, by their keys."""
     units: dict[str, str | None] = {}
-    for key, table, known in ((STRESS_UNIT, Material, tuple(STRESS_UNITS)), (LENGTH_UNIT, shape, LENGTH_UNITS)):
-        table_name, name = key.split(".")
-        chosen, field = values.get(table_name), table.model_fields[name]
-        units[key] = chosen.get(name, field.default) if isinstance(chosen, Mapping) else field.default
-        if units[key] not in (*known, None):
-            raise fault(allowed(field), key, units[key])
+    for key, kind in ((STRESS_UNIT, Material), (LENGTH_UNIT, shape)):
+        table, name = key.split(".")
+        field, chosen = kind.model_fields[name], presets.said(values, table, name)
+        if chosen not in (*choices(field), None):
+            raise fault(allowed(field), key, chosen)
+        units[key] = field.default if chosen is None else chosen
     return units
 
 
@@ -725,8 +703,7 @@ def _check_load_names(shape: str, loads: object) -> None:
             _check_load_on_face(kind, str(name), load)
         elif name not in names:
             key, listed = f"loads.{quoted(str(name))}", ", ".join(f"loads.{known}" for known in names)
-            rule = f"is now {RENAMED[key]}" if key in RENAMED else f"a {shape} has no such load; allowed: {listed}"
-            raise fault(rule, key, load)
+            raise fault(f"a {shape} has no such load; allowed: {listed}", key, load)
 
 
 def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object]) -> None:
@@ -903,13 +880,15 @@ def _ramp_times(load: Load | None) -> list[float]:
     return [] if load is None else [time for time, _ in load.ramp]
 
 
-def leaves(table: Mapping[str, object], free: Sequence[str], key: str = "") -> Iterator[tuple[str, object]]:
-    """(dotted key, value) of all values but those that are free."""
-    for name, value in table.items():
-        path = f"{key}.{name}" if key else name
-        if path in free or path.endswith("cells.fibres"):  # the SHA-256 beside it must stay
-            continue
-        if isinstance(value, Mapping):
-            yield from leaves(value, free, path)
-        else:
-            yield path, value
+def leaves(value: object, free: Sequence[str] = (), key: str = "") -> Iterator[tuple[str, object]]:
+    """(dotted key, value) of all values in tables and lists of tables, but those that are free."""
+    if key in free or key.endswith("cells.fibres"):  # the SHA-256 beside it must stay
+        return
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from leaves(inner, free, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)) and any(isinstance(entry, Mapping) for entry in value):
+        for number, inner in enumerate(value):
+            yield from leaves(inner, free, f"{key}[{number}]")
+    else:
+        yield key, value

@@ -12,11 +12,11 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Optional
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, create_model
 
 from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
@@ -37,6 +37,7 @@ from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OV
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES, TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import (
+    Faults,
     IN_A_LIST,
     KeysOfParts,
     OneOf,
@@ -102,14 +103,12 @@ class Mesh(Table):
         f"needs 'displacement'. {meanings(FORMULATIONS)} (docs/what_may_go_wrong.md).",
     )
 
-    @model_validator(mode="after")
-    def _formulation_has_the_element(self) -> Mesh:
+    def faults(self) -> Faults:
         pair = self.element, self.degree
         if self.formulation != AUTO and not FORMULATIONS[self.formulation].has(*pair):
             able = named(FORMULATIONS, lambda formulation: formulation.has(*pair))
             rule = f"allowed for elements {self.element!r} of degree {self.degree} is {able}"
-            raise fault(rule, "formulation", self.formulation)
-        return self
+            yield rule, "formulation", self.formulation
 
 
 class Model(Table):
@@ -141,11 +140,9 @@ class Support(Table):
     """For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown may twist. With 0 a
     tube may be solved on one radius, which cannot twist."""
 
-    @model_validator(mode="after")
-    def _springs_have_a_stiffness(self) -> Support:
+    def faults(self) -> Faults:
         if self.kind == "elastic" and self.stiffness is None:
-            raise fault("missing; a support of kind 'elastic' needs it, as in '10 kPa/mm'", "stiffness", None)
-        return self
+            yield "missing; a support of kind 'elastic' needs it, as in '10 kPa/mm'", "stiffness", None
 
 
 class Supports(Table):
@@ -222,7 +219,7 @@ class Material(Table):
     """Repulsive energy, which makes the reference state free of stress. 'axes': the paper's, in the stretches along the
     cell axes. 'log': of the structure tensor alone (A : ln C); the default with the law 'tensor'. 'length': of the
     length of the chains alone."""
-    stress_unit: Literal["Pa", "kPa", "MPa"] = "Pa"
+    stress_unit: Annotated[str, OneOf(STRESS_UNITS)] = "Pa"
     """Unit of every stress of the scene. Forces are in this unit times the unit of length squared."""
 
     @property
@@ -285,19 +282,16 @@ class Prestretch(Table):
     radial: float | None = Field(default=None, gt=0)
     """Stretch across the wall."""
 
-    @model_validator(mode="after")
-    def _says_one(self) -> Prestretch:
+    def faults(self) -> Faults:
         if not _set(self):
-            raise fault("needs one of " + ", ".join(type(self).model_fields))
-        return self
+            yield "needs one of " + ", ".join(type(self).model_fields), "", self
 
     @property
     def stretches(self) -> tuple[float, float, float]:
         """Around, along and across."""
-        given = [self.circumferential, self.axial, self.radial]
-        known = [value for value in given if value is not None]
-        other = float(np.prod(known)) ** (-1 / (3 - len(known))) if len(known) < 3 else 1.0
-        around, along, across = (other if value is None else value for value in given)
+        given = (self.circumferential, self.axial, self.radial)
+        known = math.prod(value for value in given if value is not None)
+        around, along, across = (known ** (-1 / given.count(None)) if value is None else value for value in given)
         return around, along, across
 
 
@@ -316,14 +310,12 @@ class NaturalLayer(_From):  # type: ignore[misc]
     prestretch: Prestretch
     """Stretches from the layer's natural state to the unloaded body."""
 
-    @model_validator(mode="after")
-    def _is_somewhere(self) -> NaturalLayer:
+    def faults(self) -> Faults:
         low, high = self.share
         if not low < high:
-            raise fault(f"must be smaller than to = {shown(high)}", "from", low)
+            yield f"must be smaller than to = {shown(high)}", "from", low
         if self.region is not None and self.share != (0.0, 1.0):
-            raise fault("a layer with a region takes no from and to", "region", self.region)
-        return self
+            yield "a layer with a region takes no from and to", "region", self.region
 
     @property
     def share(self) -> tuple[float, float]:
@@ -360,19 +352,14 @@ class Natural(Table):
         """Whether the mesh is free of stress."""
         return self.opening_angle == 0.0 and not self.layers and not self.fibres
 
-    @model_validator(mode="after")
-    def _layers_lie_apart(self) -> Natural:
-        for index, layer in enumerate(self.layers):
-            for other in self.layers[:index]:
-                same = layer.region is not None and layer.region == other.region
-                if (layer.region is None) != (other.region is None):
-                    raise fault("some layers have a region and some a share of the wall: allowed is one kind",
-                                f"layers[{index}].region", layer.region)  # fmt: skip
-                apart = layer.share[0] >= other.share[1] or layer.share[1] <= other.share[0]
-                if same or (layer.region is None and not apart):
-                    place = layer.region if same else list(layer.share)
-                    raise fault("lies in another layer", f"layers[{index}]", place)
-        return self
+    def faults(self) -> Faults:
+        for (_, other), (index, layer) in itertools.combinations(enumerate(self.layers), 2):
+            if (layer.region is None) != (other.region is None):
+                rule = "some layers have a region and some a share of the wall: allowed is one kind"
+                yield rule, f"layers[{index}].region", layer.region
+            meet = layer.share[0] < other.share[1] and other.share[0] < layer.share[1]  # with regions all do
+            if meet and layer.region == other.region:
+                yield "lies in another layer", f"layers[{index}]", layer.region or list(layer.share)
 
 
 SAME_DRAWS = 3  # antithetic seeds: over as many turns of l_1, l_2, l_3 the mean of A is isotropic in each element
@@ -435,11 +422,9 @@ class Cells(Table):
     """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It stays in the repulsive
     energy while the cells remodel."""
 
-    @model_validator(mode="after")
-    def _length_of_the_chain(self) -> Cells:
+    def faults(self) -> Faults:
         if (rule := self.fault_of_length()) is not None:
-            raise fault(rule, "initial", self.initial)
-        return self
+            yield rule, "initial", self.initial
 
     def fault_of_length(self) -> str | None:
         """What keeps three lengths from being those of a chain; None if nothing does."""
@@ -629,11 +614,9 @@ class Turnover(_WithStart):  # type: ignore[misc]
         """Whether there is any."""
         return self.time is not None
 
-    @model_validator(mode="after")
-    def _says_its_time(self) -> Turnover:
+    def faults(self) -> Faults:
         if self.time is None and self != Turnover.model_construct():
-            raise fault("missing; turnover needs its time", "time", None)
-        return self
+            yield "missing; turnover needs its time", "time", None
 
 
 @dataclass(frozen=True)
@@ -769,25 +752,23 @@ class Remodeling(Table):
         """Whether exponent or threshold is another than the paper's."""
         return self.exponent != 2.0 or self.threshold != 0.0
 
-    @model_validator(mode="after")
-    def _parts_fit_together(self) -> Remodeling:
+    def faults(self) -> Faults:
         law, driver, coupling = LAWS[self.law], DRIVERS[self.driver], COUPLINGS[self.coupling]
         able = named(LAWS, lambda law: law.takes_set_points)
         for key, plain in (("exponent", 2), ("threshold", 0)):
             if getattr(self, key) != plain and not law.takes_set_points:
-                raise fault(f"must be {plain} unless remodeling.law is {able}", key, getattr(self, key))
+                yield f"must be {plain} unless remodeling.law is {able}", key, getattr(self, key)
         if self.threshold and not driver.is_stress:
             drivers = named(DRIVERS, lambda driver: driver.is_stress)
-            raise fault(f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold)
+            yield f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold
         if self.turnover.is_on and not law.takes_set_points:
-            raise fault(f"needs remodeling.law = {able}", "turnover", None)
+            yield f"needs remodeling.law = {able}", "turnover", None
         if self.turnover.is_on and not coupling.takes_turnover:
             able = named(COUPLINGS, lambda kind: kind.takes_turnover)
-            raise fault(f"with remodeling.turnover must be one of: {able}", "coupling", self.coupling)
+            yield f"with remodeling.turnover must be one of: {able}", "coupling", self.coupling
         if coupling.needs_a_target and law.target is None:
             rule = f"needs a remodeling.law with a target that can be extrapolated: {laws_with_a_target()}"
-            raise fault(rule, "coupling", self.coupling)
-        return self
+            yield rule, "coupling", self.coupling
 
 
 def laws_with_a_target() -> str:
@@ -816,46 +797,40 @@ class Properties(NamedTuple):
         return self.material.tissue(self.cells.end_to_end_length)
 
 
-def _as_in(table: type[Table], name: str, key: str) -> Any:
-    """A key of another table that may be left out: the value of that table holds then."""
-    field = copy.copy(table.model_fields[name])
-    field.default, field.description = None, f"As `{key}.{name}`, for this region. Default: that of the whole body."
-    return field
+def _for_regions(table: type[Table], key: str, *names: str) -> Any:
+    """A class with some keys of another table, each of which may be left out: the value of that table holds then."""
+    fields: Any = {}
+    for name in names:
+        field = copy.copy(table.model_fields[name])
+        field.default, field.description = None, f"As `{key}.{name}`, for this region. Default: that of the whole body."
+        fields[name] = Optional[field.annotation], field
+    return create_model(f"_Some_{key}", __base__=Table, **fields)
 
 
-class RegionMaterial(Table):
+_SomeMaterial: Any = _for_regions(
+    Material, "material", "lame_lambda", "lame_mu", "chain_density", "contour_length", "persistence_length",
+    "initial_stiffness", "locking_stretch", "temperature", "matrix",
+)  # fmt: skip
+_SomeCells: Any = _for_regions(
+    Cells, "cells", "initial", "fibres", "fibres_sha256", "aligned_axis", "end_to_end_length"
+)
+_SomeRemodeling: Any = _for_regions(Remodeling, "remodeling", "kappa", "half_life")
+
+
+class RegionMaterial(_SomeMaterial):  # type: ignore[misc]
     """Keys of `[material]` that differ in the region. The other keys of `[material]` hold for the whole body.
 
     With `chain_density = 0` the region has no collagen: its angles are empty, and its cells stay. A region that has own
     numbers for a matrix of an extension names `matrix` too.
     """
 
-    lame_lambda: float | None = _as_in(Material, "lame_lambda", "material")
-    lame_mu: float | None = _as_in(Material, "lame_mu", "material")
-    chain_density: float | None = _as_in(Material, "chain_density", "material")
-    contour_length: float | None = _as_in(Material, "contour_length", "material")
-    persistence_length: float | None = _as_in(Material, "persistence_length", "material")
-    initial_stiffness: float | None = _as_in(Material, "initial_stiffness", "material")
-    locking_stretch: float | None = _as_in(Material, "locking_stretch", "material")
-    temperature: float | None = _as_in(Material, "temperature", "material")
-    matrix: str | None = _as_in(Material, "matrix", "material")
 
-
-class RegionCells(Table):
+class RegionCells(_SomeCells):  # type: ignore[misc]
     """Keys of `[cells]` that differ in the region. Axes and seed hold for the whole body."""
 
-    initial: InitialCells | None = _as_in(Cells, "initial", "cells")
-    fibres: str | None = _as_in(Cells, "fibres", "cells")
-    fibres_sha256: str | None = _as_in(Cells, "fibres_sha256", "cells")
-    aligned_axis: int | None = _as_in(Cells, "aligned_axis", "cells")
-    end_to_end_length: float | None = _as_in(Cells, "end_to_end_length", "cells")
 
-
-class RegionRemodeling(Table):
+class RegionRemodeling(_SomeRemodeling):  # type: ignore[misc]
     """Keys of `[remodeling]` that differ in the region. The law holds for the whole body."""
-
-    kappa: float | None = _as_in(Remodeling, "kappa", "remodeling")
-    half_life: float | None = _as_in(Remodeling, "half_life", "remodeling")
 
 
 class Region(Table):
@@ -927,12 +902,10 @@ class Load(Table):
     face: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"})
     """For a further load of a body of your own: the face that it acts on."""
 
-    @model_validator(mode="after")
-    def _kind_and_face(self) -> Load:
+    def faults(self) -> Faults:
         for given, missing in (("kind", "face"), ("face", "kind")):
             if getattr(self, given) is not None and getattr(self, missing) is None:
-                raise fault(f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None)
-        return self
+                yield f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None
 
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
@@ -980,15 +953,11 @@ class OnFace(NamedTuple):
 
 def faces_of(loads: Mapping[str, object]) -> dict[str, OnFace]:
     """Of the further loads among a scene's by name, tables as they were read or as they are."""
-
-    def said(load: object, key: str) -> Any:
-        return load.get(key) if isinstance(load, Mapping) else getattr(load, key, None)
-
-    found = {name: (said(load, "face"), said(load, "kind")) for name, load in loads.items()}
+    tables = {name: dict(load) for name, load in loads.items() if isinstance(load, (Mapping, Load))}
     return {
-        name: OnFace(face, "displacement" if kind == "displacement" else "pressure")
-        for name, (face, kind) in found.items()
-        if isinstance(face, str)
+        name: OnFace(load["face"], "displacement" if load.get("kind") == "displacement" else "pressure")
+        for name, load in tables.items()
+        if isinstance(load.get("face"), str)
     }
 
 
@@ -1017,17 +986,15 @@ class Time(Table):
     that of lengths (1 degree stands for 1.7 %; docs/theory.md, Error-controlled steps). With end = 'equilibrium'
     the default is 3 degrees, or 0.5 where a load falls."""
 
-    @model_validator(mode="after")
-    def _whole_number_of_steps(self) -> Time:
+    def faults(self) -> Faults:
         if self.is_equilibrium:
-            return self
+            return
         if self.step > self.end:
-            raise fault(f"must be at most time.end = {shown(self.end)}", "step", self.step)
+            yield f"must be at most time.end = {shown(self.end)}", "step", self.step
         if self.end / self.step > MOST_STEPS:
             rule = f"must be at least time.end / {MOST_STEPS} = {self.end / MOST_STEPS:.6g}"
-            raise fault(rule, "step", self.step)
+            yield rule, "step", self.step
         self.check_hit(self.end, "end")
-        return self
 
     def is_hit(self, time: float) -> bool:
         """Whether a step ends at a time, or may end there."""
@@ -1134,11 +1101,9 @@ class Solver(Table):
     """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_... and mat_.... Options
     that run code or write files are refused."""
 
-    @model_validator(mode="after")
-    def _has_a_tolerance(self) -> Solver:
+    def faults(self) -> Faults:
         if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
-            raise fault("must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0)
-        return self
+            yield "must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0
 
 
 FIELDS_BY_NAME = (

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType, NoneType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -24,6 +24,7 @@ from pydantic import (
     GetJsonSchemaHandler,
     ValidationError,
     create_model,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, SchemaValidator, core_schema
@@ -31,7 +32,7 @@ from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, SchemaV
 from remodel_fenicsx.errors import RemodelError, printable, shortened
 
 if TYPE_CHECKING:
-    from typing import SupportsIndex, TypeGuard
+    from typing import TypeGuard
 
     from pydantic.json_schema import JsonSchemaValue
 
@@ -39,6 +40,7 @@ LONGEST_VALUE = 60  # characters of a value in an error
 # annotation of a tuple: what is a list in TOML becomes one
 IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
+Faults = Iterator[tuple[str, str, object]]  # what is allowed, a key, and its value; the first is told
 T = TypeVar("T")
 
 
@@ -69,10 +71,6 @@ class Table(BaseModel):
 
     Attributes
     ----------
-    widened
-        Where parts have brought keys: the class without these, and they.
-    renamed
-        Of the outermost table: dotted keys of earlier versions, each with the one that has taken its place.
     further
         Class of tables that may be there under any name beside the fields; None: there are none.
 
@@ -91,13 +89,21 @@ class Table(BaseModel):
     remodel_fenicsx.schema.tables.SceneError: rate = 'fast': must be a finite number
     """
 
-    renamed: ClassVar[Mapping[str, str]] = {}
-    further: ClassVar[type[BaseModel] | None] = None
-    widened: ClassVar[Any] = None
+    further: ClassVar[type[Table] | None] = None
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    def faults(self) -> Faults:
+        """What does not fit together in its keys: what is allowed, the key and its value."""
+        yield from ()
+
+    @model_validator(mode="after")
+    def _has_none(self) -> Self:
+        for broken in self.faults():
+            raise fault(*broken)
+        return self
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -112,11 +118,6 @@ class Table(BaseModel):
         if cls.further is not None:
             table["additionalProperties"] = handler(cls.further.__pydantic_core_schema__)
         return found
-
-    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[object, ...]:
-        if self.widened is None:
-            return super().__reduce_ex__(protocol)
-        return _unpickled, (self.widened, self.__getstate__())
 
     if not TYPE_CHECKING:  # the type checker reads the arguments from the fields
 
@@ -145,8 +146,19 @@ def _of_python(value: Any) -> object:
     return type(value)(map(_of_python, value)) if type(value) in (list, tuple) else value
 
 
+class Before:
+    """An annotation of a field whose values are looked at first."""
+
+    def __get_pydantic_core_schema__(self, source: type, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(functools.partial(self.seen, source), handler(source))
+
+    def seen(self, source: type, value: object) -> object:
+        """The value to take in place of one of a field of this type."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class OneOf:
+class OneOf(Before):
     """Annotation of a field whose value is one of a registry's keys, those registered later included."""
 
     registry: Collection[object]
@@ -158,29 +170,24 @@ class OneOf:
         """All that is allowed."""
         return [*self.also, *(name for name in self.registry if name not in (self.removed or ()))]
 
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(self._check, handler(source))
-
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"enum": self.choices}
 
-    def _check(self, value: Any) -> object:
-        if self.removed and value in self.removed and value not in self.registry:
-            raise fault(self.removed[value])
+    def seen(self, source: type, value: object) -> object:
+        """The value, if it is one of those."""
+        if isinstance(value, str) and value in (self.removed or ()) and value not in self.registry:
+            raise fault((self.removed or {})[value])
         if value is not None and value not in (*self.also, *self.registry):
             raise ValueError("not registered")
         return value
 
 
 @dataclass(frozen=True)
-class VariantOf:
+class VariantOf(Before):
     """Annotation of a field that is one of several tables, those registered later included."""
 
-    registry: Mapping[str, type[BaseModel]]
+    registry: Mapping[str, type[Table]]
     tag: str
-
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(self._table, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """The keys of any variant, which an editor completes, and those that each has."""
@@ -193,7 +200,8 @@ class VariantOf:
         known[self.tag]["enum"] = list(self.registry)
         return {"type": "object", "properties": known, "required": [self.tag], "allOf": chosen}
 
-    def _table(self, value: object) -> object:
+    def seen(self, source: type, value: object) -> object:
+        """The table of the variant that a table names."""
         if not isinstance(value, Mapping):
             return value
         name = value[self.tag]
@@ -217,17 +225,16 @@ class OwnNumber(Protocol):
 
 
 @dataclass(frozen=True)
-class KeysOfParts:
+class KeysOfParts(Before):
     """Annotation of a field that is a table: with the keys too that the parts chosen in it bring (`parameters`)."""
 
     registries: Mapping[str, Mapping[str, object]]  # by the key that names the part
     optional: bool = False  # whether the keys may be left out, as those of regions
     tables: Mapping[str, PartWithTable] = MappingProxyType({})  # parts that bring a table of their name
 
-    def __get_pydantic_core_schema__(self, source: type[Table], handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(functools.partial(self._table, source), handler(source))
-
-    def _table(self, table: type[Table], value: object) -> object:
+    def seen(self, source: type, value: object) -> object:
+        """The table with the keys of its parts."""
+        table: type[Table] = source
         if not isinstance(value, Mapping):
             return value
         chosen = {key: value.get(key, table.model_fields[key].default) for key in self.registries}
@@ -256,17 +263,7 @@ def _widened(table: type[Table], own: Own, optional: bool) -> type[Table]:
         if not isinstance(number, type)
     }
     fields |= {name: (inner, inner()) for name, inner in own if isinstance(inner, type)}
-    wide = create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
-    wide.widened = table, own, optional
-    return wide
-
-
-def _unpickled(widened: tuple[type[Table], Own, bool], state: dict[str, object]) -> Table:
-    """A table whose class is made, and so has no place from which it could be imported."""
-    kind = _widened(*widened)
-    made = kind.__new__(kind)
-    made.__setstate__(state)
-    return made
+    return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
 
 
 def fault(rule: str, key: str = "", value: object = _MISSING) -> PydanticCustomError:
@@ -296,7 +293,7 @@ def is_number(value: object) -> TypeGuard[float]:
 # ---------------------------------------------------------------- one line for an error
 
 
-def one_line(error: ValidationError, table: type[BaseModel]) -> str:
+def one_line(error: ValidationError, table: type[Table]) -> str:
     """`key = value: what is allowed` of the first fault, with the number of further ones."""
     faults: dict[str, ErrorDetails] = {}  # where several kinds of values are allowed there is one for each kind
     for detail in sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden"):
@@ -310,7 +307,7 @@ def one_line(error: ValidationError, table: type[BaseModel]) -> str:
     return f"{text} (and {more} more fault{'s' if more > 1 else ''})" if more else text
 
 
-def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
+def _describe(detail: ErrorDetails, table: type[Table]) -> str:
     key, owner, field = locate(table, detail["loc"])
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "fault":
@@ -320,17 +317,15 @@ def _describe(detail: ErrorDetails, table: type[BaseModel]) -> str:
     if kind == "worded":
         return _joined(key, context["text"])
     if kind == "extra_forbidden":
-        renamed: Mapping[str, str] = getattr(table, "renamed", {})
-        rule = f"is now {renamed[key]}" if key in renamed else f"unknown key; {_suggestion(key, owner, table)}"
-        return f"{key} = {shown(value)}: {rule}"
+        return f"{key} = {shown(value)}: unknown key; {_suggestion(key, owner, table)}"
     rule = detail["msg"] if field is None else allowed(field)
     return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {shown(value)}: {rule}"
 
 
-def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel], FieldInfo | None]:
+def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, type[Table], FieldInfo | None]:
     """Dotted key of a place in a table, the table class that owns it, and its field (None where there is none)."""
     key, owner, field = "", table, None
-    inside: type[BaseModel] | None = table  # the table of which the next item is a key
+    inside: type[Table] | None = table  # the table of which the next item is a key
     items = list(location)
     while items:
         item = items.pop(0)
@@ -342,7 +337,7 @@ def locate(table: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
             continue
         key, owner, field = _joined(key, _step(item)), inside, inside.model_fields.get(str(item))
         if field is None:
-            inside = free_names(owner)
+            inside = owner.further
             if inside is not None:
                 owner, field = inside, FieldInfo.from_annotation(inside)
             continue
@@ -397,13 +392,13 @@ def _nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
     return difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
 
 
-def _nearest_key(key: str, owner: type[BaseModel]) -> str:
+def _nearest_key(key: str, owner: type[Table]) -> str:
     """The key of the same table that is most like an unknown one, or nothing."""
     parent, _, name = key.rpartition(".")
     return "".join(_joined(parent, near) for near in _nearest(name, owner.model_fields))
 
 
-def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str:
+def _suggestion(key: str, owner: type[Table], table: type[Table]) -> str:
     """The nearest key of the same table, else a key of the same name in another one, else all keys of the table."""
     parent, _, name = key.rpartition(".")
     if near := _nearest_key(key, owner):
@@ -418,14 +413,9 @@ def _suggestion(key: str, owner: type[BaseModel], table: type[BaseModel]) -> str
 # ---------------------------------------------------------------- what a field allows
 
 
-def is_table(annotation: object) -> bool:
+def is_table(annotation: object) -> TypeGuard[type[Table]]:
     """Whether an annotation is a table class."""
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def free_names(table: object) -> type[BaseModel] | None:
-    """The class of the tables that a table may have under any name beside its fields, or None."""
-    return getattr(table, "further", None)
+    return isinstance(annotation, type) and issubclass(annotation, Table)
 
 
 def variant_of_field(field: FieldInfo) -> VariantOf | None:
@@ -466,7 +456,7 @@ def allowed(field: FieldInfo) -> str:
     return " ".join(filter(None, [f"must be {nouns[_kind(field)]}", " and ".join(bounds)]))
 
 
-def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[BaseModel]]]:
+def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[Table]]]:
     """Of a field: what stands after its key for a table in it, the variant, the class; NAME stands for a free name."""
     if several := variant_of_field(field):
         yield from (("", tag, kind) for tag, kind in several.registry.items())
@@ -475,10 +465,10 @@ def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[BaseModel]]]:
     yield from ((suffix, "", kind) for kind in (field.annotation, *get_args(field.annotation)) if is_table(kind))
 
 
-def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[BaseModel]]]:
+def sections(table: type[Table], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[Table]]]:
     """(dotted key, variant, class) of a table and of all tables in it; NAME stands for a free name."""
     yield key, variant, table
-    if (kind := free_names(table)) is not None:
+    if (kind := table.further) is not None:
         yield from sections(kind, _joined(key, "NAME"))
     for name, field in table.model_fields.items():
         for suffix, tag, inner in tables_in(field):
@@ -488,11 +478,11 @@ def sections(table: type[BaseModel], key: str = "", variant: str = "") -> Iterat
 # ---------------------------------------------------------------- documentation
 
 
-def description(table: type[BaseModel], name: str) -> str:
+def description(table: type[Table], name: str) -> str:
     """What a field means, on one line."""
     return " ".join((table.model_fields[name].description or "").split())
 
 
-def meaning(table: type[BaseModel]) -> str:
+def meaning(table: type[Table]) -> str:
     """What a reader of scenes is told of a table: its docstring up to what scripts need."""
     return re.split(r"\n\nIts keyword arguments |\n\n\w+\n---", inspect.cleandoc(table.__doc__ or ""))[0]

@@ -13,7 +13,7 @@ import math
 import re
 import textwrap
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from remodel_fenicsx.errors import UnreadableFile, printable
-from remodel_fenicsx.schema.tables import SceneError, description, listed, shown
+from remodel_fenicsx.schema.tables import SceneError, listed, quoted, shown
 from remodel_fenicsx.schema.units import is_quantity
 from remodel_fenicsx.system.files import read_regular
 
@@ -118,47 +118,35 @@ def merged(base: Mapping[str, object], over: Mapping[str, object]) -> dict[str, 
 
 def toml_text(table: BaseModel, header: str = "") -> str:
     """A table with all its values as TOML, each key under its description as a comment."""
-    document = tomlkit.document()
-    for line in header.splitlines():
-        document.add(tomlkit.comment(printable(line)) if line.strip() else tomlkit.nl())
-    if header:
-        document.add(tomlkit.nl())
-    _fill(document, table)
-    return tomlkit.dumps(document)
+    head = [f"# {printable(line)}" if line.strip() else "" for line in header.splitlines()]
+    return "\n".join([*head, *([""] if head else []), *_lines(table), ""])
 
 
-def _fill(container: Any, table: BaseModel | Mapping[str, object]) -> None:
+def _lines(table: BaseModel | Mapping[str, object], place: str = "") -> Iterator[str]:
+    """The lines of a table: TOML wants its own values before the tables in it."""
     fields = type(table).model_fields if isinstance(table, BaseModel) else {}
-    # TOML wants a table's own values before the tables in it
-    for name, value in sorted(dict(table).items(), key=lambda item: _is_of_tables(item[1])):
-        if isinstance(value, tuple) and _is_of_tables(value):
-            several = tomlkit.aot()
-            for entry in value:
-                inner = tomlkit.table()
-                _fill(inner, entry)
-                several.append(inner)
-            container.add(name, several)
-        elif isinstance(value, (BaseModel, dict)):
-            of_tables = isinstance(value, dict) and any(isinstance(entry, BaseModel) for entry in value.values())
-            inner = tomlkit.table(is_super_table=of_tables)
-            _fill(inner, value)
-            if len(inner) or not fields:  # an empty table says nothing, but a name does
-                container.add(name, inner)
+    inside: list[tuple[str, Any]] = []
+    entries: dict[str, Any] = dict(table)
+    for name, value in entries.items():
+        if isinstance(value, (BaseModel, dict)):
+            inside.append((f"[{place}{quoted(name)}]", value))
+        elif isinstance(value, tuple) and value and isinstance(value[0], BaseModel):
+            inside += [(f"[[{place}{quoted(name)}]]", entry) for entry in value]
         elif value is not None:
-            text = description(type(table), name) if isinstance(table, BaseModel) and name in fields else ""
-            for line in _wrapped(text):
-                container.add(tomlkit.comment(line))
-            container.add(name, value)
+            yield from _wrapped((name in fields and fields[name].description) or "")
+            yield f"{quoted(name)} = {tomlkit.item(value).as_string()}"
+    for head, value in inside:
+        lines = [*_lines(value, head.strip("[]") + ".")]
+        if fields and not lines:  # an empty table says nothing, but a name does
+            continue
+        if isinstance(value, BaseModel) or lines[:1] != [""]:  # the tables in a plain one say that it is there
+            yield from ("", head)
+        yield from lines
 
 
 @functools.cache
 def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, COMMENT_WIDTH)
-
-
-def _is_of_tables(value: object) -> bool:
-    """Whether it is a table or a list of tables."""
-    return isinstance(value, (BaseModel, dict)) or (isinstance(value, tuple) and isinstance((*value, 0)[0], BaseModel))
+    return textwrap.wrap(" ".join(text.split()), COMMENT_WIDTH + 2, initial_indent="# ", subsequent_indent="# ")
 
 
 # ---------------------------------------------------------------- tables of numbers

@@ -19,7 +19,7 @@ import sysconfig
 import types
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, RemodelError, UnreadableFile
 from remodel_fenicsx.system.environment import extensions_for_children
@@ -36,8 +36,16 @@ class Worker:
     """A process that does commands one after the other: what it has imported and compiled serves all of them."""
 
     def __init__(self) -> None:
-        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
-        self.process = _process([SERVE], **pipes)
+        # -P: no module is taken from the working folder, which may be somebody else's
+        command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE]
+        if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
+            only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
+            command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(
+            command, env=environment_of_child(), stdin=pipe, stdout=pipe, text=True, bufsize=1
+        )
+        self._tasks, self._answers = cast(IO[str], self.process.stdin), cast(IO[str], self.process.stdout)
         self.messages: Path | None = None
         self.is_at_work = False
 
@@ -46,16 +54,14 @@ class Worker:
         messages.unlink(missing_ok=True)  # whatever was in its place: a link too
         os.close(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         self.messages, self.is_at_work = messages, True
-        assert self.process.stdin is not None
         if self.is_alive:  # else `poll` will see it; PETSc, where it is loaded, aborts at a closed pipe
-            self.process.stdin.write(json.dumps([list(arguments), str(messages.absolute())]) + "\n")
+            self._tasks.write(json.dumps([list(arguments), str(messages.absolute())]) + "\n")
 
     def poll(self) -> int | None:
         """Exit code of the command, negative for a signal that has ended the process; None while it is at work."""
         if not wait_for_one([self], 0.0):
             return None
-        assert self.process.stdout is not None
-        self.is_at_work, line = False, self.process.stdout.readline()
+        self.is_at_work, line = False, self._answers.readline()
         return int(line) if line else self.process.wait() or 1  # it has ended without an answer
 
     @property
@@ -75,14 +81,13 @@ class Worker:
         """End it, by force if it takes too long."""
         if self.is_at_work:
             self.process.terminate()
-        assert self.process.stdin is not None and self.process.stdout is not None
-        self.process.stdin.close()
+        self._tasks.close()
         try:
             self.process.wait(timeout=SECONDS_TO_END)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        self.process.stdout.close()
+        self._answers.close()
 
 
 def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
@@ -114,15 +119,6 @@ def serve(command: Callable[[Sequence[str]], int]) -> int:
 def cores() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0))
-
-
-def _process(arguments: Sequence[str], **streams: Any) -> subprocess.Popen[str]:
-    """remodel-fenicsx ARGUMENTS; -P: no module is taken from the working folder, which may be somebody else's."""
-    command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", *arguments]
-    if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
-        only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
-        command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
-    return subprocess.Popen(command, env=environment_of_child(), **streams)
 
 
 def environment_of_child() -> dict[str, str]:
@@ -190,12 +186,16 @@ def made_apart(
                 copy.write(data)
         except OSError as error:
             raise NoRoomError from error
-        words = [reader, str(source.fileno()), str(found.fileno()), str(int(seconds)), str(memory)]
-        command = [sys.executable, "-P", "-W", "ignore", "-m", "remodel_fenicsx.system.children", *words]
-        kept: dict[str, Any] = {"pass_fds": (source.fileno(), found.fileno()), "env": environment_of_child()}
+        ends = source.fileno(), found.fileno()
+        words = [reader, *map(str, (*ends, int(seconds), memory))]
         try:
             done = subprocess.run(
-                command, stdin=subprocess.DEVNULL, capture_output=True, timeout=WAITING * seconds, **kept
+                [sys.executable, "-P", "-W", "ignore", "-m", "remodel_fenicsx.system.children", *words],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=WAITING * seconds,
+                pass_fds=ends,
+                env=environment_of_child(),
             )
         except subprocess.TimeoutExpired:
             raise UnreadableFile(f"takes more than {seconds:.3g} seconds to read") from None

@@ -12,10 +12,13 @@ from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from logging.handlers import MemoryHandler
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import TYPE_CHECKING, Self, cast
 
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.system.files import open_own
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
@@ -30,7 +33,7 @@ class Progress:
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
         self._first: tuple[float, float] | None = None  # step and clock: what it takes to compile is past
-        self._bar: Any = None  # rich's, on a terminal
+        self._bar: RichProgress | None = None  # on a terminal
 
     def __enter__(self) -> Self:
         if not self._silent and _is_terminal():
@@ -50,7 +53,7 @@ class Progress:
             return
         count, left = count or f"{index}/{self._total}", self._time_left(index)
         if self._bar is not None:
-            self._bar.update(0, completed=index, count=count, state=state, left=left)
+            self._bar.update(self._bar.task_ids[0], completed=index, count=count, state=state, left=left)
         else:
             said = f"step {count}", state, left
             self._say(", ".join(filter(None, said)), at_once=index >= self._total)
@@ -58,7 +61,7 @@ class Progress:
     def show(self, text: str) -> None:
         """Show a line; where lines stay, only now and then."""
         if self._bar is not None:
-            self._bar.update(0, state=text)
+            self._bar.update(self._bar.task_ids[0], state=text)
         elif not self._silent:
             self._say(text, at_once=False)
 
@@ -67,14 +70,6 @@ class Progress:
         if at_once or clock.monotonic() >= self._line_is_due:
             announce(f"{self._title}: {text}")
             self._line_is_due = clock.monotonic() + self._interval
-
-    def message(self, text: str) -> None:
-        """Print a line above the bar, or between the plain lines."""
-        if self._bar is not None:
-            with suppress(OSError):
-                self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        elif not self._silent:
-            announce(f"{self._title}: {text}")
 
     def _time_left(self, index: float) -> str:
         """The mean time of a step after the first one, times the steps that are left."""
@@ -92,19 +87,25 @@ class Line(Progress):
         super().__init__(0, title, -1 if silent else 0, interval=LINE_EVERY)
 
 
-def _bar(title: str, total: int | None, done: float) -> Any:
+def _bar(title: str, total: int | None, done: float) -> RichProgress:
     """Title, bar, step, state, time so far, time left on one line of stderr; what others print stands above it."""
     from rich.console import Console  # late: most runs have no terminal
-    from rich.progress import BarColumn, Progress as RichProgress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress as RichProgress, TimeElapsedColumn
 
-    named, count, state, left = (f"{{task.fields[{name}]}}" for name in ("title", "count", "state", "left"))
-    title_column, *columns = (TextColumn(text, markup=False) for text in (named, count, state))
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False, highlight=False)
     console.width -= 3  # a line that reaches the edge is broken by the ^C that a terminal shows, and stands there twice
-    how: dict[str, Any] = {"console": console, "refresh_per_second": 4, "redirect_stdout": sys.stdout.isatty()}
-    last = TimeElapsedColumn(), TextColumn(left, markup=False)
-    found = RichProgress(title_column, BarColumn(24), *columns, *last, **how)
-    found.add_task("", total=total, completed=done, title=title, count="", state="starting", left="")  # type: ignore
+    found = RichProgress(
+        "{task.description}",
+        BarColumn(24),
+        "{task.fields[count]}",
+        "{task.fields[state]}",
+        TimeElapsedColumn(),
+        "{task.fields[left]}",
+        console=console,
+        refresh_per_second=4,
+        redirect_stdout=sys.stdout.isatty(),
+    )
+    found.update(found.add_task(title, total=total, count="", state="starting", left=""), completed=done)
     return found
 
 

@@ -458,4 +458,5 @@ def test_a_scene_key() -> None:
         HealingScene(**{**SCENE, "remodeling": {"rest": -1.0}})
     with pytest.raises(SceneError, match="^remodeling.rest = 2.5: unknown key"):
         Scene(**values)
-    assert "| `rest` | `0.0` | a number at least 0 | Time before the cells" in extend.markdown_reference(HealingScene)
+    key = HealingScene.model_json_schema()["$defs"]["HealingRemodeling"]["properties"]["rest"]
+    assert (key["default"], key["minimum"], key["description"]) == (0.0, 0, "Time before the cells begin to remodel.")

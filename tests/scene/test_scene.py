@@ -16,7 +16,7 @@ from remodel_fenicsx.body import SHAPES, Tube
 from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
-from remodel_fenicsx.scene.scene import FORMAT, RENAMED, Scene, preset_scene, read_scene, scene_from_dict, too_soft
+from remodel_fenicsx.scene.scene import FORMAT, Scene, preset_scene, read_scene, scene_from_dict, too_soft
 from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Time
 from remodel_fenicsx.schema.tables import SceneError, allowed, locate, shown
 from remodel_fenicsx.schema.text import put
@@ -83,15 +83,6 @@ def test_a_preset_without_the_shape(monkeypatch):
         refusal({**CUBE, "preset": "bent"})
         == "geometry.shape = 'cube': the preset 'bent' has the shapes 'tendon', 'tube'"
     )
-
-
-def test_a_key_of_an_earlier_format_is_refused_with_its_new_name(monkeypatch):
-    monkeypatch.setitem(RENAMED, "mesh.finite_cell", "mesh.degree")
-    monkeypatch.setitem(RENAMED, "loads.lengthening", "loads.pressure")
-    assert refusal(changed(TUBE, {"format": 1, "mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
-    assert refusal(changed(TUBE, {"mesh.finite_cell": 1})) == "mesh.finite_cell = 1: is now mesh.degree"
-    line = "loads.lengthening = {value = 1.0}: is now loads.pressure"
-    assert refusal(changed(TUBE, {"loads.lengthening": {"value": 1.0}})) == line
 
 
 def test_what_is_read_is_of_the_present_format():
