@@ -367,7 +367,7 @@ def _report(options: argparse.Namespace) -> None:
 )
 def _picture(options: argparse.Namespace) -> None:
     """Draw the body of the run in DIR: PNG or PDF."""
-    from remodel_fenicsx.pictures.bodies import Viewing, draw_picture
+    from remodel_fenicsx.pictures import Viewing, draw_picture
 
     viewing = Viewing(options.layers, options.cut, options.view)
     _say(str(draw_picture(options.folder, options.time, viewing, options.output)))
@@ -388,7 +388,7 @@ def _picture(options: argparse.Namespace) -> None:
 )
 def _animate(options: argparse.Namespace) -> None:
     """Draw the body of the run in DIR as it moves: GIF or WebP."""
-    from remodel_fenicsx.pictures.bodies import Viewing, draw_animation
+    from remodel_fenicsx.pictures import Viewing, draw_animation
 
     viewing = Viewing(options.layers, options.cut, options.view)
     _say(str(draw_animation(options.folder, options.frames, viewing, options.output)))

@@ -110,9 +110,11 @@ def append_chains(
 
 
 class WholeBody:
-    """The body whose fields a run has recorded."""
+    """The body whose fields a run has recorded; RecordingError where there are none."""
 
     def __init__(self, recording: RecordedRun):
+        if not has_a_body(recording):
+            raise RecordingError(f"{recording.path}: the run recorded no fields of a body (output.fields)")
         scene = recording.scene
         shape, kinematics = scene.geometry, KINEMATICS[scene.model.kinematics]
         self.recording, self.is_turned = recording, kinematics.reduced
@@ -188,8 +190,6 @@ def revolve(folder: Path | str) -> list[Path]:
     for path in paths:
         if path.exists():
             raise RecordingError(f"{path}: is there already; nothing is overwritten")
-    if not has_a_body(recording):
-        raise RecordingError(f"{recording.path}: the run recorded no fields")
     whole = WholeBody(recording)
     centres = whole.points[whole.elements].mean(axis=1)
     scale = 0.4 * float(np.prod(np.ptp(whole.points, axis=0)) / len(centres)) ** (1 / 3)

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.errors import BAD_INPUT, RemodelError
 from remodel_fenicsx.results.recording import unit_of, words
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.system.environment import versions
@@ -53,7 +53,7 @@ STYLE: dict[str, object] = {
 class FigureError(RemodelError, ValueError):
     """No figure for a reason that its one line names; `exit_code` is the command's."""
 
-    def __init__(self, message: str, exit_code: int):
+    def __init__(self, message: str, exit_code: int = BAD_INPUT):
         super().__init__(message)
         self.exit_code = exit_code
 
@@ -193,8 +193,9 @@ def _check_ours(path: Path, name: str) -> None:
         return
     # tables of older versions begin with it
     if MARK.encode() not in path.read_bytes() and path.name not in read_notes(path.parent, name):
-        message = f"{path}: is not a figure of this command and is not overwritten; choose another folder with -o"
-        raise FigureError(message, 2)
+        raise FigureError(
+            f"{path}: is not a figure of this command and is not overwritten; choose another folder with -o"
+        )
 
 
 def read_notes(folder: Path, name: str) -> dict[str, list[str]]:

@@ -18,8 +18,8 @@ import pytest
 
 from remodel_fenicsx import Recording, cli, run as run_scene
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.report import REPORT, page, write_report
-from remodel_fenicsx.report.page import ANGLE_STEPS, NO_ANGLE, ReportedRun
+from remodel_fenicsx import report as page
+from remodel_fenicsx.report import ANGLE_STEPS, NO_ANGLE, REPORT, ReportedRun, write_report
 from remodel_fenicsx.results.recording import kept_times
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import preset_scene
@@ -345,7 +345,7 @@ def test_a_run_leaves_none_where_none_is_wanted(tmp_path: Path, words: list[str]
 def test_a_report_that_fails_is_one_warning(tmp_path: Path) -> None:
     """And never the run's exit code."""
     program = (
-        "import sys; from remodel_fenicsx import cli; from remodel_fenicsx.report import page\n"
+        "import sys; from remodel_fenicsx import cli; from remodel_fenicsx import report as page\n"
         "def fail(*_): raise ValueError('no\\nroom')\n"
         "page.page_of = fail; sys.exit(cli.main(sys.argv[1:]))"
     )
