@@ -34,6 +34,8 @@ from remodel_fenicsx.studies.trade import Setting, as_run, ladder, pareto, typic
 from tests.reference.radial import solve_radial
 from tests.runs import rows_of
 
+SECONDS_PER_POINT = 3e-5  # of a step, roughly
+
 Array = NDArray[np.float64]
 Run = Mapping[str, Array]
 

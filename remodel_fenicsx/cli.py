@@ -595,7 +595,7 @@ def _ensemble(options: argparse.Namespace) -> int:
     "trade artery.toml --budget 10min",
     *SCENE_AND_CHANGES,
     option(
-        "--budget TIME  Begin no run that would end after this wall time (default: 10min). Cheap runs come first.",
+        "--budget TIME  Stop after this wall time (default: 10min). Cheap runs come first; a larger budget goes on.",
         default=600.0,
     ),
     *_study("trade"),

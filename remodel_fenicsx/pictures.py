@@ -34,12 +34,8 @@ from remodel_fenicsx.results.recording import (
     RecordedRun,
     VIEWS,
     kept_times,
-    unit_of,
-    with_unit,
-    words,
 )
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.system.children import environment_of_child, last_line
 from remodel_fenicsx.system.files import TakenError, numbered, write_new
@@ -329,7 +325,7 @@ def _draw(
     recording, scene, shown = whole.recording, whole.recording.scene, shown_elements(whole, viewing)
     if ANGLE not in recording.fields(sheets[0][0], {ANGLE}):
         raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)")
-    drawn = [[(_title(recording, t), deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times] for times in sheets]
+    drawn = [[(f"t = {t:g}", deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times] for times in sheets]
     along, across = scene.geometry.angle_in_words
     scale = f"angle of the collagen, deformed: 0 {along}, 90 {across} (degrees)"
     notes = f"{scene.name}: {len(whole.elements):,} elements. "
@@ -355,18 +351,6 @@ def _draw(
             if path:
                 raise
     return free
-
-
-def _title(recording: RecordedRun, time: float) -> str:
-    """Say the time and its loads, where the history has a row of it."""
-    scene, history, found = recording.scene, recording.history, []
-    row = np.flatnonzero([same_time(recorded, time) for recorded in history["time"]])
-    for name in scene.loads:
-        column = scene.load_kinds[name].make_column(name)
-        if len(row) and column.name in history:
-            value = with_unit(float(history[column.name][row[0]]), unit_of(scene, column.unit))
-            found.append(f"{words(column.name)} {value}")
-    return "\n".join([f"t = {time:g}", *found])
 
 
 if __name__ == "__main__":

@@ -33,7 +33,6 @@ from remodel_fenicsx.body.wall import Walled
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import GROWTH, moved_axes
-from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -57,8 +56,6 @@ from remodel_fenicsx.results.whole_body import (
     has_a_body,
 )
 from remodel_fenicsx.scene.scene import Scene, leaves, preset_scene
-from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
-from remodel_fenicsx.schema.tables import Table
 from remodel_fenicsx.system.files import read_regular, typed, write_new, write_whole
 from remodel_fenicsx.system.terminal import duration
 
@@ -258,7 +255,7 @@ class Warned:
 
 ASSETS = Path(__file__).with_name("assets")
 MOST_TILES = 8
-NO_PHYSICS = ("format", "name", "preset", "profile", "output", "solver")
+NO_PHYSICS = ("format", "name", "preset", "profile", "output", "solver", "geometry.sha256")
 MOST_ROWS = 2000  # of a curve: a curve has fewer pixels
 LARGEST_DOWNLOAD = 20_000_000  # bytes of a history that still goes into the page
 
@@ -300,24 +297,23 @@ class ReportedRun:
         return state, f"{at}: {reason}" if reason else f"{at}, without a word: it was killed"
 
     @cached_property
-    def columns(self) -> list[Column]:
-        """Of the history, those of the shape first; none without a number."""
+    def known(self) -> dict[str, Column]:
+        """The columns that its scene has, by name."""
+        return {column.name: column for column in self.recording.scene.columns()}
+
+    @cached_property
+    def columns(self) -> list[str]:
+        """Names of the history, those of the shape first; none without a number."""
         scene, history = self.recording.scene, self.recording.history
-        known = {column.name: column for column in scene.columns()}
         own = {column.name for one in (scene.geometry.columns, *map(columns_of_region, scene.regions)) for column in one}
         names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
         if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
             names.remove("substeps")
-        # of one that its scene does not have, under whatever name, nothing else is known
-        return [known.get(name) or Column(name, "", "", _unknown) for name in sorted(names, key=lambda n: n not in own)]
+        return sorted(names, key=lambda name: name not in own)
 
-    def unit(self, column: Column) -> str:
+    def unit(self, name: str) -> str:
         """The column's unit where the scene says what it is, else nothing."""
-        return unit_of(self.recording.scene, column.unit)
-
-
-def _unknown(measured: object) -> float:
-    return np.nan
+        return unit_of(self.recording.scene, self.known[name].unit) if name in self.known else ""
 
 
 Part = Callable[[ReportedRun], Card | None]
@@ -341,18 +337,16 @@ def tiles(run: ReportedRun) -> Card | None:
     history = run.recording.history
     found: list[str] = []
     own = [column.name for column in run.recording.scene.geometry.columns]
-    for column in run.columns:
-        if column.name not in (*own, "max_chain_extension") or len(found) == MOST_TILES:
+    for name in run.columns:
+        values, unit = history[name][np.isfinite(history[name])], run.unit(name)
+        if name not in (*own, "max_chain_extension") or len(found) == MOST_TILES or not values.any():
             continue
-        values, unit = history[column.name][np.isfinite(history[column.name])], run.unit(column)
-        if not values.any():
-            continue
-        is_reference = column.name.startswith("fibre_angle") and "deformed" not in column.name
-        reference = " (reference)" if is_reference else ""  # body and profile are deformed
+        # body and profile are deformed
+        reference = " (reference)" if name.startswith("fibre_angle") and "deformed" not in name else ""
         last, first = (escape(with_unit(float(values[index]), unit)) for index in (-1, 0))
         found.append(
-            f'<div class="tile" title="{escape(column.meaning)}"><b>{last}</b>'
-            f'<span>{escape(words(column.name))}{reference}</span><span class="note">from {first}</span></div>'
+            f'<div class="tile" title="{escape(run.known[name].meaning)}"><b>{last}</b>'
+            f'<span>{escape(words(name))}{reference}</span><span class="note">from {first}</span></div>'
         )
     return Card("tiles", f'<div class="tiles whole">{"".join(found)}</div>') if found else None
 
@@ -443,16 +437,16 @@ def curves(run: ReportedRun) -> Card | None:
     if len(history["time"]) < 2 or not run.columns:
         return None
     rows = np.unique(np.linspace(0, len(history["time"]) - 1, MOST_ROWS).round().astype(int))
-    groups = defaultdict[tuple[str, str], list[Column]](list)
-    for column in run.columns:
-        groups[column.unit, _family(column.name)].append(column)
+    groups = defaultdict[tuple[str, str], list[str]](list)
+    for name in run.columns:
+        groups[run.known[name].unit if name in run.known else "", _family(name)].append(name)
     cards, data = [], []
     for index, ((_, family), group) in enumerate(groups.items()):
         unit = run.unit(group[0])
-        title = words(group[0].name if len(group) == 1 else WHOLE.get(family, family))
+        title = words(group[0] if len(group) == 1 else WHOLE.get(family, family))
         title = title[0].upper() + title[1:]
         cards.append(section(title, f'<div class="curve" id="curve-{index}"></div>', "third", unit))
-        series = [{"name": words(column.name), "values": _finite(history[column.name][rows])} for column in group]
+        series = [{"name": words(name), "values": _finite(history[name][rows])} for name in group]
         data.append({"title": title, "unit": unit, "series": series})
     times = history["time"][rows].tolist()
     return Card("curves", f'<div class="curves whole">{"".join(cards)}</div>', {"times": times, "curves": data})
@@ -478,51 +472,25 @@ def _finite(values: NDArray[np.floating]) -> object:
 
 # ---------------------------------------------------------------- in words
 def facts(run: ReportedRun) -> Card:
-    """What was run."""
-    scene, history = run.recording.scene, run.recording.history
-    kinematics = KINEMATICS[scene.model.kinematics]
-    count = f"{len(run.recording.elements):,} " if run.body else ""
-    seconds = history.get("seconds", np.zeros(0))
-    solving = f"; {duration(float(np.nansum(seconds)))} of solving" if len(seconds) else ""
-    steps = f"{max(0, len(history['time']) - 1)}{'' if scene.time.chooses else ' of'}"
+    """What was run: the tables of the scene, and what the run has made of them."""
+    scene, history, tables = run.recording.scene, run.recording.history, defaultdict[str, list[str]](list)
+    without = NO_PHYSICS if scene.remodeling.turnover.is_on else (*NO_PHYSICS, "remodeling.turnover")
+    for key, value in leaves(scene.model_dump(exclude_none=True), without):
+        place, _, name = key.rpartition(".")
+        if value not in ((), {}):
+            tables[place or "load cases"].append(f"{words(name)} {_as_text(value)}")
     said = [text for _, _, text in run.log]
-    ranks = [found[1] for text in said if (found := _RANKS.match(text))][-1:]
-    on_ranks = "".join(f", {number} ranks" for number in ranks if number != "1")
-    unloaded = [text for text in said if text.startswith(SAID_UNLOADED)][-1:]
-    element = kinematics.element(scene.mesh.element)
-    elements = f"{element[:-2]}a" if element.endswith("dron") else f"{element}s"
-    ends = () if len(scene.geometry.ends) > 1 else ("ends",)  # what they have no choice of is said by none
-    rows = [
-        ("Changed", _changed(scene)),
-        ("Body", "; ".join([_keys(scene.geometry, "file", "sha256"), *unloaded])),
-        ("Free of stress", "" if scene.natural.is_of_the_mesh else _keys(scene.natural)),
-        ("Mesh", f"{count}{elements}: {_keys(scene.mesh, 'element')}"),
-        ("Kinematics", f"{scene.model.kinematics}: {kinematics.meaning}"),
-        ("Supports", _keys(scene.supports, *ends)),
-        ("Cells", _keys(scene.cells, *_idle(scene))),
-        *((f"Region {words(name)}", _keys(region)) for name, region in scene.regions.items()),
-        *((words(name).capitalize(), _keys(load)) for name, load in scene.loads.items()),
-        *((f"Load case {number}", _keys(case)) for number, case in enumerate(scene.cases, start=1)),
-        ("Material", scene.summary()),
-        ("Remodeling", _keys(scene.remodeling, "turnover", *_idle(scene))),
-        ("Turnover", _keys(scene.remodeling.turnover) if scene.remodeling.turnover.is_on else ""),
-        ("Time", f"{steps} {scene.time.in_words()}{solving}{on_ranks}"),
-    ]
-    return Card("facts", section("What was run", table(row for row in rows if row[1])))
-
-
-def _idle(scene: Scene) -> list[str]:
-    """Keys of cells and remodeling that change nothing beside the others."""
-    how, is_random = scene.remodeling, scene.cells.initial == "random"
-    law = LAWS[how.law]
-    used = {
-        "aligned_axis": scene.cells.initial == "aligned", "seed": is_random, "antithetic": is_random,
-        "pairing": not law.takes_set_points, "threshold": law.takes_set_points, "exponent": law.takes_set_points,
-        "relaxation_factor": COUPLINGS[how.coupling].makes_a_share, "mean": bool(scene.cases),
-        "rotation_time": how.law == "rotation",
-    }  # fmt: skip
-    without_a_pass = () if law.remodels else set(Remodeling.model_fields) - {"law"}
-    return [*(key for key, is_used in used.items() if not is_used), *without_a_pass]
+    tables["geometry"] += [text for text in said if text.startswith(SAID_UNLOADED)][-1:]
+    if run.body:
+        tables["mesh"].append(f"{len(run.recording.elements):,} elements")
+    tables["model"].append(KINEMATICS[scene.model.kinematics].meaning)
+    tables["material"].append(scene.summary())
+    steps = f"{max(0, len(history['time']) - 1)}{'' if scene.time.chooses else ' of'} {scene.time.in_words()}"
+    solving = f"{duration(float(np.nansum(history.get('seconds', 0.0))))} of solving"
+    ranks = [f"{found[1]} ranks" for text in said if (found := _RANKS.match(text)) and found[1] != "1"]
+    tables["time"] += [steps, solving, *ranks[-1:]]
+    rows = {"changed": _changed(scene)} | {place.replace(".", " "): ", ".join(parts) for place, parts in tables.items()}
+    return Card("facts", section("What was run", table((words(n).capitalize(), row) for n, row in rows.items() if row)))
 
 
 def _changed(scene: Scene) -> str:
@@ -533,11 +501,6 @@ def _changed(scene: Scene) -> str:
     before, now = (dict(leaves(one.model_dump(exclude_none=True), NO_PHYSICS)) for one in (preset, scene))
     new = {key: value for key, value in now.items() if before.get(key) != value}
     return ", ".join(f"{key} = {_as_text(value)} for {_as_text(before.get(key, '-'))}" for key, value in new.items())
-
-
-def _keys(keys: Table, *but: str) -> str:
-    """All keys of a table that have a value."""
-    return _as_text(keys.model_dump(exclude_none=True, exclude=set(but)))
 
 
 def _as_text(value: object) -> str:

@@ -98,6 +98,7 @@ class Answer(ABC):
     name: str  # of its files
     caption: str  # of its picture
     scene: Scene  # that was asked for
+    only_in_file: Sequence[str] = ()  # columns that a terminal does not show
     failed: Mapping[str, str] = {}
     notes: Sequence[str] = ()
 
@@ -112,7 +113,7 @@ class Answer(ABC):
 
     def lines(self) -> list[str]:
         """The table for a terminal."""
-        return aligned(self.table(), 8, 5)
+        return aligned({name: cells for name, cells in self.table().items() if name not in self.only_in_file}, 8, 5)
 
     @abstractmethod
     def verdict(self) -> str:
@@ -137,13 +138,14 @@ class Answer(ABC):
 
 
 def aligned(table: Mapping[str, ArrayLike | Sequence[str]], least: int, digits: int) -> list[str]:
-    """Columns under their names, each `least` wide or more: numbers to the right, text to the left."""
+    """Columns under their names, each `least` wide or more: numbers to the right, text to the left, none of what is not known."""
     columns = []
     for name, values in table.items():
         cells = [value if isinstance(value, str) else f"{value:.{digits}g}" for value in np.asarray(values).tolist()]
         side = "<" if np.asarray(values).dtype.kind == "U" else ">"
         width = max(least, *map(len, (name, *cells)))
-        columns.append([f"{cell:{side}{width}}" for cell in (name, *cells)])
+        if not {*cells} <= {"", "nan"}:
+            columns.append([f"{cell:{side}{width}}" for cell in (name, *cells)])
     return [" ".join(row).rstrip() for row in zip(*columns, strict=True)]
 
 

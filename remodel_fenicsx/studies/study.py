@@ -150,10 +150,6 @@ class Study:
         """Of all that have not failed, by name."""
         return {run.name: run.history() for run in self.runs if run.name not in self.failed}
 
-    def fits(self, run: Run) -> bool:
-        """Whether a run may begin now."""
-        return True
-
     def learn(self) -> None:
         """Do what is to be done whenever a run has ended."""
 
@@ -194,7 +190,7 @@ class Study:
             if run.folder.is_dir() and writer(run.folder)[1]:
                 continue
             self._waiting.remove(run)
-            if self._is_left(run) and self.fits(run):
+            if self._is_left(run):
                 worker = self._idle.pop() if self._idle else Worker()
                 self._running[worker] = run
                 run.begin(worker)
