@@ -33,7 +33,7 @@ from remodel_fenicsx.system.environment import (
 from remodel_fenicsx.system.files import positive, refusal_in_words, wall_time, write_new
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.studies.page import Answer
+    from remodel_fenicsx.studies.study import Answer
     from remodel_fenicsx.scene.scene import Scene
 
 presets, scenes = Late("remodel_fenicsx.scene.presets"), Late("remodel_fenicsx.scene.scene")  # no help needs them

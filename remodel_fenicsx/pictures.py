@@ -26,7 +26,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.errors import BAD_ENVIRONMENT
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, FigureError
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -36,7 +36,6 @@ from remodel_fenicsx.results.recording import (
     kept_times,
 )
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines
-from remodel_fenicsx.studies.page import FigureError
 from remodel_fenicsx.system.children import environment_of_child, last_line
 from remodel_fenicsx.system.files import TakenError, numbered, write_new
 

@@ -305,7 +305,9 @@ class ReportedRun:
     def columns(self) -> list[str]:
         """Names of the history, those of the shape first; none without a number."""
         scene, history = self.recording.scene, self.recording.history
-        own = {column.name for one in (scene.geometry.columns, *map(columns_of_region, scene.regions)) for column in one}
+        own = {
+            column.name for one in (scene.geometry.columns, *map(columns_of_region, scene.regions)) for column in one
+        }
         names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
         if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
             names.remove("substeps")

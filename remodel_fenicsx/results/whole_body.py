@@ -18,6 +18,7 @@ from remodel_fenicsx.results.vtkhdf import CELL_TYPES, LINE, TransientGrid
 
 spatial = Late("scipy.spatial")  # most runs show no reduction
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 Fields = tuple[Array | None, dict[str, Array]]
 
 CORNERS = {"interval": 2, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
@@ -34,9 +35,7 @@ TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
 class TurnedFields:
     """Which node and element of a reduction stands for each of a body's own, and its fields there."""
 
-    def __init__(
-        self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
-    ):
+    def __init__(self, points: Array, elements: Numbers, own_points: Array, own_elements: Numbers, turn: Turn):
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
         self.nodes = spatial.cKDTree(own_points).query(back)[1]
@@ -72,7 +71,7 @@ AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
 OF_CHAINS = ("cell_dimensions", *AXIS_FIELDS, "deformation_gradient", "fibre_angle")
 
 
-def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tuple[Array, NDArray[np.int64]]:
+def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tuple[Array, Numbers]:
     """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2)."""
     signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
     half = scale * signs @ (lengths[:, :, None] * axes)
@@ -153,26 +152,17 @@ def has_a_body(recording: RecordedRun) -> bool:
     return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
 
 
-def _layers(depth: Array, elements: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:
+def _layers(depth: Array, elements: Numbers) -> tuple[Numbers, Array]:
     """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
     nodes = np.bincount(elements.ravel(), weights=np.repeat(depth, elements.shape[1])) / np.bincount(elements.ravel())
     extent = np.ptp(nodes[elements], axis=1).mean()
     number = max(1, round(float(np.ptp(nodes) / extent))) if extent > 0 else 1
-    layer = rank_of(depth)
+    layer = np.unique(depth.round(6), return_inverse=True)[1]
     if layer.max() >= number or number > MOST_LAYERS:
         number = number if number <= MOST_LAYERS else FEW_LAYERS
         layer = np.minimum((number * np.clip(depth, 0.0, 1.0)).astype(np.int64), number - 1)
-        layer = np.unique(layer, return_inverse=True)[1].reshape(-1)  # none without an element
-    counts = np.bincount(layer)
-    return layer, np.bincount(layer, weights=depth) / counts
-
-
-def rank_of(values: Array) -> NDArray[np.int64]:
-    """Number of each value among the distinct ones, ascending, from 0: layers, rows or columns of a regular mesh."""
-    ordered = np.sort(values)
-    size = np.ptp(ordered) or 1.0  # of one layer there is no range
-    starts = np.concatenate([[True], np.diff(ordered) > 1e-6 * size])
-    return np.searchsorted(ordered[starts], values + 1e-7 * size) - 1
+        layer = np.unique(layer, return_inverse=True)[1]  # none without an element
+    return layer, np.bincount(layer, weights=depth) / np.bincount(layer)
 
 
 # ---------------------------------------------------------------- files of the whole body

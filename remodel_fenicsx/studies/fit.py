@@ -37,8 +37,17 @@ from remodel_fenicsx.initial import with_choices
 from remodel_fenicsx.simulation import Simulation, begin_again
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
-from remodel_fenicsx.studies.page import COLOURS, Answer, Page, label, made_with, panels
-from remodel_fenicsx.studies.study import Run, Study
+from remodel_fenicsx.studies.study import (
+    COLOURS,
+    Answer,
+    Page,
+    Run,
+    Study,
+    dimensions,
+    label,
+    made_with,
+    panels,
+)
 from remodel_fenicsx.system.children import PART, Worker
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
 from remodel_fenicsx.system.terminal import hold_log, open_log, unsaid
@@ -48,8 +57,6 @@ from remodel_fenicsx.watch.warnings import WarnsOnce
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from scipy.optimize import OptimizeResult
-
-    from remodel_fenicsx.body.shape import Column
 
 log = logging.getLogger(__name__)
 
@@ -241,9 +248,7 @@ def _prescribed(columns: Columns, table: MeasuredTable, scene: Scene, place: str
 
 
 def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
-    kinds = {column.name: column.unit for column in _all_columns(scene)}
-    kinds |= {load: kind.dimension.name for load, kind in scene.load_kinds.items() if kind.dimension}
-    if (dimension := DIMENSIONS.get(kinds.get(name, ""))) is None:
+    if (dimension := DIMENSIONS.get(dimensions(scene).get(name, ""))) is None:
         raise SceneError(f"{place}: {name} takes no unit")
     units = {STRESS_UNIT: scene.material.stress_unit, LENGTH_UNIT: scene.geometry.length_unit}
     try:
@@ -252,12 +257,9 @@ def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
         raise SceneError(f"{place}: {error}") from error
 
 
-def _all_columns(scene: Scene) -> tuple[Column, ...]:
-    return scene.columns(column.name for column in scene.geometry.columns_on_request)
-
-
 def _read_columns(path: Path, place: str, scene: Scene) -> Columns:
-    known = {column.name for column in _all_columns(scene)} - {"seconds", "substeps"}
+    own = scene.columns(column.name for column in scene.geometry.columns_on_request)
+    known = {column.name for column in own} - {"seconds", "substeps"}
     strains = {name.replace("elongation", "stretch"): name for name in scene.load_kinds if "elongation" in name}
     allowed = sorted({*scene.loads, *known, "time", *strains})
     try:
@@ -292,7 +294,7 @@ WALL = ("wall_thickness", "inner_radius")
 
 def doubts(tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene) -> Iterator[str]:
     """Lines on measured columns that may be in another convention, beside the model at the start."""
-    units = {column.name: column.unit for column in _all_columns(scene)}
+    units = dimensions(scene)
     for table, model in zip(tables, modelled, strict=True):
         pairs = {f"{name} ({units[name]})": (table.columns[name], model[name]) for name in table.sd}
         pairs = {name: pair for name, pair in pairs.items() if name.split()[0] not in table.scaled}
@@ -711,7 +713,9 @@ def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str,
     ways = found.inflation * found.covariance[chosen] / found.deviations[chosen, None]
     points = np.clip(best + np.multiply.outer(PROFILE_STEPS, ways), *ends)  # (steps, chosen, unknowns)
     tasks = {
-        f"profile of {found.keys[held]} at {steps:+g}": partial(minimised, start=x, held=held, near=near, enough=ROUGHLY)
+        f"profile of {found.keys[held]} at {steps:+g}": partial(
+            minimised, start=x, held=held, near=near, enough=ROUGHLY
+        )
         for steps, row in zip(PROFILE_STEPS, points, strict=True)
         for held, x in zip(chosen, row, strict=True)
     }
@@ -817,7 +821,9 @@ class Fit(Answer):
         """Write tables and picture."""
         super().write(folder)
         notes = [self.title, made_with()]
-        rows = [(key, *row) for key, one in self.profiles.items() for row in zip(one.values, one.increases, strict=True)]
+        rows = [
+            (key, *row) for key, one in self.profiles.items() for row in zip(one.values, one.increases, strict=True)
+        ]
         if rows:
             columns = dict(zip(("key", "value", "increase"), zip(*rows, strict=True), strict=True))
             Page(folder, "profiles").save_table(columns, notes)
@@ -827,20 +833,21 @@ class Fit(Answer):
     def figure(self) -> Figure:
         """A panel for each measured column of each protocol, over what was prescribed along its axis."""
         shown = [
-            (table, modelled[name], name, rows, number, len(table.protocols))
-            for table, modelled in zip(self.problem.tables, self.modelled, strict=True)
+            (table, model[name], name, rows, f", protocol {number} of {len(table.protocols)}")
+            for table, model in zip(self.problem.tables, self.modelled, strict=True)
             for number, rows in enumerate(table.protocols, start=1)
             for name in table.sd
         ]
-        figure, grid = panels(len(shown), 2.6)
-        scales = self.problem.scales_of(self.logarithms)
-        for axes, (table, model, name, rows, number, protocols) in zip(grid, shown, strict=True):
-            over, which = table.over(name), f", protocol {number} of {protocols}" if protocols > 1 else ""
+        (figure, grid), scales = panels(len(shown), 2.6), self.problem.scales_of(self.logarithms)
+        for axes, (table, model, name, rows, which) in zip(grid, shown, strict=True):
+            over = table.over(name)
             (unit_of_x, per_x), (unit, per) = (table.units.get(one, ("", 1.0)) for one in (over, name))
             x, y = (scales.get(one, 1.0) * table.columns[one][rows] for one in (over, name))
             axes.errorbar(x / per_x, y / per, table.sd[name] / per, fmt="o", color=COLOURS[0], label="measured")
             axes.plot(x / per_x, model[rows] / per, color=COLOURS[1], label="fitted model")
-            axes.set_title(f"{Path(table.name).name} ({table.state}){which}", fontsize=8)
+            axes.set_title(
+                f"{Path(table.name).name} ({table.state}){which if len(table.protocols) > 1 else ''}", fontsize=8
+            )
             axes.set(xlabel=label(self.scene, over, unit_of_x), ylabel=label(self.scene, name, unit))
             axes.legend(fontsize=7)
         return figure

@@ -22,7 +22,7 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.newton import SolveFailure
-from remodel_fenicsx.studies.page import COLOURS, Answer
+from remodel_fenicsx.studies.study import COLOURS, Answer
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,16 @@ from remodel_fenicsx.body.reductions import only_for_means
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.schema.tables import shown
-from remodel_fenicsx.studies.page import COLOURS, Answer, aligned, label, panels
-from remodel_fenicsx.studies.study import FEWEST_RUNS, Study, TooFewRuns
+from remodel_fenicsx.studies.study import (
+    COLOURS,
+    FEWEST_RUNS,
+    Answer,
+    Study,
+    TooFewRuns,
+    aligned,
+    label,
+    panels,
+)
 from remodel_fenicsx.system.files import MOST_RUNS
 
 Array = NDArray[np.float64]

@@ -21,8 +21,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.studies.page import COLOURS, Answer
-from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, Study, TooFewRuns
+from remodel_fenicsx.studies.study import COLOURS, FEWEST_RUNS, Answer, Study, TooFewRuns
 from remodel_fenicsx.system.files import make_own_folder, write_whole
 
 log = logging.getLogger(__name__)
@@ -316,7 +315,9 @@ class Trade(Answer):
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
-        axes.plot([row.seconds for row in known], [row.angle_error for row in known], "o", color=COLOURS[0], mfc="white")
+        axes.plot(
+            [row.seconds for row in known], [row.angle_error for row in known], "o", color=COLOURS[0], mfc="white"
+        )
         for row in known:
             if row.on_front:
                 axes.plot(row.seconds, row.angle_error, "o", label=row.setting.name)

@@ -146,7 +146,11 @@ def test_regions_are_shown_by_name(recorded: Recorded) -> None:
     places = ("inner", "middle", "outer", "media", "adventitia")
     assert curves["Fibre angle"] == [f"fibre angle {place}" for place in places]
     assert curves["Largest r/L"] == ["largest r/L media", "largest r/L adventitia", "largest r/L"]
-    for words in ("<th>Regions media remodeling</th><td>kappa 0.05", "<th>Regions adventitia", "initial (0.5, 0.85, 0.165"):
+    for words in (
+        "<th>Regions media remodeling</th><td>kappa 0.05",
+        "<th>Regions adventitia",
+        "initial (0.5, 0.85, 0.165",
+    ):
         assert words in found.text
     assert Decoded.of(recorded("artery")).data["parts"]["angles"]["regions"] == []
 
