@@ -101,19 +101,17 @@ class Array(NamedTuple):
 
 
 class Card(NamedTuple):
-    """A part of the page."""
+    """A part of the page: HTML, and what `assets/drawn.html` and the scripts take."""
 
     name: str
-    html: str
+    html: str = ""
     data: Mapping[str, object] = MappingProxyType({})
     arrays: Mapping[str, Array] = MappingProxyType({})
 
 
-def section(title: str, content: str, width: str = "half", note: str = "") -> str:
-    """A card with a heading; `content` is HTML, the others text. Widths: whole, wide, narrow, half, third."""
-    more = f' <span class="note">{escape(note)}</span>' if note else ""
-    heading = f"<h2>{escape(title)}{more}</h2>" if title else ""
-    return f'<section class="card {width}">{heading}{content}</section>'
+def section(title: str, content: str) -> str:
+    """A card with a heading; `content` is HTML."""
+    return f'<section class="card half"><h2>{escape(title)}</h2>{content}</section>'
 
 
 def folded(title: str, content: str) -> str:
@@ -354,25 +352,27 @@ def tiles(run: ReportedRun) -> Card | None:
 
 
 # ---------------------------------------------------------------- the body
-def view(run: ReportedRun) -> Card | None:
+def drawn(run: ReportedRun) -> Card:
+    """The places of what is drawn."""
+    return Card("drawn", _asset("drawn.html"))
+
+
+def view(run: ReportedRun) -> Card:
     """The body in space, with time, and what can be done with it."""
     body = run.body
     if body is None:
-        text = "The run recorded no fields (output.fields), so there is no body to be seen."
-        return Card("no_view", section("The body", f'<p class="note">{text}</p>', "whole"))
+        return Card("no_view")
     arrays, scales = body.arrays()
-    data = {
-        **scales, "times": [float(time) for time in body.times], "layers": len(body.whole.depth),
-        "words": run.recording.scene.geometry.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT,
-        "views": VIEWS,
-        "least_extension": float(np.floor(20 * np.nanmin(body.series.get("extension", 0.0))) / 20),
-        "chain": CHAIN_LOOK,
-    }  # fmt: skip
     notes, kept, all_times = body.whole.notes(body.is_deformed), len(body.times), len(run.recording.times)
     if kept < all_times:
         notes.append(f"{kept} of {all_times} recorded times are kept here, to save room.")
-    html = _filled("view.html", NOTES="".join(f'<p class="note">{escape(note)}</p>' for note in notes))
-    return Card("view", html, data, arrays)
+    data = {
+        **scales, "times": body.times.tolist(), "layers": len(body.whole.depth),
+        "words": run.recording.scene.geometry.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT,
+        "views": VIEWS, "chain": CHAIN_LOOK, "notes": " ".join(notes),
+        "least_extension": float(np.floor(20 * np.nanmin(body.series.get("extension", 0.0))) / 20),
+    }  # fmt: skip
+    return Card("view", data=data, arrays=arrays)
 
 
 def angles(run: ReportedRun) -> Card | None:
@@ -384,52 +384,47 @@ def angles(run: ReportedRun) -> Card | None:
     if not np.isfinite(run.recording.history.get("lumen_volume", np.zeros(1))).any():
         through = "through the body"  # its inner face encloses nothing
     along, across = shape.angle_in_words
-    legend = '<p class="note">Red: now, mean and 10 to 90 % of the volume. Grey: other times.</p>'
-    profile = section(f"Collagen angle {through}, deformed", f'<div id="profile"></div>{legend}', "narrow")
-    rose = section("Where the collagen points, by volume", '<div id="rose"></div>', "narrow")
-    data = {"depth": body.whole.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})", "along": along,
-            "across": across, "colours": ANGLE_COLOURS,
-            "regions": [{"name": words(name), "from": start, "to": end}
-                        for name, (start, end) in shape.region_depths(regions).items()]}  # fmt: skip
-    return Card("angles", f'<div class="stack">{profile if len(body.whole.depth) > 1 else ""}{rose}</div>', data)
+    places = [{"name": words(name), "from": a, "to": b} for name, (a, b) in shape.region_depths(regions).items()]
+    data = {"title": f"Collagen angle {through}, deformed", "depth": body.whole.depth.tolist(), "along": along,
+            "through": f"{through} (0 {start}, 1 {end})", "across": across, "colours": ANGLE_COLOURS,
+            "regions": places}  # fmt: skip
+    return Card("angles", data=data)
 
 
 def stress(run: ReportedRun) -> Card | None:
     """Stress through the wall, and what the law of Laplace says of its mean around."""
     history, unit, level = run.recording.history, unit_of(run.recording.scene, "stress"), None
-    legend = "Means of layers, in axes that move with the wall."
+    legend, name = "Means of layers, in axes that move with the wall.", "Cauchy stress"
     if {"pressure", "inner_radius", "outer_radius"} <= set(history):
         inner, outer = history["inner_radius"], history["outer_radius"]
         level = history["pressure"] * inner / (outer - inner)
         legend += " Dashed: p r_i / h, by the law of Laplace the mean around."
-    return _by_layer(run, "stress", ("around", "along", "across"), "Cauchy stress", legend, unit, level)
+    label = ", ".join(filter(None, (name, unit)))
+    return _by_layer(run, "stress", ("around", "along", "across"), label, level, title=name, unit=unit, legend=legend)
 
 
 def content(run: ReportedRun) -> Card | None:
     """Content and growth of the collagen through the wall, where they were recorded."""
-    legend = "Means of layers, over those at the start: amount of the collagen, volume of the wall."
-    return _by_layer(run, "content", MADE, "over the start", legend)
+    return _by_layer(run, "content", MADE, "over the start")
 
 
 def _by_layer(
-    run: ReportedRun, name: str, names: Sequence[str], label: str, legend: str, unit: str = "",
-    level: Places | None = None,
-) -> Card | None:  # fmt: skip
+    run: ReportedRun, name: str, names: Sequence[str], label: str, level: Places | None = None, **said: str
+) -> Card | None:
     """A series of `ShownBody` over the depth, and a dashed level of each row of the history."""
     body = run.body
     if body is None or name not in body.series or len(body.whole.depth) < 2:
         return None
     through, start, end = run.recording.scene.geometry.depth_in_words
     known = np.isfinite(body.series[name]).any(axis=(0, 1))
+    names = [*compress(names, known)]
     data = {
-        "layers": _finite(body.series[name][..., known]), "names": [*compress(names, known)],
+        "layers": _finite(body.series[name][..., known]), "names": names, "label": label,
         "depth": body.whole.depth.tolist(), "through": f"{through} (0 {start}, 1 {end})",
         "level": [] if level is None else _finite(np.interp(body.times, run.recording.history["time"], level)),
-        "label": ", ".join(filter(None, (label, unit))),
+        **said, "title": f"{said.get('title', ' and '.join(names).capitalize())} {through}",
     }  # fmt: skip
-    title = label if unit else " and ".join(compress(names, known)).capitalize()
-    html = f'<div id="{name}" class="stack"></div><p class="note">{legend}</p>'
-    return Card(name, section(f"{title} {through}", html, "half", unit), data)
+    return Card(name, data=data)
 
 
 # ---------------------------------------------------------------- curves
@@ -442,16 +437,15 @@ def curves(run: ReportedRun) -> Card | None:
     groups = defaultdict[tuple[str, str], list[str]](list)
     for name in run.columns:
         groups[run.known[name].unit if name in run.known else "", _family(name)].append(name)
-    cards, data = [], []
-    for index, ((_, family), group) in enumerate(groups.items()):
+    data = []
+    for (_, family), group in groups.items():
         unit = run.unit(group[0])
         title = words(group[0] if len(group) == 1 else WHOLE.get(family, family))
         title = title[0].upper() + title[1:]
-        cards.append(section(title, f'<div class="curve" id="curve-{index}"></div>', "third", unit))
         series = [{"name": words(name), "values": _finite(history[name][rows])} for name in group]
         data.append({"title": title, "unit": unit, "series": series})
     times = history["time"][rows].tolist()
-    return Card("curves", f'<div class="curves whole">{"".join(cards)}</div>', {"times": times, "curves": data})
+    return Card("curves", data={"times": times, "curves": data})
 
 
 WHOLE = {"max_chain": "max_chain_extension"}  # families that are no words by themselves
@@ -557,7 +551,7 @@ def versions(run: ReportedRun) -> Card:
     return Card("versions", folded("Versions and licences", table(rows) + note + licences))
 
 
-PAGE_PARTS: list[Part] = [head, tiles, view, angles, curves, stress, content, facts, warnings, scene, versions]
+PAGE_PARTS: list[Part] = [head, tiles, drawn, view, angles, curves, stress, content, facts, warnings, scene, versions]
 """In the order of the page."""
 
 
@@ -625,7 +619,7 @@ def page_with(found: list[Card]) -> str:
         "BUNDLE": bundle,
         "SCRIPT": script,
     }
-    return _filled("template.html", **parts)
+    return Template(_asset("template.html")).substitute(parts)  # what is put in is not looked at again
 
 
 def policy(scripts: list[str], style: str) -> str:
@@ -649,8 +643,3 @@ def as_json(values: object) -> str:
 
 def _asset(name: str) -> str:
     return (ASSETS / name).read_text(encoding="utf-8")
-
-
-def _filled(name: str, **parts: str) -> str:
-    """A template with its parts, which are not looked at again."""
-    return Template(_asset(name)).substitute(parts)

@@ -31,7 +31,18 @@ function listenToKeys(clock) {
   });
 }
 
+// What is drawn has its place and its words; what this run has not goes.
+function showParts() {
+  for (const card of document.querySelectorAll("[data-part]")) {
+    const data = PAGE.parts[card.dataset.part];
+    card.hidden = false;
+    if (!data) card.remove();
+    else for (const place of card.querySelectorAll("[data-text]")) place.textContent = data[place.dataset.text];
+  }
+}
+
 async function start() {
+  showParts();
   const arrays = await unpacked();
   const times = PAGE.parts.view?.times ?? PAGE.parts.curves?.times ?? [0];
   const clock = new Clock(times);
