@@ -13,7 +13,7 @@ import json
 import os
 import re
 import shlex
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -237,18 +237,8 @@ def _volumes(corners: Places) -> Places:
 # ---------------------------------------------------------------- how a run went, from its folder
 # Whether it has ended and why, what it warned of.
 
-_STEP = re.compile(r"time (\S+?), ")
 SAID_UNLOADED = "unloaded: "  # as logs say it
 _RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
-
-
-@dataclass
-class Warned:
-    """A warning of a run, with others that differ from it in numbers alone."""
-
-    text: str
-    count: int
-    time: str
 
 
 ASSETS = Path(__file__).with_name("assets")
@@ -271,15 +261,13 @@ class ReportedRun:
         return log_entries(self.recording.path)
 
     @cached_property
-    def warnings(self) -> list[Warned]:
-        """Those of run.log."""
-        found, time = dict[str, Warned](), ""
+    def warnings(self) -> dict[str, int]:
+        """Those of run.log with their numbers; of some that differ in numbers alone the first."""
+        first, found = dict[str, str](), Counter[str]()
         for _, level, text in self.log:
-            if level == "INFO" and (step := _STEP.match(text)):
-                time = step[1]
             if level in ("WARNING", "ERROR", "CRITICAL"):
-                found.setdefault(re.sub(r"\d+", "0", text), Warned(text, 0, time)).count += 1
-        return list(found.values())
+                found[first.setdefault(re.sub(r"\d+", "0", text), text)] += 1
+        return dict(found)
 
     @cached_property
     def state(self) -> tuple[str, str]:
@@ -511,18 +499,14 @@ def _as_text(value: object) -> str:
 def warnings(run: ReportedRun) -> Card:
     """What the run warned of, and how to run it again."""
     found = run.warnings
-    items = "".join(
-        f"<li>{escape(one.text)} "
-        f'<span class="note">({"once" if one.count == 1 else f"{one.count} times"}'
-        f'{f", first after t = {escape(one.time)}" if one.time else ""})</span></li>'
-        for one in found
-    )
+    numbers = {text: "once" if count == 1 else f"{count} times" for text, count in found.items()}
+    items = "".join(f'<li>{escape(text)} <span class="note">({n})</span></li>' for text, n in numbers.items())
     said = f"<ul>{items}</ul>" if found else '<p class="note">None: the run raised no warnings.</p>'
     name = run.recording.scene.name
     command = re.sub(r"^\S*/with-fenicsx", "./with-fenicsx", typed())  # the page goes elsewhere
     again = f"{command} run scene.toml -o {shlex.quote(f'results/{name}-again')}"
     buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a>' for file in _files(run))
-    html = section(f"Warnings ({sum(one.count for one in found)})", said + f'<h2>Run it again</h2><pre id="again">'
+    html = section(f"Warnings ({sum(found.values())})", said + f'<h2>Run it again</h2><pre id="again">'
                    f'{escape(again)}</pre><p><button id="copy">copy</button> {buttons}</p>')  # fmt: skip
     arrays = {file: Array(np.frombuffer(data, dtype=np.uint8)) for file, data in _files(run).items()}
     return Card("warnings", html, {"files": list(arrays)}, arrays)

@@ -8,7 +8,7 @@ import logging
 import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -556,6 +556,16 @@ class Part(Run):
 
 
 class _FitStudy(Study):
+    """Parts of a fit, side by side."""
+
+    def answers(self, problem: Problem, place: Path, tasks: Mapping[str, Task]) -> list[Any]:
+        """What the tasks make of the problem, which then knows what was evaluated for them."""
+        parts = [Part(name, self.scene, self.folder / name, (problem, task)) for name, task in tasks.items()]
+        self.runs = [*parts]
+        self.do()
+        problem.known |= read_journal(place)[1]
+        return [part.answer for part in parts]
+
     def learn(self) -> None:
         """End it with the first part that fails."""
         for name, words in self.failed.items():
@@ -590,30 +600,21 @@ def fit(
         for words in (*explained(scene), scene.formulation_in_words()):
             log.info("%s", words)
         first, jacobian = _begun(problem)
-    with ExitStack() as stack:
-        stack.enter_context(RunLock(place))
-        stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
-        parts = stack.enter_context(TemporaryDirectory())
-        study = stack.enter_context(closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)))
+    with RunLock(place), open_log(place / "fit.log", quiet=quiet, held=held), TemporaryDirectory() as parts:
         problem.begin(place, mark)
-
-        def on_cores(tasks: Mapping[str, Task]) -> list[Any]:
-            found = [Part(name, scene, Path(parts, name), (problem, task)) for name, task in tasks.items()]
-            study.runs = [*found]
-            study.do()
-            problem.known |= read_journal(place)[1]
-            return [part.answer for part in found]
-
         random = np.random.default_rng(1)
         points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
         rough = partial(minimised, near=(first, jacobian), enough=ROUGHLY)
-        found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
-        best = int(np.argmin([one.cost for one in found]))
-        (found[best],) = on_cores({f"from the end of start {best + 1}": partial(minimised, start=found[best].x)})
-        log.info("sums of squares: %s", ", ".join(f"{2 * one.cost:.6g}" for one in found))
-        result = result_of(problem, found)
-        if profiles:
-            result = with_profiles(problem, result, on_cores)
+        with closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)) as study:
+            on_cores = partial(study.answers, problem, place)
+            found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
+            best = int(np.argmin([one.cost for one in found]))
+            again = partial(minimised, start=found[best].x)
+            (found[best],) = on_cores({f"from the end of start {best + 1}": again})
+            log.info("sums of squares: %s", ", ".join(f"{2 * one.cost:.6g}" for one in found))
+            result = result_of(problem, found)
+            if profiles:
+                result = with_profiles(problem, result, on_cores)
         log.info("%s", result.verdict())
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
         result.write(place)
@@ -745,13 +746,8 @@ class Fit(Answer):
     modelled: list[Columns]
     profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
 
-    name, only_in_file = "fit", ("limited_by",)
+    name, about, only_in_file = "fit", "measured and fitted", ("limited_by",)
     caption = "Points: measured, with one standard deviation; lines: the fitted model. Each protocol has its panels."
-
-    @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: measured and fitted"
 
     @property
     def keys(self) -> list[str]:

@@ -140,10 +140,10 @@ class Analysis(Answer):
     caption = "Factor by which one pass multiplies a small change of the cells; beyond -1 and 1 the change grows."
 
     @property
-    def title(self) -> str:
-        """Of the picture."""
+    def about(self) -> str:  # type: ignore[override]
+        """What is shown."""
         how = self.scene.remodeling
-        return f"{self.scene.name}: driver {how.driver}, frame {how.frame}, coupling {how.coupling}"
+        return f"driver {how.driver}, frame {how.frame}, coupling {how.coupling}"
 
     def table(self) -> dict[str, list[float]]:
         """A row for each time."""

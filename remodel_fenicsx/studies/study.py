@@ -121,10 +121,12 @@ class Answer(ABC):
     failed: Mapping[str, str] = {}
     notes: Sequence[str] = ()
 
+    about: str  # that a picture's title says beside the scene's name
+
     @property
-    @abstractmethod
     def title(self) -> str:
         """Of the picture."""
+        return f"{self.scene.name}: {self.about}"
 
     @abstractmethod
     def table(self) -> Mapping[str, ArrayLike]:

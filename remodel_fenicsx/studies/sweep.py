@@ -33,6 +33,7 @@ from remodel_fenicsx.system.files import MOST_RUNS
 
 Array = NDArray[np.float64]
 Number = int | float
+Point = Mapping[str, Number]
 
 OF_THE_SOLVER = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
 RULE = (
@@ -103,7 +104,6 @@ def _number(text: str) -> Number:
 
 # ---------------------------------------------------------------- a sweep: the last rows over the numbers
 PANEL_COLUMNS, PANEL_KEYS = 5, 3  # of the picture: what fits on a page
-MOST_LINES = 6  # in a panel; where there are more combinations of the other keys, points are drawn
 
 
 @dataclass(frozen=True)
@@ -111,17 +111,17 @@ class Sweep(Answer):
     """Numbers by key and histories of the runs; one that has failed has no history."""
 
     scene: Scene
-    points: Mapping[str, Mapping[str, Number]]
+    points: Mapping[str, Point]
     histories: Mapping[str, Mapping[str, Array]]
     failed: dict[str, str] = field(default_factory=dict)
 
     name = "sweep"
-    caption = "Each point is the end of one run; lines join runs whose other numbers are equal."
+    caption = "Each point is the end of one run; where one key varies a line joins them."
 
     @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: the last row of {len(self.points)} runs"
+    def about(self) -> str:  # type: ignore[override]
+        """What is shown."""
+        return f"the last row of {len(self.points)} runs"
 
     @cached_property
     def values(self) -> dict[str, Array]:
@@ -163,26 +163,18 @@ class Sweep(Answer):
             return "No column of the last row differs between the runs."
         return f"At the end of {len(self.histories)} runs: {'; '.join(parts)}."
 
-    def _at(self, run: int | np.integer, but: str = "") -> str:
-        return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items() if key != but)
+    def _at(self, run: np.integer) -> str:
+        return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items())
 
     def figure(self) -> Figure:
-        """Columns over keys: a line for each combination of the other keys, points where these are many."""
+        """Columns over keys."""
         keys, columns = list(self.values)[:PANEL_KEYS], self.shown[:PANEL_COLUMNS]
         figure = Figure(figsize=(7.2, 2.2 * max(1, len(columns)) + 0.4), layout="constrained")
         grid = figure.subplots(max(1, len(columns)), len(keys), squeeze=False, sharey="row", sharex="col")
         for (row, name), (column, key) in product(enumerate(columns), enumerate(keys)):
-            axes, x, y = grid[row, column], self.values[key], self.ends[name]
-            groups: dict[str, list[int]] = {}
-            for run in np.argsort(x, kind="stable"):
-                groups.setdefault(self._at(run, but=key), []).append(run)
-            if len(groups) > MOST_LINES or len(groups) == len(x):
-                axes.plot(x, y, "o")
-            else:
-                for words, runs in groups.items():
-                    axes.plot(x[runs], y[runs], "o-", label=words or None)
-                if row == 0 and len(groups) > 1:
-                    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
+            axes, order = grid[row, column], np.argsort(self.values[key])
+            look = "o-" if len(self.values) == 1 else "o"
+            axes.plot(self.values[key][order], self.ends[name][order], look)
             axes.set(xlabel=key, ylabel=label(self.scene, name))
             axes.label_outer()
         return figure
@@ -190,7 +182,7 @@ class Sweep(Answer):
 
 def sweep(
     scene: Scene,
-    points: Sequence[Mapping[str, Number]],
+    points: Sequence[Point],
     folder: Path | str | None = None,
     jobs: int | None = None,
     quiet: bool = True,
@@ -215,7 +207,7 @@ Swept = TypeVar("Swept", bound=Sweep)
 
 
 def _answered(
-    kind: type[Swept], points: Mapping[str, Mapping[str, Number]], refused: Mapping[str, str], study: Study
+    kind: type[Swept], points: Mapping[str, Point], refused: Mapping[str, str], study: Study
 ) -> tuple[Path, Swept]:
     """Do the runs of a sweep; at least `FEWEST_RUNS` of its points must reach the end."""
     study.failed |= refused
@@ -229,7 +221,7 @@ def _answered(
     return study.answered(answer)
 
 
-def _changed(scene: Scene, point: Mapping[str, Number]) -> Scene:
+def _changed(scene: Scene, point: Point) -> Scene:
     """With the numbers of a point; some keys take them and mean something else."""
     found = scene.with_values({**point, "output.fields": False})
     for key, value in point.items():
@@ -255,9 +247,9 @@ class Ensemble(Sweep):
     caption = "Lines: means over the seeds; dark: mean and one standard deviation; light: least and most of all seeds."
 
     @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: {self.seeds} seeds of random cells, and isotropic cells"
+    def about(self) -> str:  # type: ignore[override]
+        """What is shown."""
+        return f"{self.seeds} seeds of random cells, and isotropic cells"
 
     @property
     def time(self) -> Array:

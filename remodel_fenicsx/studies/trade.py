@@ -210,10 +210,11 @@ class _TradeStudy(Study):
     """Runs in the order of their cost, within a budget."""
 
     def __init__(self, scene: Scene, folder: Path | str | None, budget: float, *how: Any):
+        deadline = clock.monotonic() + budget
         runs = [(setting, as_run(setting, seed)) for setting in ladder(scene) for seed in setting.seeds]
         super().__init__("trade", scene, folder, {run.name: run for _, run in runs}, *how)
         self.settings = {run.name: setting for setting, run in runs}
-        self.budget, self.deadline = budget, clock.monotonic() + budget
+        self.budget, self.deadline = budget, deadline
         self._results: dict[Setting, Result] = {}
 
     @property
@@ -266,14 +267,9 @@ class Trade(Answer):
     notes: list[str] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
 
-    name = "trade"
+    name, about = "trade", "error and cost of its settings"
     caption = "Errors against the finest setting; filled: no other setting is as good for less."
     only_in_file = "scene", "trusted"
-
-    @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: error and cost of its settings"
 
     def table(self) -> dict[str, Sequence[object]]:
         """A row for each setting."""

@@ -289,10 +289,10 @@ def test_warnings_come_once_with_their_number(folder: Path) -> None:
         log.write("2026-01-02 03:04:06,000 WARNING before all\n2026-01-02 03:04:06,000 INFO time 1, force 25\n")
         log.write("2026-01-02 03:04:07,000 WARNING locks at 3 points\n2026-01-02 03:04:07,000 INFO time 2, force 50\n")
         log.write("2026-01-02 03:04:08,000 WARNING locks at 12 points\n2026-01-02 03:04:08,000 WARNING two\nlines\n")
-    found = [(one.text, one.count, one.time) for one in ReportedRun(Recording(folder)).warnings]
-    assert found == [("before all", 1, ""), ("locks at 3 points", 2, "1"), ("two\nlines", 1, "2")]
+    found = ReportedRun(Recording(folder)).warnings
+    assert found == {"before all": 1, "locks at 3 points": 2, "two\nlines": 1}
     text = write_report(folder).read_text()
-    assert "<h2>Warnings (4)</h2>" in text and "(2 times, first after t = 1)" in text
+    assert "<h2>Warnings (4)</h2>" in text and 'locks at 3 points <span class="note">(2 times)' in text
 
 
 def test_text_of_others_is_text(folder: Path) -> None:
@@ -355,7 +355,7 @@ def test_a_report_that_fails_is_one_warning(tmp_path: Path) -> None:
     command = ["run", str(DEMOS / "cube.toml"), "--set", "time.end=1", "-o", str(tmp_path / "run"), "-q"]
     done = forked("python", program, *command)
     assert done.returncode == 0 and done.stderr == "WARNING: no report.html: no room\n"
-    assert [one.text for one in ReportedRun(Recording(tmp_path / "run")).warnings] == ["no report.html: no room"]
+    assert ReportedRun(Recording(tmp_path / "run")).warnings == {"no report.html: no room": 1}
 
 
 # ---------------------------------------------------------------- what is in it of others
