@@ -584,7 +584,7 @@ def _sweep(options: argparse.Namespace) -> int:
     needs=COMPUTES + DRAWS,
 )
 def _ensemble(options: argparse.Namespace) -> int:
-    """Run a scene of random cells with many seeds, and with isotropic cells."""
+    """Run a scene of random cells with many seeds."""
     from remodel_fenicsx.studies.sweep import ensemble
 
     return _answer(ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet)
