@@ -256,7 +256,7 @@ def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
     if cut is None:
         return np.zeros(len(whole.elements), dtype=bool)
     middle = (whole.points.min(axis=0) + whole.points.max(axis=0)) / 2
-    x, y, _ = (whole.points[whole.elements].mean(axis=1) - middle).T
+    x, y, _ = (whole.centres - middle).T
     slack = 1e-6 * np.ptp(whole.points)  # an element on the border stays
     found = {"half": y < -slack, "quarter": (y < -slack) & (x > slack)}
     if cut not in found:

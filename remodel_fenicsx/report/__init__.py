@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import re
-import shlex
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -56,7 +55,7 @@ from remodel_fenicsx.results.whole_body import (
     has_a_body,
 )
 from remodel_fenicsx.scene.scene import Scene, leaves, preset_scene
-from remodel_fenicsx.system.files import read_regular, typed, write_new, write_whole
+from remodel_fenicsx.system.files import read_regular, write_new, write_whole
 from remodel_fenicsx.system.terminal import duration
 
 
@@ -217,7 +216,7 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
     if recorded:
         axes = np.stack([fields[name] for name in recorded], axis=1)
     else:
-        axes = shape.axes_at(whole.points[whole.elements].mean(axis=1))
+        axes = shape.axes_at(whole.centres)
     F, stress = (fields[name].reshape(-1, 3, 3) for name in TENSOR_FIELDS)
     moved = moved_axes(axes, F)
     return found | {"stress": means([*np.einsum("nki,nij,nkj->kn", moved, stress, moved)])}
@@ -497,18 +496,15 @@ def _as_text(value: object) -> str:
 
 
 def warnings(run: ReportedRun) -> Card:
-    """What the run warned of, and how to run it again."""
+    """What the run warned of, and its files."""
     found = run.warnings
     numbers = {text: "once" if count == 1 else f"{count} times" for text, count in found.items()}
     items = "".join(f'<li>{escape(text)} <span class="note">({n})</span></li>' for text, n in numbers.items())
     said = f"<ul>{items}</ul>" if found else '<p class="note">None: the run raised no warnings.</p>'
-    name = run.recording.scene.name
-    command = re.sub(r"^\S*/with-fenicsx", "./with-fenicsx", typed())  # the page goes elsewhere
-    again = f"{command} run scene.toml -o {shlex.quote(f'results/{name}-again')}"
-    buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a>' for file in _files(run))
-    html = section(f"Warnings ({sum(found.values())})", said + f'<h2>Run it again</h2><pre id="again">'
-                   f'{escape(again)}</pre><p><button id="copy">copy</button> {buttons}</p>')  # fmt: skip
-    arrays = {file: Array(np.frombuffer(data, dtype=np.uint8)) for file, data in _files(run).items()}
+    files = _files(run)
+    buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a> ' for file in files)
+    html = section(f"Warnings ({sum(found.values())})", f"{said}<h2>Files of the run</h2><p>{buttons}</p>")
+    arrays = {file: Array(np.frombuffer(data, dtype=np.uint8)) for file, data in files.items()}
     return Card("warnings", html, {"files": list(arrays)}, arrays)
 
 

@@ -128,8 +128,9 @@ class WholeBody:
             self._turned = TurnedFields(points, elements, *solved, reduction.turn)
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
+        self.centres = self.points[self.elements].mean(axis=1)
         known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
-        depth = known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
+        depth = known["depth"] if "depth" in known else shape.depth(self.centres)
         self.layer, self.depth = _layers(depth, self.elements)
 
     def notes(self, is_deformed: bool) -> list[str]:
@@ -181,8 +182,7 @@ def revolve(folder: Path | str) -> list[Path]:
         if path.exists():
             raise RecordingError(f"{path}: is there already; nothing is overwritten")
     whole = WholeBody(recording)
-    centres = whole.points[whole.elements].mean(axis=1)
-    scale = 0.4 * float(np.prod(np.ptp(whole.points, axis=0)) / len(centres)) ** (1 / 3)
+    scale = 0.4 * float(np.prod(np.ptp(whole.points, axis=0)) / len(whole.elements)) ** (1 / 3)
     kind = CELL_TYPES["hexahedron" if whole.elements.shape[1] == 8 else "tetrahedron"][0]
     with ExitStack() as stack:  # the body is closed last: where it is, all are
         grid = stack.enter_context(TransientGrid(paths[0], whole.points, whole.elements, kind))
@@ -192,6 +192,6 @@ def revolve(folder: Path | str) -> list[Path]:
             grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
             if displacement is not None and set(OF_CHAINS) <= set(fields):
                 middle = displacement[whole.elements].mean(axis=1)
-                new = append_chains(chains or paths[1], float(time), centres, scale, middle, fields)
+                new = append_chains(chains or paths[1], float(time), whole.centres, scale, middle, fields)
                 chains = chains or stack.enter_context(new)
     return [path for path in paths if path.exists()]

@@ -648,16 +648,6 @@ def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, dict[
     return chosen_folder(folder, name, MPI.COMM_SELF), {}
 
 
-@dataclass(frozen=True)
-class LikelihoodProfile:
-    """Smallest sums of squares with one unknown held."""
-
-    values: Array
-    increases: Array
-    lower: float
-    upper: float
-
-
 def minimised(
     problem: Problem,
     start: Array,
@@ -723,12 +713,10 @@ def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str,
     costs = np.reshape([one.cost for one in on_cores(tasks)], points.shape[:2])
     profiles = {}
     for held, values, cost in zip(chosen, points.T[chosen, range(len(chosen))], costs.T, strict=True):
-        increases = np.maximum(2 * cost - least, 0.0)
         # the root of the increase is nearly a straight line; where it is that of the band; NaN beyond all points
-        roots = np.sign(PROFILE_STEPS) * np.sqrt(increases) / found.inflation
+        roots = np.sign(PROFILE_STEPS) * np.sqrt(np.maximum(2 * cost - least, 0.0)) / found.inflation
         beyond = [value if value in ends[:, held] else np.nan for value in values[[0, -1]]]
-        band = np.exp(np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond))
-        profiles[found.keys[held]] = LikelihoodProfile(np.exp(values), increases, *map(float, band))
+        profiles[found.keys[held]] = np.exp(np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond))
     return replace(found, profiles=profiles)
 
 
@@ -744,7 +732,7 @@ class Fit(Answer):
     misfit: float
     minima: list[float]
     modelled: list[Columns]
-    profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
+    profiles: Columns = field(default_factory=dict)  # bands by likelihood profiles, their two ends
 
     name, about, only_in_file = "fit", "measured and fitted", ("limited_by",)
     caption = "Points: measured, with one standard deviation; lines: the fitted model. Each protocol has its panels."
@@ -793,7 +781,7 @@ class Fit(Answer):
     def table(self) -> dict[str, ArrayLike]:
         """A row for each unknown."""
         lower, upper = np.exp(self.band)
-        profiles = [[getattr(self.profiles.get(key), end, np.nan) for key in self.keys] for end in ("lower", "upper")]
+        profiles = np.transpose([self.profiles.get(key, [np.nan, np.nan]) for key in self.keys])
         columns = {"key": self.keys, "value": self.values, "lower": lower, "upper": upper, "open": self.open}
         columns["limited_by"] = [self.limited_by] * len(self.keys)
         columns |= dict(zip(("profile_lower", "profile_upper"), profiles, strict=True))
@@ -816,14 +804,8 @@ class Fit(Answer):
     def write(self, folder: Path) -> None:
         """Write tables and picture."""
         super().write(folder)
-        notes = [self.title, made_with()]
-        rows = [
-            (key, *row) for key, one in self.profiles.items() for row in zip(one.values, one.increases, strict=True)
-        ]
-        if rows:
-            columns = dict(zip(("key", "value", "increase"), zip(*rows, strict=True), strict=True))
-            Page(folder, "profiles").save_table(columns, notes)
         correlations = dict(zip(self.keys, self.correlations, strict=True))
+        notes = [self.title, made_with()]
         Page(folder, "correlations").save_table({"key": self.keys, **correlations}, notes)
 
     def figure(self) -> Figure:

@@ -58,23 +58,7 @@ from remodel_fenicsx.unloading import as_unloaded
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
 DOTS_PER_INCH = 200
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
-STYLE: dict[str, object] = {
-    "axes.prop_cycle": matplotlib.rcsetup.cycler(color=COLOURS),
-    "font.family": "DejaVu Sans",
-    "font.size": 8.5,
-    "axes.titlesize": 9,
-    "axes.titlepad": 4.0,
-    "axes.labelsize": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "axes.grid": True,
-    "grid.color": "0.9",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.6,
-    "legend.frameon": False,
-    "figure.facecolor": "white",
-}
+STYLE = matplotlib.rc_params_from_file(Path(__file__).with_name("figures.mplstyle"), use_default_template=False)
 
 
 class Page:

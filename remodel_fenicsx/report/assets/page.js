@@ -1,13 +1,5 @@
 // The page as a whole: its parts, downloads and keys.
 PARTS.warnings = (data, arrays) => {
-  const copy = document.getElementById("copy"), again = document.getElementById("again");
-  copy.addEventListener("click", async () => {
-    getSelection().selectAllChildren(again);  // where nothing may be put into the clipboard it can be copied by hand
-    try {
-      await navigator.clipboard.writeText(again.textContent);
-      copy.textContent = "copied";
-    } catch { copy.textContent = "selected"; }
-  });
   for (const link of document.querySelectorAll(".download")) {
     link.addEventListener("click", (event) => {
       event.preventDefault();
