@@ -23,6 +23,7 @@ from remodel_fenicsx.system.files import write_new
 
 
 log = logging.getLogger(__name__)
+LEAST_SAID = 0.01  # of a change between elements: less is below what a fit of angles resolves
 
 
 def write_vtu(
@@ -112,9 +113,25 @@ def export(folder: Path | str, kind: str, path: Path | None = None, time: float 
     if fibres.others and kind not in WITH_OTHERS:
         kinds = " and ".join(WITH_OTHERS)
         log.warning("%s has no place for %s; %s files have them", kind, ", ".join(fibres.others), kinds)
+    share = unevenness(fibres.elements, fibres.tensors)
+    if fibres.elements.shape[1] > 4 and share > LEAST_SAID:
+        log.warning(
+            "each element has the mean of its points: at nodes they differ by up to %.1f %% of tr A, "
+            "and a run that begins with them is off by up to about as much there",
+            100 * share,
+        )
     path = Path(folder) / f"fibres{ending}" if path is None else path
     write(path, fibres)
     return path
+
+
+def unevenness(elements: NDArray[np.int64], tensors: Array) -> float:
+    """Largest change of A (elements, 3, 3), over tr A, from an element to the mean of all at one of its nodes."""
+    shares = (tensors / np.trace(tensors, axis1=1, axis2=2)[:, None, None]).reshape(-1, 9)
+    sums = np.zeros((elements.max() + 1, 10))
+    np.add.at(sums, elements, np.insert(shares, 9, 1.0, axis=1)[:, None])
+    at_nodes = sums[elements, :9] / sums[elements, 9:]
+    return float(np.linalg.norm(at_nodes - shares[:, None], axis=2).max())
 
 
 def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:
