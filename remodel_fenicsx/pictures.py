@@ -71,7 +71,8 @@ def grid(
     found = pyvista.UnstructuredGrid({kind: whole.elements}, whole.points)
     if displacement is not None:
         found.point_data["displacement"] = displacement
-    found.cell_data.update({"layer": whole.layer, **fields})
+    cells: dict[str, NDArray[Any]] = {"layer": whole.layer, **fields}
+    found.cell_data.update(cells)
     return found if shown is None else found.extract_cells(shown)
 
 

@@ -403,7 +403,7 @@ def _by_layer(
     if body is None or name not in body.series or len(body.whole.depth) < 2:
         return None
     through, start, end = run.recording.scene.geometry.depth_in_words
-    known = np.isfinite(body.series[name]).any(axis=(0, 1))
+    known: NDArray[np.bool_] = np.isfinite(body.series[name]).any(axis=(0, 1))
     names = [*compress(names, known)]
     data = {
         "layers": _finite(body.series[name][..., known]), "names": names, "label": label,
@@ -446,9 +446,9 @@ def _family(name: str) -> str:
     return "_".join([first, *others[:1]]) if len(others) > 1 else first
 
 
-def _finite(values: NDArray[np.floating]) -> object:
+def _finite(values: NDArray[np.floating[Any]] | np.floating[Any]) -> object:
     """Nested lists of numbers with 7 digits; None where there is none."""
-    if np.ndim(values):
+    if isinstance(values, np.ndarray):
         return [*map(_finite, values)]
     return float(f"{values:.7g}") if np.isfinite(values) else None
 

@@ -460,7 +460,7 @@ class Problem:
         return {key.removeprefix(SCALE): n for key, n in self._numbers(logarithms) if key.startswith(SCALE)}
 
     def _numbers(self, logarithms: Array) -> zip[tuple[str, float]]:
-        return zip(self.unknowns, np.exp(logarithms).tolist(), strict=True)
+        return zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
 
     def models(self, logarithms: Array, kept: Kept | None = None) -> list[Columns]:
         """What the model says of each table."""
@@ -705,7 +705,7 @@ def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str,
     points = np.clip(best + np.multiply.outer(PROFILE_STEPS, ways), *ends)  # (steps, chosen, unknowns)
     tasks = {
         f"profile of {found.keys[held]} at {steps:+g}": partial(
-            minimised, start=x, held=held, near=near, enough=ROUGHLY
+            minimised, start=x, held=int(held), near=near, enough=ROUGHLY
         )
         for steps, row in zip(PROFILE_STEPS, points, strict=True)
         for held, x in zip(chosen, row, strict=True)

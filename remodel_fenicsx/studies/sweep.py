@@ -252,7 +252,7 @@ class Ensemble(Sweep):
         """Of each column over the seeds, at each time."""
         runs = [*self.histories.values()]
         columns = {name: np.array([run[name] for run in runs]) for name in runs[0] if name not in OF_THE_SOLVER}
-        kinds = {"mean": np.mean, "deviation": partial(np.std, ddof=1), "least": np.min, "most": np.max}
+        kinds: dict[str, Any] = {"mean": np.mean, "deviation": partial(np.std, ddof=1), "least": np.min, "most": np.max}
         return {name: {kind: of(v, axis=0) for kind, of in kinds.items()} for name, v in columns.items()}
 
     def table(self) -> dict[str, Array]:

@@ -271,7 +271,7 @@ class Trade(Answer):
     caption = "Errors against the finest setting; filled: no other setting is as good for less."
     only_in_file = "scene", "trusted"
 
-    def table(self) -> dict[str, Sequence[object]]:
+    def table(self) -> dict[str, list[Any]]:
         """A row for each setting."""
         rows = [
             (one.setting.name, f"{ROWS}/{one.setting.name}.toml", one.angle_error, one.length_error, one.seconds,
@@ -280,7 +280,7 @@ class Trade(Answer):
         ]  # fmt: skip
         lengths = f"error_{compared_lengths(self.scene)[0]}"
         names = "setting", "scene", "error_degrees", lengths, "cpu_seconds", "on_front", "trusted", "doubt"
-        return dict(zip(names, zip(*rows, strict=True), strict=True))
+        return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
 
     def verdict(self) -> str:
         """What `WANTED` degrees cost."""
