@@ -403,7 +403,7 @@ def _by_layer(
     if body is None or name not in body.series or len(body.whole.depth) < 2:
         return None
     through, start, end = run.recording.scene.geometry.depth_in_words
-    known: NDArray[np.bool_] = np.isfinite(body.series[name]).any(axis=(0, 1))
+    known = np.any(np.isfinite(body.series[name]), axis=(0, 1)).tolist()
     names = [*compress(names, known)]
     data = {
         "layers": _finite(body.series[name][..., known]), "names": names, "label": label,

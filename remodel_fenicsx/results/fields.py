@@ -217,6 +217,8 @@ class Fields(Watcher, ClosedAtEnd):
             if grid is not None:
                 grid.close()
 
+    publish = close
+
 
 def _continued(path: Path, after: float | None) -> TransientGrid | None:
     """The file without the steps after this time, if a run goes on and has it."""
