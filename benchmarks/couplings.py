@@ -25,7 +25,7 @@ from mpi4py import MPI
 from docs.making.pages import DOCS, FIGURES, between_marks, by_column, markdown, panel_letters, read_table
 from remodel_fenicsx import read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.study import COLOURS, STYLE, Page
 from tests.runs import made
 
 PAGE = DOCS / "laws_and_couplings.md"

@@ -29,10 +29,12 @@ from remodel_fenicsx.body.shape import PROFILE, profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.studies.page import COLOURS, STYLE, Page
+from remodel_fenicsx.studies.study import COLOURS, STYLE, Page
 from remodel_fenicsx.studies.trade import Setting, as_run, ladder, pareto, typical
 from tests.reference.radial import solve_radial
 from tests.runs import rows_of
+
+SECONDS_PER_POINT = 3e-5  # of a step, roughly
 
 Array = NDArray[np.float64]
 Run = Mapping[str, Array]

@@ -34,7 +34,7 @@ from remodel_fenicsx.system.environment import (
 from remodel_fenicsx.system.files import positive, refusal_in_words, wall_time, write_new
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.studies.page import Answer
+    from remodel_fenicsx.studies.study import Answer
     from remodel_fenicsx.scene.scene import Scene
 
 presets, scenes = Late("remodel_fenicsx.scene.presets"), Late("remodel_fenicsx.scene.scene")  # no help needs them
@@ -366,7 +366,7 @@ def _report(options: argparse.Namespace) -> None:
 )
 def _picture(options: argparse.Namespace) -> None:
     """Draw the body of the run in DIR: PNG or PDF."""
-    from remodel_fenicsx.pictures.bodies import Viewing, draw_picture
+    from remodel_fenicsx.pictures import Viewing, draw_picture
 
     viewing = Viewing(options.layers, options.cut, options.view)
     _say(str(draw_picture(options.folder, options.time, viewing, options.output)))
@@ -385,7 +385,7 @@ def _picture(options: argparse.Namespace) -> None:
 )
 def _animate(options: argparse.Namespace) -> None:
     """Draw the body of the run in DIR as it moves: GIF or WebP."""
-    from remodel_fenicsx.pictures.bodies import Viewing, draw_animation
+    from remodel_fenicsx.pictures import Viewing, draw_animation
 
     viewing = Viewing(options.layers, options.cut, options.view)
     _say(str(draw_animation(options.folder, options.frames, viewing, options.output)))
@@ -576,7 +576,7 @@ def _sweep(options: argparse.Namespace) -> int:
     needs=COMPUTES + DRAWS,
 )
 def _ensemble(options: argparse.Namespace) -> int:
-    """Run a scene of random cells with many seeds, and with isotropic cells."""
+    """Run a scene of random cells with many seeds."""
     from remodel_fenicsx.studies.sweep import ensemble
 
     return _answer(ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet)
@@ -586,8 +586,8 @@ def _ensemble(options: argparse.Namespace) -> int:
     "trade artery.toml --budget 10min",
     SCENE_AND_CHANGES,
     """
-    --budget TIME = 10min  Begin no run that would end after this wall time (default: %(default)s).
-        Cheap runs come first.
+    --budget TIME = 10min  Stop after this wall time (default: %(default)s). Cheap runs come first;
+        a larger budget goes on.
     """,
     _study("trade"),
     needs=COMPUTES + DRAWS,

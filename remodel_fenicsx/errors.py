@@ -46,6 +46,14 @@ class UnreadableFile(RemodelError, ValueError):  # noqa: N818
     """What is wrong with a file of others; one line."""
 
 
+class FigureError(RemodelError, ValueError):
+    """No figure for a reason that its one line names."""
+
+    def __init__(self, message: str, exit_code: int = BAD_INPUT):
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
 def printable(text: str) -> str:
     """Text on one line: control characters and line ends become spaces."""
     return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)

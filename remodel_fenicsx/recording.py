@@ -58,7 +58,7 @@ class Recording(RecordedRun):
     """
 
     def _repr_html_(self) -> str:
-        from remodel_fenicsx.report.page import page_of
+        from remodel_fenicsx.report import page_of
 
         page = escape(page_of(self, NOTEBOOK_SIZE))
         sandbox = "allow-scripts allow-downloads"  # no origin of its own: it reaches nothing of the notebook
@@ -88,7 +88,7 @@ class Recording(RecordedRun):
         OSError
             If it cannot be written.
         """
-        from remodel_fenicsx.report.page import write_report
+        from remodel_fenicsx.report import write_report
 
         return write_report(self.path, path)
 
@@ -113,9 +113,9 @@ class Recording(RecordedRun):
         ImportError
             If there is no PyVista.
         """
-        from remodel_fenicsx.pictures.bodies import grid, whole_body
+        from remodel_fenicsx.pictures import WholeBody, grid
 
-        return grid(whole_body(self), self._time(time))
+        return grid(WholeBody(self), self._time(time))
 
     def plot(
         self, time: float | None = None, name: str = "fibre_angle_deformed", *, layers: int | None = None,
@@ -158,21 +158,21 @@ class Recording(RecordedRun):
         ImportError
             If there is no PyVista.
         """
-        from remodel_fenicsx.pictures import bodies
+        from remodel_fenicsx import pictures
 
-        whole = bodies.whole_body(self)
-        shown = bodies.shown_elements(whole, bodies.Viewing(layers, cut))
+        whole = pictures.WholeBody(self)
+        shown = pictures.shown_elements(whole, pictures.Viewing(layers, cut))
         if elements is not None:
             if np.shape(elements) != shown.shape:
                 rule = f"allowed is a mask of all {len(shown)}"
-                raise bodies.FigureError(f"elements of shape {np.shape(elements)}: {rule}", 2)
+                raise pictures.FigureError(f"elements of shape {np.shape(elements)}: {rule}")
             shown &= np.asarray(elements, dtype=bool)
-        found = bodies.grid(whole, self._time(time), shown)
+        found = pictures.grid(whole, self._time(time), shown)
         if name not in found.cell_data:
             there = ", ".join(found.cell_data)
             raise RecordingError(f"{self.path}: no field {name!r} of elements; there are {there}")
-        plotter = plotter or bodies.new_plotter()
-        bodies.add_body(plotter, bodies.deformed(found), name, chains, **options)
+        plotter = plotter or pictures.new_plotter()
+        pictures.add_body(plotter, pictures.deformed(found), name, chains, **options)
         return plotter
 
     def screenshot(
@@ -208,12 +208,10 @@ class Recording(RecordedRun):
         OSError
             If the file cannot be written.
         """
-        from remodel_fenicsx.pictures.bodies import Viewing, draw_picture
+        from remodel_fenicsx.pictures import Viewing, draw_picture
 
         return draw_picture(self.path, times, Viewing(layers, cut, view), None if path is None else Path(path))
 
     def _time(self, time: float | None) -> float:
         """A time with fields: this one or the last."""
-        if not len(self.times):
-            raise RecordingError(f"{self.path}: the run recorded no fields (output.fields)")
         return float(self.times[-1]) if time is None else time

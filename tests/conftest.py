@@ -63,14 +63,14 @@ def display() -> Iterator[dict[str, str]]:
 @pytest.fixture
 def drawn_by_forks(display: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures in space are drawn by children of the process that has imported all."""
-    program = "import sys; from remodel_fenicsx.pictures import bodies; bodies.main(sys.argv[1])"
-    imports = ("remodel_fenicsx.pictures.bodies", "pyvista.plotting", "matplotlib.backends.backend_agg")
+    program = "import sys; from remodel_fenicsx import pictures; pictures.main(sys.argv[1])"
+    imports = ("remodel_fenicsx.pictures", "pyvista.plotting", "matplotlib.backends.backend_agg")
 
     def draw(command: Sequence[str], env: dict[str, str], **_: Any) -> subprocess.CompletedProcess[str]:
         return forked("python", program, command[-1], variables=env | display, imports=imports)
 
     drawing = SimpleNamespace(**vars(subprocess) | {"run": draw})
-    monkeypatch.setattr("remodel_fenicsx.pictures.bodies.subprocess", drawing)
+    monkeypatch.setattr("remodel_fenicsx.pictures.subprocess", drawing)
 
 
 @pytest.fixture

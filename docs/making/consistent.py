@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from docs.making.pages import EDGES, FIGURES, Columns, drawn, panel_letters, read_table
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.studies.page import COLOURS, Page
+from remodel_fenicsx.studies.study import COLOURS, Page
 from tests.runs import made
 
 END, KAPPA = 150.0, 0.025

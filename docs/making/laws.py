@@ -32,7 +32,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.studies.page import COLOURS, Page
+from remodel_fenicsx.studies.study import COLOURS, Page
 from tests.runs import made
 
 PAGE = DOCS / "laws_and_couplings.md"

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from remodel_fenicsx.studies.page import DOTS_PER_INCH, STYLE, Page, made_with
+from remodel_fenicsx.studies.study import DOTS_PER_INCH, STYLE, Page, made_with
 from remodel_fenicsx.system.children import cores
 
 DOCS = Path(__file__).resolve().parents[1]

@@ -14,7 +14,7 @@ import numpy as np
 
 from demos.figures import scenes
 from docs.making.pages import by_column, side_by_side
-from remodel_fenicsx.studies.page import Page
+from remodel_fenicsx.studies.study import Page
 from tests.runs import last_row
 
 Row = dict[str, Any]

@@ -19,7 +19,7 @@ from remodel_fenicsx.body.shape import columns_on_request
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.studies.page import COLOURS, Page
+from remodel_fenicsx.studies.study import COLOURS, Page
 from tests.runs import made
 
 OPENING_ANGLES = (0, 60, 120, 160)  # degrees

@@ -32,7 +32,7 @@ from docs.making.pages import (
 )
 from remodel_fenicsx import RemodelError, extend, read_scene
 from remodel_fenicsx.studies.fit import fit
-from remodel_fenicsx.studies.page import COLOURS, Page
+from remodel_fenicsx.studies.study import COLOURS, Page
 from tests.body.test_peers import passive
 from tests.runs import last_row
 from tests.runs import rows_of as run

@@ -19,7 +19,7 @@ from demos import figures
 from docs.making.consistent import page_values
 from docs.making.pages import DOCS, EDGES, FIGURES, Columns, drawn, markdown, read_table, rows_of
 from docs.making.studies import study
-from remodel_fenicsx.studies.page import COLOURS, Page, read_notes
+from remodel_fenicsx.studies.study import COLOURS, Page, read_notes
 from remodel_fenicsx.system.children import cores
 from tests.reference.radial import RadialHistory, solve_radial
 

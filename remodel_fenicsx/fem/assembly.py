@@ -165,6 +165,11 @@ def over_ranks(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
     return value if comm.size == 1 else comm.allreduce(value, operation)
 
 
+def integral(form: Form) -> float:
+    """Value of a compiled form without arguments, over all ranks. Collective."""
+    return float(over_ranks(form.mesh.comm, np.real(dolfinx.fem.assemble_scalar(form)), MPI.SUM))
+
+
 def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:
     """The values of all ranks, on all ranks. Collective."""
     return [value] if comm.size == 1 else comm.allgather(value)

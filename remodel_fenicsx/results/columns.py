@@ -8,7 +8,6 @@ from functools import cached_property
 from numbers import Real
 from typing import Any, NamedTuple, TypeVar
 
-import basix.ufl
 import dolfinx.fem
 import numpy as np
 import ufl
@@ -20,7 +19,7 @@ from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import integral, over_ranks
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.schema.tables import SceneError, shown
@@ -243,20 +242,27 @@ class Measurement:
         deformed
             Whether by the deformed area.
         """
-        return self._face(face, deformed).mean(nodal_values)
+        return self._over_face(face, deformed, nodal_values) / self.face_area(face, deformed)
 
     def face_area(self, face: str, deformed: bool = False) -> float:
         """Reference or deformed area of a named face."""
-        return self._face(face, deformed).area()
+        return self._over_face(face, deformed, 1.0)
 
-    def _face(self, face: str, deformed: bool) -> _FaceIntegral:
-        return self.tool((face, deformed), lambda: _FaceIntegral(self.observer, face, deformed))
+    def _over_face(self, face: str, deformed: bool, nodal_values: Array | float) -> float:
+        field, form = self.tool((face, deformed), lambda: _face_form(self, face, deformed))
+        field.x.array.reshape(-1, field.function_space.dofmap.index_map_bs)[:, 0] = nodal_values
+        return integral(form)
 
     def end_force(self, face: str) -> EndForce:
         """Of a tube whose inner face has this name, at the end z = length."""
-        length = self.domain.dimensions["length"]
-        measure = self.tool(("end force", face), lambda: _EndForceForms(self.equilibrium, face, length))
-        return self.tool_of_step(("end force", face), measure)
+
+        def measured() -> EndForce:
+            groups = self.tool(("end force", face), lambda: _end_forms(self, face))
+            if self.equilibrium.pointwise is not None:
+                self.equilibrium.pointwise.update()
+            return EndForce(*(sum(map(integral, group)) for group in groups))
+
+        return self.tool_of_step(("end force", face), measured)
 
     def support_force(self, face: str) -> float:
         """Of an own body: force by which the support of a face pulls it, along the mean normal of each of its parts.
@@ -266,11 +272,11 @@ class Measurement:
         face
             Its name, of `Domain.faces`.
         """
-        return float(self.tool(("support", face), lambda: _SupportForce(self.equilibrium, face))())
+        return self.tool(("support", face), lambda: _support_force(self.equilibrium, face))()
 
     def lumen_volume(self) -> float:
         """Of an own body (`MeshDomain`): volume inside the deformed inner face, with flat caps on its rims."""
-        return float(self.tool("lumen volume", lambda: _LumenVolume(self.observer))())
+        return self.tool("lumen volume", lambda: _lumen_volume(self.observer))()
 
     def largest(self, values: Array) -> float:
         """Largest of one value per local element, over all ranks.
@@ -280,8 +286,7 @@ class Measurement:
         values
             One a local element, (elements,).
         """
-        local = float(np.max(self.quadrature.owned(values), initial=-np.inf))
-        return float(self.domain.comm.allreduce(local, MPI.MAX))
+        return self.quadrature.maximum(values)
 
     def smallest(self, values: Array) -> float:
         """Smallest of one value per local element, over all ranks.
@@ -291,7 +296,7 @@ class Measurement:
         values
             One a local element, (elements,).
         """
-        return -self.largest(-values)
+        return self.quadrature.minimum(values)
 
     def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
         """Mask of the local elements with a reference point at this distance from the z axis, (elements,)."""
@@ -331,96 +336,67 @@ class Measurement:
         return self._of_step[key]
 
 
-class _FaceIntegral:
-    """Integrals over a face of a nodal field, over the reference or the deformed area."""
-
-    def __init__(self, observer: Observer, face: str, deformed: bool):
-        domain, state = observer.domain, observer.state
-        # first component of a function of the displacement's space: surely the same order of nodes
-        self.field = dolfinx.fem.Function(state.kinematics.nodal_space(state.unknown))
-        self._size = self.field.function_space.dofmap.index_map_bs
-        value = self.field[0] if self.field.ufl_shape else self.field
-        normal = ufl.FacetNormal(domain.mesh)
-        F = state.kinematics.deformation_gradient(state.unknown)
-        stretched = ufl.cofac(F) * normal if deformed else normal
-        weight = ufl.sqrt(ufl.inner(stretched, stretched)) * state.kinematics.weight(domain.mesh)
-        self._form = jit.form(value * weight * state.loading.measure_alone(face))
-        self._comm = domain.comm
-
-    def mean(self, nodal_values: Array) -> float:
-        """Of nodal values (nodes,). Collective."""
-        weighted, area = self._comm.allreduce(
-            np.array([self._integral(values) for values in (nodal_values, 1.0)]), MPI.SUM
-        )
-        return float(weighted / area)
-
-    def area(self) -> float:
-        """Of the face. Collective."""
-        return float(self._comm.allreduce(self._integral(1.0), MPI.SUM))
-
-    def _integral(self, nodal_values: Array | float) -> float:
-        self.field.x.array.reshape(-1, self._size)[:, 0] = nodal_values
-        return float(np.real(dolfinx.fem.assemble_scalar(self._form)))
+def _face_form(measured: Measurement, face: str, deformed: bool) -> tuple[dolfinx.fem.Function, dolfinx.fem.Form]:
+    """A nodal field, and its integral over the reference or the deformed area of a face."""
+    state, mesh = measured.state, measured.domain.mesh
+    # first component of a function of the displacement's space: surely the same order of nodes
+    field: dolfinx.fem.Function = dolfinx.fem.Function(state.kinematics.nodal_space(state.unknown))
+    value, normal = field[0] if field.ufl_shape else field, ufl.FacetNormal(mesh)
+    F = state.kinematics.deformation_gradient(state.unknown)
+    stretched = ufl.cofac(F) * normal if deformed else normal
+    weight = ufl.sqrt(ufl.inner(stretched, stretched)) * state.kinematics.weight(mesh)
+    return field, jit.form(value * weight * state.loading.measure_alone(face))
 
 
-class _LumenVolume:
+def _lumen_volume(observer: Observer) -> Callable[[], float]:
     """-1/3 integral of x . cof(F) N over the inner face, and the cones over flat caps on its rims."""
+    from remodel_fenicsx.body.mesh_faces import cap_volume
 
-    def __init__(self, observer: Observer):
-        domain, state = observer.domain, observer.state
-        self._rims, self._comm, self._size = domain.rims, domain.comm, domain.size  # type: ignore[attr-defined]
-        middle = domain.boundary.parts("inner")[0].centre  # type: ignore[attr-defined]
-        self._nodes = domain.gather_nodes(domain.mesh.geometry.x - middle)
-        self._state = state
-        place = ufl.SpatialCoordinate(domain.mesh) - dolfinx.fem.Constant(domain.mesh, middle)
-        place += state.kinematics.displacement(state.unknown)
-        normal = ufl.cofac(state.kinematics.deformation_gradient(state.unknown)) * ufl.FacetNormal(domain.mesh)
-        self._form = jit.form(-ufl.inner(place, normal) / 3 * state.loading.measure_alone("inner"))
+    domain: Any = observer.domain  # a `MeshDomain`
+    state, mesh, middle = observer.state, domain.mesh, domain.boundary.parts("inner")[0].centre
+    nodes = domain.gather_nodes(mesh.geometry.x - middle)
+    place = ufl.SpatialCoordinate(mesh) - dolfinx.fem.Constant(mesh, middle)
+    place += state.kinematics.displacement(state.unknown)
+    normal = ufl.cofac(state.kinematics.deformation_gradient(state.unknown)) * ufl.FacetNormal(mesh)
+    form = jit.form(-ufl.inner(place, normal) / 3 * state.loading.measure_alone("inner"))
 
-    def __call__(self) -> float:
-        """Of the present displacement. Collective."""
-        from remodel_fenicsx.body.mesh_faces import cap_volume
+    def volume() -> float:
+        displacement = state.gathered_displacement()
+        caps = 0.0
+        if displacement is not None:
+            caps = sum(cap_volume(nodes + displacement, rim) for rim in domain.rims)
+        found = integral(form) + float(over_ranks(domain.comm, caps, MPI.SUM))
+        return found if abs(found) > NO_LUMEN * domain.size**3 else math.nan
 
-        volume = float(np.real(dolfinx.fem.assemble_scalar(self._form)))
-        displacement = self._state.gathered_displacement()
-        if displacement is not None and self._nodes is not None:
-            volume += sum(cap_volume(self._nodes + displacement, rim) for rim in self._rims)
-        volume = float(over_ranks(self._comm, volume, MPI.SUM))
-        return volume if abs(volume) > NO_LUMEN * self._size**3 else math.nan
+    return volume
 
 
-class _SupportForce:
+def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
     """What springs do in a shift along the normal, or what is out of balance at nodes that are held."""
+    state, unknown = equilibrium.state, equilibrium.state.unknown
+    domain: Any = state.loading.domain  # a `MeshDomain`
+    if domain.boundary.goes_around(face):
+        raise SceneError(
+            f"output.columns = 'support_force_{face}': the face goes around the body, so that there is no direction"
+        )
+    if (potential := state.loading.supports[face]) is not None:
+        form = jit.form(-ufl.derivative(potential(unknown), unknown, domain.of_parts(face, "normal")))
+        return lambda: integral(form)
+    held: list[tuple[NDArray[np.int32], Array]] = []
+    for part, facets in domain.facets_of_parts(face):
+        nodes = dolfinx.fem.locate_dofs_topological(unknown.function_space, 2, facets)
+        held.append((nodes[nodes < state.number_of_owned_unknowns // 3], part.normal))
 
-    def __init__(self, equilibrium: Equilibrium, face: str):
-        self._equilibrium, state = equilibrium, equilibrium.state
-        self._unknown, loading = state.unknown, state.loading
-        domain: Any = loading.domain  # a `MeshDomain`
-        self._comm, potential = domain.comm, loading.supports[face]
-        if domain.boundary.goes_around(face):
-            raise SceneError(
-                f"output.columns = 'support_force_{face}': the face goes around the body, so that there is no direction"
-            )
-        normal = domain.of_parts(face, "normal")
-        self._form = potential and jit.form(-ufl.derivative(potential(self._unknown), self._unknown, normal))
-        self._nodes: list[tuple[NDArray[np.int32], Array]] = []
-        for part, facets in domain.facets_of_parts(face) if potential is None else ():
-            nodes = dolfinx.fem.locate_dofs_topological(self._unknown.function_space, 2, facets)
-            self._nodes.append((nodes[nodes < state.number_of_owned_unknowns // 3], part.normal))
+    def out_of_balance() -> float:
+        vectors = [unknown.x.petsc_vec.duplicate() for _ in range(2)]
+        equilibrium.assemble_internal(vectors[0])
+        equilibrium.assemble_external(vectors[1])
+        forces = (vectors[0].array + vectors[1].array).reshape(-1, 3)
+        for vector in vectors:
+            vector.destroy()
+        return float(over_ranks(domain.comm, sum(float((forces[n] @ normal).sum()) for n, normal in held), MPI.SUM))
 
-    def __call__(self) -> float:
-        """In the present state. Collective."""
-        if self._form is not None:
-            local = float(np.real(dolfinx.fem.assemble_scalar(self._form)))
-        else:
-            vectors = [self._unknown.x.petsc_vec.duplicate() for _ in range(2)]
-            self._equilibrium.assemble_internal(vectors[0])
-            self._equilibrium.assemble_external(vectors[1])
-            forces = (vectors[0].array + vectors[1].array).reshape(-1, 3)
-            local = sum(float((forces[nodes] @ normal).sum()) for nodes, normal in self._nodes)
-            for vector in vectors:
-                vector.destroy()
-        return float(over_ranks(self._comm, local, MPI.SUM))
+    return out_of_balance
 
 
 class EndForce(NamedTuple):
@@ -439,38 +415,27 @@ class EndForce(NamedTuple):
         return self.internal - pressure * self.lumen
 
 
-class _EndForceForms:
+def _end_forms(measured: Measurement, face: str) -> list[list[dolfinx.fem.Form]]:
     """The forms of `EndForce`, in any kinematics and formulation."""
-
-    def __init__(self, equilibrium: Equilibrium, face: str, length: float):
-        state, mesh = equilibrium.state, equilibrium.quadrature.mesh
-        self._pointwise, self._comm = equilibrium.pointwise, equilibrium.comm
-        weight, F = state.kinematics.weight(mesh), state.kinematics.deformation_gradient(state.unknown)
-        tissue, elastic = state.kinematics.stress_free_weight(mesh), state.kinematics.elastic
-        # a function where a number would do: UFL differentiates by functions only, and some kinematics prescribe F_zz
-        element = basix.ufl.element("DG", mesh.topology.cell_name(), 0)
-        change: dolfinx.fem.Function = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, element))
-        one, size = (dolfinx.fem.Constant(mesh, np.float64(value)) for value in (1.0, length))
-        along = ufl.as_tensor([[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)])
-        longer = F + change * along
-        energies = state.dilatation.energies(equilibrium.tissue, elastic(longer), [state.cells.ufl_cell], tissue)
-        internal = [ufl.derivative(energy, change, one) for energy in energies]
-        if self._pointwise is not None:
-            work = ufl.inner(ufl.dot(elastic(F), self._pointwise.stress), elastic(along))
-            internal[0] += work * tissue * equilibrium.quadrature.dx
-        place, normal = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
-        surface = state.loading.surface_measure(face)
-        inward = ufl.dot(ufl.cofac(F), normal)[2] * place[2] / size
-        moved = place + state.kinematics.displacement(state.unknown)
-        # as in Loading.add_cavity_pressure: caps, across which z alone changes, add nothing
-        across = ufl.as_vector([moved[0], moved[1], 0.0])
-        volume = -ufl.inner(across, ufl.dot(ufl.cofac(longer), normal)) / 2 * weight * surface
-        groups = internal, [inward * weight * surface], [ufl.derivative(volume, change, one)]
-        self._forms = [[jit.form(form) for form in group] for group in groups]
-
-    def __call__(self) -> EndForce:
-        """Of the present unknowns. Collective."""
-        if self._pointwise is not None:
-            self._pointwise.update()
-        local = [sum(float(np.real(dolfinx.fem.assemble_scalar(form))) for form in group) for group in self._forms]
-        return EndForce(*map(float, self._comm.allreduce(np.array(local), MPI.SUM)))
+    state, equilibrium, mesh = measured.state, measured.equilibrium, measured.domain.mesh
+    weight, F = state.kinematics.weight(mesh), state.kinematics.deformation_gradient(state.unknown)
+    tissue, elastic = state.kinematics.stress_free_weight(mesh), state.kinematics.elastic
+    # a function where a number would do: UFL differentiates by functions only, and some kinematics prescribe F_zz
+    change: dolfinx.fem.Function = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, ("DG", 0)))
+    one, size = (dolfinx.fem.Constant(mesh, np.float64(v)) for v in (1.0, measured.domain.dimensions["length"]))
+    along = ufl.as_tensor([[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)])
+    longer = F + change * along
+    energies = state.dilatation.energies(equilibrium.tissue, elastic(longer), [state.cells.ufl_cell], tissue)
+    internal = [ufl.derivative(energy, change, one) for energy in energies]
+    if equilibrium.pointwise is not None:
+        work = ufl.inner(ufl.dot(elastic(F), equilibrium.pointwise.stress), elastic(along))
+        internal[0] += work * tissue * equilibrium.quadrature.dx
+    place, normal = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
+    surface = state.loading.surface_measure(face)
+    inward = ufl.dot(ufl.cofac(F), normal)[2] * place[2] / size
+    moved = place + state.kinematics.displacement(state.unknown)
+    # as in Loading.add_cavity_pressure: caps, across which z alone changes, add nothing
+    across = ufl.as_vector([moved[0], moved[1], 0.0])
+    volume = -ufl.inner(across, ufl.dot(ufl.cofac(longer), normal)) / 2 * weight * surface
+    groups = internal, [inward * weight * surface], [ufl.derivative(volume, change, one)]
+    return [[jit.form(form) for form in group] for group in groups]

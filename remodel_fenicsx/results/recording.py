@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import fcntl
-import math
 import os
 import re
 import socket
@@ -350,19 +349,20 @@ def with_unit(value: float, unit: str) -> str:
     return number(value) + (unit if unit == "°" else f" {unit}" if unit else "")
 
 
-NEWTONS: dict[float, str] = {0: "N", -3: "mN", -6: "µN", -9: "nN"}  # by powers of ten; cm make hundreds
+FORCES = {
+    "MPa mm": "N",
+    "kPa mm": "mN",
+    "Pa mm": "µN",
+    "kPa um": "nN",
+    "Pa m": "N",
+}  # stress length^2, if it has a name
 
 
-def unit_of(scene: Any, dimension: str) -> str:
+def unit_of(scene: Scene, dimension: str) -> str:
     """The unit of a `Column` by what it measures, where the scene says what it is, else nothing."""
     names = {"stress": scene.material.stress_unit, "length": scene.geometry.length_unit, "degrees": "°"}
-    if dimension == "force" and names["length"]:
-        from remodel_fenicsx.schema.settings import STRESS_UNITS  # late, with pydantic; a scene has it
-        from remodel_fenicsx.schema.units import METRES
-
-        newtons = STRESS_UNITS[names["stress"]] * METRES[names["length"]] ** 2
-        if name := NEWTONS.get(round(math.log10(newtons), 6)):
-            return name
+    if dimension == "force" and (name := FORCES.get(f"{names['stress']} {names['length']}")):
+        return name
     parts = re.split(r"(\w+)", dimension.replace("force", "stress length^2"))
     if not all(names.get(part, part) for part in parts if part):
         return ""

@@ -18,6 +18,7 @@ from remodel_fenicsx.results.vtkhdf import CELL_TYPES, LINE, TransientGrid
 
 spatial = Late("scipy.spatial")  # most runs show no reduction
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 Fields = tuple[Array | None, dict[str, Array]]
 
 CORNERS = {"interval": 2, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
@@ -34,9 +35,7 @@ TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
 class TurnedFields:
     """Which node and element of a reduction stands for each of a body's own, and its fields there."""
 
-    def __init__(
-        self, points: Array, elements: NDArray[np.int64], own_points: Array, own_elements: NDArray[np.int64], turn: Turn
-    ):
+    def __init__(self, points: Array, elements: Numbers, own_points: Array, own_elements: Numbers, turn: Turn):
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
         self.nodes = spatial.cKDTree(own_points).query(back)[1]
@@ -72,7 +71,7 @@ AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
 OF_CHAINS = ("cell_dimensions", *AXIS_FIELDS, "deformation_gradient", "fibre_angle")
 
 
-def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tuple[Array, NDArray[np.int64]]:
+def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tuple[Array, Numbers]:
     """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2)."""
     signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
     half = scale * signs @ (lengths[:, :, None] * axes)
@@ -110,9 +109,11 @@ def append_chains(
 
 
 class WholeBody:
-    """The body whose fields a run has recorded."""
+    """The body whose fields a run has recorded; RecordingError where there are none."""
 
     def __init__(self, recording: RecordedRun):
+        if not has_a_body(recording):
+            raise RecordingError(f"{recording.path}: the run recorded no fields of a body (output.fields)")
         scene = recording.scene
         shape, kinematics = scene.geometry, KINEMATICS[scene.model.kinematics]
         self.recording, self.is_turned = recording, kinematics.reduced
@@ -127,8 +128,9 @@ class WholeBody:
             self._turned = TurnedFields(points, elements, *solved, reduction.turn)
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
+        self.centres = self.points[self.elements].mean(axis=1)
         known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
-        depth = known["depth"] if "depth" in known else shape.depth(self.points[self.elements].mean(axis=1))
+        depth = known["depth"] if "depth" in known else shape.depth(self.centres)
         self.layer, self.depth = _layers(depth, self.elements)
 
     def notes(self, is_deformed: bool) -> list[str]:
@@ -151,26 +153,17 @@ def has_a_body(recording: RecordedRun) -> bool:
     return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
 
 
-def _layers(depth: Array, elements: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:
+def _layers(depth: Array, elements: Numbers) -> tuple[Numbers, Array]:
     """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
     nodes = np.bincount(elements.ravel(), weights=np.repeat(depth, elements.shape[1])) / np.bincount(elements.ravel())
     extent = np.ptp(nodes[elements], axis=1).mean()
     number = max(1, round(float(np.ptp(nodes) / extent))) if extent > 0 else 1
-    layer = rank_of(depth)
+    layer = np.unique(depth.round(6), return_inverse=True)[1]
     if layer.max() >= number or number > MOST_LAYERS:
         number = number if number <= MOST_LAYERS else FEW_LAYERS
         layer = np.minimum((number * np.clip(depth, 0.0, 1.0)).astype(np.int64), number - 1)
-        layer = np.unique(layer, return_inverse=True)[1].reshape(-1)  # none without an element
-    counts = np.bincount(layer)
-    return layer, np.bincount(layer, weights=depth) / counts
-
-
-def rank_of(values: Array) -> NDArray[np.int64]:
-    """Number of each value among the distinct ones, ascending, from 0: layers, rows or columns of a regular mesh."""
-    ordered = np.sort(values)
-    size = np.ptp(ordered) or 1.0  # of one layer there is no range
-    starts = np.concatenate([[True], np.diff(ordered) > 1e-6 * size])
-    return np.searchsorted(ordered[starts], values + 1e-7 * size) - 1
+        layer = np.unique(layer, return_inverse=True)[1]  # none without an element
+    return layer, np.bincount(layer, weights=depth) / np.bincount(layer)
 
 
 # ---------------------------------------------------------------- files of the whole body
@@ -188,11 +181,8 @@ def revolve(folder: Path | str) -> list[Path]:
     for path in paths:
         if path.exists():
             raise RecordingError(f"{path}: is there already; nothing is overwritten")
-    if not has_a_body(recording):
-        raise RecordingError(f"{recording.path}: the run recorded no fields")
     whole = WholeBody(recording)
-    centres = whole.points[whole.elements].mean(axis=1)
-    scale = 0.4 * float(np.prod(np.ptp(whole.points, axis=0)) / len(centres)) ** (1 / 3)
+    scale = 0.4 * float(np.prod(np.ptp(whole.points, axis=0)) / len(whole.elements)) ** (1 / 3)
     kind = CELL_TYPES["hexahedron" if whole.elements.shape[1] == 8 else "tetrahedron"][0]
     with ExitStack() as stack:  # the body is closed last: where it is, all are
         grid = stack.enter_context(TransientGrid(paths[0], whole.points, whole.elements, kind))
@@ -202,6 +192,6 @@ def revolve(folder: Path | str) -> list[Path]:
             grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
             if displacement is not None and set(OF_CHAINS) <= set(fields):
                 middle = displacement[whole.elements].mean(axis=1)
-                new = append_chains(chains or paths[1], float(time), centres, scale, middle, fields)
+                new = append_chains(chains or paths[1], float(time), whole.centres, scale, middle, fields)
                 chains = chains or stack.enter_context(new)
     return [path for path in paths if path.exists()]

@@ -8,7 +8,7 @@ import logging
 import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -37,8 +37,17 @@ from remodel_fenicsx.initial import with_choices
 from remodel_fenicsx.simulation import Simulation, begin_again
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
-from remodel_fenicsx.studies.page import COLOURS, Answer, Page, aligned, label, made_with, panels
-from remodel_fenicsx.studies.study import Run, Study
+from remodel_fenicsx.studies.study import (
+    COLOURS,
+    Answer,
+    Page,
+    Run,
+    Study,
+    dimensions,
+    label,
+    made_with,
+    panels,
+)
 from remodel_fenicsx.system.children import PART, Worker
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
 from remodel_fenicsx.system.terminal import hold_log, open_log, unsaid
@@ -49,11 +58,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from scipy.optimize import OptimizeResult
 
-    from remodel_fenicsx.body.shape import Column
-
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Columns = dict[str, Array]
 
 
 # ---------------------------------------------------------------- what is read: data, checked before any solve
@@ -130,7 +138,7 @@ class Measured:
     name: str
     state: str
     time: float
-    columns: dict[str, Array]
+    columns: Columns
     loads: tuple[str, ...]
     sd: dict[str, float]
     scaled: tuple[str, ...]
@@ -226,7 +234,7 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
     return Measured(table.file, table.state, table.time or 0.0, columns, loads, table.sd, tuple(table.scale), units)
 
 
-def _prescribed(columns: Mapping[str, Array], table: MeasuredTable, scene: Scene, place: str) -> tuple[str, ...]:
+def _prescribed(columns: Columns, table: MeasuredTable, scene: Scene, place: str) -> tuple[str, ...]:
     """The loads among the columns: those that drive the test; of a force and a strain along one axis the strain."""
     kinds = scene.load_kinds
     for name in table.drive:
@@ -240,9 +248,7 @@ def _prescribed(columns: Mapping[str, Array], table: MeasuredTable, scene: Scene
 
 
 def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
-    kinds = {column.name: column.unit for column in _all_columns(scene)}
-    kinds |= {load: kind.dimension.name for load, kind in scene.load_kinds.items() if kind.dimension}
-    if (dimension := DIMENSIONS.get(kinds.get(name, ""))) is None:
+    if (dimension := DIMENSIONS.get(dimensions(scene).get(name, ""))) is None:
         raise SceneError(f"{place}: {name} takes no unit")
     units = {STRESS_UNIT: scene.material.stress_unit, LENGTH_UNIT: scene.geometry.length_unit}
     try:
@@ -251,12 +257,9 @@ def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
         raise SceneError(f"{place}: {error}") from error
 
 
-def _all_columns(scene: Scene) -> tuple[Column, ...]:
-    return scene.columns(column.name for column in scene.geometry.columns_on_request)
-
-
-def _read_columns(path: Path, place: str, scene: Scene) -> dict[str, Array]:
-    known = {column.name for column in _all_columns(scene)} - {"seconds", "substeps"}
+def _read_columns(path: Path, place: str, scene: Scene) -> Columns:
+    own = scene.columns(column.name for column in scene.geometry.columns_on_request)
+    known = {column.name for column in own} - {"seconds", "substeps"}
     strains = {name.replace("elongation", "stretch"): name for name in scene.load_kinds if "elongation" in name}
     allowed = sorted({*scene.loads, *known, "time", *strains})
     try:
@@ -272,7 +275,7 @@ def _read_columns(path: Path, place: str, scene: Scene) -> dict[str, Array]:
     return {strains.get(name, name): values - (name in strains) for name, values in columns.items()}
 
 
-def _check_columns(columns: Mapping[str, Array], loads: tuple[str, ...], state: str, place: str, scene: Scene) -> None:
+def _check_columns(columns: Columns, loads: tuple[str, ...], state: str, place: str, scene: Scene) -> None:
     if set(columns) <= {*loads, "time"}:
         raise SceneError(f"{place}: has no measured column")
     if state == "history":
@@ -289,9 +292,9 @@ def _check_columns(columns: Mapping[str, Array], loads: tuple[str, ...], state: 
 WALL = ("wall_thickness", "inner_radius")
 
 
-def doubts(tables: Sequence[Measured], modelled: Sequence[Mapping[str, Array]], scene: Scene) -> Iterator[str]:
+def doubts(tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene) -> Iterator[str]:
     """Lines on measured columns that may be in another convention, beside the model at the start."""
-    units = {column.name: column.unit for column in _all_columns(scene)}
+    units = dimensions(scene)
     for table, model in zip(tables, modelled, strict=True):
         pairs = {f"{name} ({units[name]})": (table.columns[name], model[name]) for name in table.sd}
         pairs = {name: pair for name, pair in pairs.items() if name.split()[0] not in table.scaled}
@@ -311,7 +314,7 @@ CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
 
-def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], kept: Kept | None = None) -> dict[str, Array]:
+def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], kept: Kept | None = None) -> Columns:
     """What a scene says where a table has measurements, by column, (rows,)."""
     changes = PRECISE | {"output.columns": [*table.sd], "output.times": [], "output.fields": False}
     scene = with_choices(scene.with_values(changes))
@@ -369,7 +372,7 @@ class Kept(dict[Any, tuple[Simulation, Snapshot]]):
 
 def _run(
     scene: Scene, table: Measured, kept: Kept | None = None, start: tuple[Array, Array] | None = None
-) -> tuple[dict[str, Array], tuple[Array, Array]]:
+) -> tuple[Columns, tuple[Array, Array]]:
     """Columns and `time` of all steps; dimensions and axes of the cells at the end."""
     simulation = Simulation(scene, MPI.COMM_SELF) if kept is None else kept.simulation(scene, table, start is None)
     cells = simulation.cells
@@ -425,7 +428,7 @@ SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
 ENOUGH = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
 TELLING = 0.5  # of a change of the residuals: where a Jacobian misses more, the next is made by differences
 CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
-PROFILE_STEPS = (-4, -2.5, -1.5, 1.5, 2.5, 4)  # standard deviations of the straight line
+PROFILE_STEPS = (-4, -2.5, -1.5, 0, 1.5, 2.5, 4)  # standard deviations of the straight line
 ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
 LIMITED_BY_MODEL = 1.5  # standard deviations that a model is off: the noise of ten rows alone is below 1.35 at 95 %
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
@@ -450,15 +453,16 @@ class Problem:
 
     def scene_of(self, logarithms: Array) -> Scene:
         """The scene with these numbers."""
-        found = dict(zip(self.unknowns, map(float, np.exp(logarithms)), strict=True))
-        return self.scene.with_values({key: value for key, value in found.items() if not key.startswith(SCALE)})
+        return self.scene.with_values({key: n for key, n in self._numbers(logarithms) if not key.startswith(SCALE)})
 
     def scales_of(self, logarithms: Array) -> dict[str, float]:
         """Factors on columns, by name."""
-        found = zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
-        return {key.removeprefix(SCALE): value for key, value in found if key.startswith(SCALE)}
+        return {key.removeprefix(SCALE): n for key, n in self._numbers(logarithms) if key.startswith(SCALE)}
 
-    def models(self, logarithms: Array, kept: Kept | None = None) -> list[dict[str, Array]]:
+    def _numbers(self, logarithms: Array) -> zip[tuple[str, float]]:
+        return zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
+
+    def models(self, logarithms: Array, kept: Kept | None = None) -> list[Columns]:
         """What the model says of each table."""
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
         return [model_of(scene, table, scales, kept) for table in self.tables]
@@ -475,7 +479,7 @@ class Problem:
         return self.known[key]
 
     def _evaluated(self, x: Array) -> Array:
-        scales, models = self.scales_of(x), list[dict[str, Array]]()
+        scales, models = self.scales_of(x), list[Columns]()
         with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
             models = self.models(x, self.kept)
         parts: list[ArrayLike] = []
@@ -552,6 +556,16 @@ class Part(Run):
 
 
 class _FitStudy(Study):
+    """Parts of a fit, side by side."""
+
+    def answers(self, problem: Problem, place: Path, tasks: Mapping[str, Task]) -> list[Any]:
+        """What the tasks make of the problem, which then knows what was evaluated for them."""
+        parts = [Part(name, self.scene, self.folder / name, (problem, task)) for name, task in tasks.items()]
+        self.runs = [*parts]
+        self.do()
+        problem.known |= read_journal(place)[1]
+        return [part.answer for part in parts]
+
     def learn(self) -> None:
         """End it with the first part that fails."""
         for name, words in self.failed.items():
@@ -586,30 +600,21 @@ def fit(
         for words in (*explained(scene), scene.formulation_in_words()):
             log.info("%s", words)
         first, jacobian = _begun(problem)
-    with ExitStack() as stack:
-        stack.enter_context(RunLock(place))
-        stack.enter_context(open_log(place / "fit.log", quiet=quiet, held=held))
-        parts = stack.enter_context(TemporaryDirectory())
-        study = stack.enter_context(closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)))
+    with RunLock(place), open_log(place / "fit.log", quiet=quiet, held=held), TemporaryDirectory() as parts:
         problem.begin(place, mark)
-
-        def on_cores(tasks: Mapping[str, Task]) -> list[Any]:
-            found = [Part(name, scene, Path(parts, name), (problem, task)) for name, task in tasks.items()]
-            study.runs = [*found]
-            study.do()
-            problem.known |= read_journal(place)[1]
-            return [part.answer for part in found]
-
         random = np.random.default_rng(1)
         points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
         rough = partial(minimised, near=(first, jacobian), enough=ROUGHLY)
-        found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
-        best = int(np.argmin([one.cost for one in found]))
-        (found[best],) = on_cores({f"from the end of start {best + 1}": partial(minimised, start=found[best].x)})
-        log.info("sums of squares: %s", ", ".join(f"{2 * one.cost:.6g}" for one in found))
-        result = result_of(problem, found)
-        if profiles:
-            result = with_profiles(problem, result, on_cores)
+        with closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)) as study:
+            on_cores = partial(study.answers, problem, place)
+            found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
+            best = int(np.argmin([one.cost for one in found]))
+            again = partial(minimised, start=found[best].x)
+            (found[best],) = on_cores({f"from the end of start {best + 1}": again})
+            log.info("sums of squares: %s", ", ".join(f"{2 * one.cost:.6g}" for one in found))
+            result = result_of(problem, found)
+            if profiles:
+                result = with_profiles(problem, result, on_cores)
         log.info("%s", result.verdict())
         write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
         result.write(place)
@@ -641,16 +646,6 @@ def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, dict[
     if present is not None and folder is not None:
         raise SceneError(f"folder {wanted}: holds a fit of another scene, data or version; choose another folder")
     return chosen_folder(folder, name, MPI.COMM_SELF), {}
-
-
-@dataclass(frozen=True)
-class LikelihoodProfile:
-    """Smallest sums of squares with one unknown held."""
-
-    values: Array
-    increases: Array
-    lower: float
-    upper: float
 
 
 def minimised(
@@ -703,31 +698,26 @@ def result_of(problem: Problem, found: Sequence[OptimizeResult]) -> Fit:
 
 def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Task]], list[Any]]) -> Fit:
     """The fit with profiles of what goes together: the others are fitted again at each value."""
-    best, ends, keys = found.logarithms, problem.bounds.T, found.keys
+    best, ends = found.logarithms, problem.bounds.T
     least, near = float(np.sum(problem.residuals(best) ** 2)), (best, problem.jacobian(best, central=True))
-    points: dict[str, tuple[int, float, Array]] = {}
-    for number in np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1):
-        way = found.inflation * found.covariance[:, number] / found.deviations[number]
-        for steps in PROFILE_STEPS:
-            points[f"profile of {keys[number]} at {steps:+g}"] = number, steps, np.clip(best + steps * way, *ends)
+    chosen = np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1)
+    ways = found.inflation * found.covariance[chosen] / found.deviations[chosen, None]
+    points = np.clip(best + np.multiply.outer(PROFILE_STEPS, ways), *ends)  # (steps, chosen, unknowns)
     tasks = {
-        name: partial(minimised, start=x, held=number, near=near, enough=ROUGHLY)
-        for name, (number, _, x) in points.items()
+        f"profile of {found.keys[held]} at {steps:+g}": partial(
+            minimised, start=x, held=int(held), near=near, enough=ROUGHLY
+        )
+        for steps, row in zip(PROFILE_STEPS, points, strict=True)
+        for held, x in zip(chosen, row, strict=True)
     }
-    rows: dict[int, list[tuple[float, float, float]]] = {}
-    for (number, steps, x), one in zip(points.values(), on_cores(tasks), strict=True):
-        increase = max(2 * float(one.cost) - least, 0.0)
-        rows.setdefault(number, [(0.0, float(best[number]), 0.0)]).append((steps, float(x[number]), increase))
-    return replace(found, profiles={keys[n]: _profile(rows[n], found.inflation, ends[:, n]) for n in rows})
-
-
-def _profile(rows: list[tuple[float, float, float]], inflation: float, bounds: Array) -> LikelihoodProfile:
-    """Where the root of the increase, which is nearly a straight line, is that of the band; NaN beyond all points."""
-    steps, values, increases = np.array(sorted(rows)).T
-    beyond = [value if value in bounds else np.nan for value in (values[0], values[-1])]
-    roots = np.sign(steps) * np.sqrt(increases) / inflation
-    ends = np.exp(np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond))
-    return LikelihoodProfile(np.exp(values), increases, *map(float, ends))
+    costs = np.reshape([one.cost for one in on_cores(tasks)], points.shape[:2])
+    profiles = {}
+    for held, values, cost in zip(chosen, points.T[chosen, range(len(chosen))], costs.T, strict=True):
+        # the root of the increase is nearly a straight line; where it is that of the band; NaN beyond all points
+        roots = np.sign(PROFILE_STEPS) * np.sqrt(np.maximum(2 * cost - least, 0.0)) / found.inflation
+        beyond = [value if value in ends[:, held] else np.nan for value in values[[0, -1]]]
+        profiles[found.keys[held]] = np.exp(np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond))
+    return replace(found, profiles=profiles)
 
 
 # ---------------------------------------------------------------- the answer
@@ -741,26 +731,16 @@ class Fit(Answer):
     covariance: Array  # of the logarithms, by the noise alone
     misfit: float
     minima: list[float]
-    modelled: list[dict[str, Array]]
-    profiles: dict[str, LikelihoodProfile] = field(default_factory=dict)
+    modelled: list[Columns]
+    profiles: Columns = field(default_factory=dict)  # bands by likelihood profiles, their two ends
 
-    name = "fit"
+    name, about, only_in_file = "fit", "measured and fitted", ("limited_by",)
     caption = "Points: measured, with one standard deviation; lines: the fitted model. Each protocol has its panels."
-
-    @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: measured and fitted"
 
     @property
     def keys(self) -> list[str]:
         """Of the unknowns."""
         return list(self.problem.unknowns)
-
-    @property
-    def starts(self) -> list[float]:
-        """Of the unknowns."""
-        return [unknown.start for unknown in self.problem.unknowns.values()]
 
     @property
     def values(self) -> Array:
@@ -801,22 +781,11 @@ class Fit(Answer):
     def table(self) -> dict[str, ArrayLike]:
         """A row for each unknown."""
         lower, upper = np.exp(self.band)
-        table = {"key": self.keys, "value": self.values, "lower": lower, "upper": upper, "open": self.open}
-        table["limited_by"] = [self.limited_by] * len(self.keys)
-        for end in ("lower", "upper"):
-            table[f"profile_{end}"] = [getattr(self.profiles.get(key), end, np.nan) for key in self.keys]
-        return table | {"start": self.starts}
-
-    def lines(self) -> list[str]:
-        """A row for each unknown, and its profile."""
-        lower, upper = np.exp(self.band)
-        limit = "  limited by the model, not the noise" if self.limited_by == "model" else ""
-        said = [(f"  at the bound: {ends}" if ends else "") + limit for ends in self.open]
-        table = {"": self.keys, "fitted": self.values, "95 % from": lower, "to": upper, "start": self.starts, " ": said}
-        lines = aligned(table, 12, 5)
-        return lines + [
-            f"profile of {key}: 95 % from {p.lower:.5g} to {p.upper:.5g}" for key, p in self.profiles.items()
-        ]
+        profiles = np.transpose([self.profiles.get(key, [np.nan, np.nan]) for key in self.keys])
+        columns = {"key": self.keys, "value": self.values, "lower": lower, "upper": upper, "open": self.open}
+        columns["limited_by"] = [self.limited_by] * len(self.keys)
+        columns |= dict(zip(("profile_lower", "profile_upper"), profiles, strict=True))
+        return columns | {"start": [unknown.start for unknown in self.problem.unknowns.values()]}
 
     def verdict(self) -> str:
         """How far the model is off, how many starts agree, and which unknowns go together."""
@@ -835,32 +804,28 @@ class Fit(Answer):
     def write(self, folder: Path) -> None:
         """Write tables and picture."""
         super().write(folder)
-        notes, rows = [self.title, made_with()], [
-            (key, *row) for key, one in self.profiles.items() for row in zip(one.values, one.increases, strict=True)
-        ]
-        if rows:
-            columns = dict(zip(("key", "value", "increase"), zip(*rows, strict=True), strict=True))
-            Page(folder, "profiles").save_table(columns, notes)
         correlations = dict(zip(self.keys, self.correlations, strict=True))
+        notes = [self.title, made_with()]
         Page(folder, "correlations").save_table({"key": self.keys, **correlations}, notes)
 
     def figure(self) -> Figure:
         """A panel for each measured column of each protocol, over what was prescribed along its axis."""
         shown = [
-            (table, modelled[name], name, rows, number, len(table.protocols))
-            for table, modelled in zip(self.problem.tables, self.modelled, strict=True)
+            (table, model[name], name, rows, f", protocol {number} of {len(table.protocols)}")
+            for table, model in zip(self.problem.tables, self.modelled, strict=True)
             for number, rows in enumerate(table.protocols, start=1)
             for name in table.sd
         ]
-        figure, grid = panels(len(shown), 2.6)
-        scales = self.problem.scales_of(self.logarithms)
-        for axes, (table, model, name, rows, number, protocols) in zip(grid, shown, strict=True):
-            over, which = table.over(name), f", protocol {number} of {protocols}" if protocols > 1 else ""
+        (figure, grid), scales = panels(len(shown), 2.6), self.problem.scales_of(self.logarithms)
+        for axes, (table, model, name, rows, which) in zip(grid, shown, strict=True):
+            over = table.over(name)
             (unit_of_x, per_x), (unit, per) = (table.units.get(one, ("", 1.0)) for one in (over, name))
             x, y = (scales.get(one, 1.0) * table.columns[one][rows] for one in (over, name))
             axes.errorbar(x / per_x, y / per, table.sd[name] / per, fmt="o", color=COLOURS[0], label="measured")
             axes.plot(x / per_x, model[rows] / per, color=COLOURS[1], label="fitted model")
-            axes.set_title(f"{Path(table.name).name} ({table.state}){which}", fontsize=8)
+            axes.set_title(
+                f"{Path(table.name).name} ({table.state}){which if len(table.protocols) > 1 else ''}", fontsize=8
+            )
             axes.set(xlabel=label(self.scene, over, unit_of_x), ylabel=label(self.scene, name, unit))
             axes.legend(fontsize=7)
         return figure

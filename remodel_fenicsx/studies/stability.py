@@ -22,7 +22,7 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.newton import SolveFailure
-from remodel_fenicsx.studies.page import COLOURS, Answer
+from remodel_fenicsx.studies.study import COLOURS, Answer
 
 log = logging.getLogger(__name__)
 
@@ -140,10 +140,10 @@ class Analysis(Answer):
     caption = "Factor by which one pass multiplies a small change of the cells; beyond -1 and 1 the change grows."
 
     @property
-    def title(self) -> str:
-        """Of the picture."""
+    def about(self) -> str:  # type: ignore[override]
+        """What is shown."""
         how = self.scene.remodeling
-        return f"{self.scene.name}: driver {how.driver}, frame {how.frame}, coupling {how.coupling}"
+        return f"driver {how.driver}, frame {how.frame}, coupling {how.coupling}"
 
     def table(self) -> dict[str, list[float]]:
         """A row for each time."""

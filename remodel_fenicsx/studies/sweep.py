@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,14 +17,22 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import only_for_means
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.schema.tables import shown
-from remodel_fenicsx.studies.page import COLOURS, Answer, aligned, label, panels
-from remodel_fenicsx.studies.study import FEWEST_RUNS, Study, TooFewRuns
+from remodel_fenicsx.studies.study import (
+    COLOURS,
+    FEWEST_RUNS,
+    Answer,
+    Study,
+    TooFewRuns,
+    aligned,
+    label,
+    panels,
+)
 from remodel_fenicsx.system.files import MOST_RUNS
 
 Array = NDArray[np.float64]
 Number = int | float
+Point = Mapping[str, Number]
 
 OF_THE_SOLVER = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
 RULE = (
@@ -95,7 +103,6 @@ def _number(text: str) -> Number:
 
 # ---------------------------------------------------------------- a sweep: the last rows over the numbers
 PANEL_COLUMNS, PANEL_KEYS = 5, 3  # of the picture: what fits on a page
-MOST_LINES = 6  # in a panel; where there are more combinations of the other keys, points are drawn
 
 
 @dataclass(frozen=True)
@@ -103,17 +110,17 @@ class Sweep(Answer):
     """Numbers by key and histories of the runs; one that has failed has no history."""
 
     scene: Scene
-    points: Mapping[str, Mapping[str, Number]]
+    points: Mapping[str, Point]
     histories: Mapping[str, Mapping[str, Array]]
     failed: dict[str, str] = field(default_factory=dict)
 
     name = "sweep"
-    caption = "Each point is the end of one run; lines join runs whose other numbers are equal."
+    caption = "Each point is the end of one run; where one key varies a line joins them."
 
     @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: the last row of {len(self.points)} runs"
+    def about(self) -> str:  # type: ignore[override]
+        """What is shown."""
+        return f"the last row of {len(self.points)} runs"
 
     @cached_property
     def values(self) -> dict[str, Array]:
@@ -155,26 +162,18 @@ class Sweep(Answer):
             return "No column of the last row differs between the runs."
         return f"At the end of {len(self.histories)} runs: {'; '.join(parts)}."
 
-    def _at(self, run: int | np.integer, but: str = "") -> str:
-        return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items() if key != but)
+    def _at(self, run: np.integer) -> str:
+        return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items())
 
     def figure(self) -> Figure:
-        """Columns over keys: a line for each combination of the other keys, points where these are many."""
+        """Columns over keys."""
         keys, columns = list(self.values)[:PANEL_KEYS], self.shown[:PANEL_COLUMNS]
         figure = Figure(figsize=(7.2, 2.2 * max(1, len(columns)) + 0.4), layout="constrained")
         grid = figure.subplots(max(1, len(columns)), len(keys), squeeze=False, sharey="row", sharex="col")
         for (row, name), (column, key) in product(enumerate(columns), enumerate(keys)):
-            axes, x, y = grid[row, column], self.values[key], self.ends[name]
-            groups: dict[str, list[int]] = {}
-            for run in np.argsort(x, kind="stable"):
-                groups.setdefault(self._at(run, but=key), []).append(run)
-            if len(groups) > MOST_LINES or len(groups) == len(x):
-                axes.plot(x, y, "o")
-            else:
-                for words, runs in groups.items():
-                    axes.plot(x[runs], y[runs], "o-", label=words or None)
-                if row == 0 and len(groups) > 1:
-                    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
+            axes, order = grid[row, column], np.argsort(self.values[key])
+            look = "o-" if len(self.values) == 1 else "o"
+            axes.plot(self.values[key][order], self.ends[name][order], look)
             axes.set(xlabel=key, ylabel=label(self.scene, name))
             axes.label_outer()
         return figure
@@ -182,7 +181,7 @@ class Sweep(Answer):
 
 def sweep(
     scene: Scene,
-    points: Sequence[Mapping[str, Number]],
+    points: Sequence[Point],
     folder: Path | str | None = None,
     jobs: int | None = None,
     quiet: bool = True,
@@ -207,7 +206,7 @@ Swept = TypeVar("Swept", bound=Sweep)
 
 
 def _answered(
-    kind: type[Swept], points: Mapping[str, Mapping[str, Number]], refused: Mapping[str, str], study: Study
+    kind: type[Swept], points: Mapping[str, Point], refused: Mapping[str, str], study: Study
 ) -> tuple[Path, Swept]:
     """Do the runs of a sweep; at least `FEWEST_RUNS` of its points must reach the end."""
     study.failed |= refused
@@ -221,7 +220,7 @@ def _answered(
     return study.answered(answer)
 
 
-def _changed(scene: Scene, point: Mapping[str, Number]) -> Scene:
+def _changed(scene: Scene, point: Point) -> Scene:
     """With the numbers of a point; some keys take them and mean something else."""
     found = scene.with_values({**point, "output.fields": False})
     for key, value in point.items():
@@ -233,112 +232,66 @@ def _changed(scene: Scene, point: Mapping[str, Number]) -> Scene:
     return found
 
 
-# ---------------------------------------------------------------- an ensemble: a sweep of seeds, and isotropic cells
-ISOTROPIC = "isotropic"
-WITHIN = 2.0  # standard deviations
-KNOWN = 6  # seeds from which on a deviation is known to a third: its relative error is 1 / sqrt(2 (seeds - 1))
+# ---------------------------------------------------------------- an ensemble: a sweep of seeds
 PANELS = 6
 
 
 class Ensemble(Sweep):
-    """A sweep whose axis is the seed, beside a run with isotropic cells."""
+    """A sweep whose axis is the seed."""
 
     name = "ensemble"
     caption = "Lines: means over the seeds; dark: mean and one standard deviation; light: least and most of all seeds."
 
     @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: {self.seeds} seeds of random cells, and isotropic cells"
+    def about(self) -> str:  # type: ignore[override]
+        """What is shown."""
+        return f"{len(self.histories)} seeds of random cells"
 
-    @property
-    def time(self) -> Array:
-        """Times of the rows."""
-        return next(iter(self.histories.values()))["time"]
-
-    @property
-    def seeds(self) -> int:
-        """How many have reached the end."""
-        return len(self.histories.keys() & self.points.keys())
-
-    @property
-    def isotropic(self) -> Mapping[str, Array]:
-        """Columns of isotropic cells; nothing if their run has failed."""
-        return self.histories.get(ISOTROPIC, {})
-
-    def statistics(self, name: str) -> dict[str, Array]:
-        """Of a column over the seeds, at each time."""
-        values = np.array([self.histories[run][name] for run in self.points if run in self.histories])
-        mean, deviation = values.mean(axis=0), values.std(axis=0, ddof=1)
-        return {"mean": mean, "deviation": deviation, "least": values.min(axis=0), "most": values.max(axis=0)}
+    @cached_property
+    def statistics(self) -> dict[str, dict[str, Array]]:
+        """Of each column over the seeds, at each time."""
+        runs = [*self.histories.values()]
+        columns = {name: np.array([run[name] for run in runs]) for name in runs[0] if name not in OF_THE_SOLVER}
+        kinds: dict[str, Any] = {"mean": np.mean, "deviation": partial(np.std, ddof=1), "least": np.min, "most": np.max}
+        return {name: {kind: of(v, axis=0) for kind, of in kinds.items()} for name, v in columns.items()}
 
     def table(self) -> dict[str, Array]:
-        """Of each column mean, standard deviation, least, most, and isotropic cells."""
-        found = {"time": self.time}
-        for name in (name for name in next(iter(self.histories.values())) if name not in OF_THE_SOLVER):
-            found |= {f"{name}_{kind}": values for kind, values in self.statistics(name).items()}
-            if name in self.isotropic:
-                found[f"{name}_isotropic"] = self.isotropic[name]
-        return found
-
-    def away(self) -> dict[str, float]:
-        """By how many standard deviations isotropic cells miss the mean at the end, where that is known."""
-        # of random cells extremes grow with the number of cells, so they are not compared
-        extremes = {column.name for column in self.scene.columns() if column.extreme}
-        if self.seeds < KNOWN or not self.isotropic:
-            return {}
-        ends = {name: {kind: v[-1] for kind, v in self.statistics(name).items()} for name in self.shown}
-        return {
-            name: float((self.isotropic[name][-1] - of["mean"]) / of["deviation"])
-            for name, of in ends.items()
-            if name not in extremes
-        }
+        """Of each column mean, standard deviation, least and most."""
+        columns = self.statistics.items()
+        found = {f"{name}_{kind}": values for name, kinds in columns for kind, values in kinds.items()}
+        return {"time": next(iter(self.histories.values()))["time"], **found}
 
     def lines(self) -> list[str]:
         """The columns that differ between seeds, at the end."""
-        table, rows = self.table(), dict[str, Any]()
-        rows[f"time {self.time[-1]:g}, {self.seeds} seeds"] = self.shown
-        for kind in ("mean", "deviation", "least", "most", ISOTROPIC):
-            rows[kind] = [table[f"{name}_{kind}"][-1] if f"{name}_{kind}" in table else np.nan for name in self.shown]
+        rows: dict[str, Any] = {f"{len(self.histories)} seeds": self.shown}
+        for kind in ("mean", "deviation", "least", "most"):
+            rows[kind] = [self.statistics[name][kind][-1] for name in self.shown]
         return aligned(rows, 11, 5)
 
     def verdict(self) -> str:
-        """Whether isotropic cells say what random ones do."""
-        time, away = f"At time {self.time[-1]:g}", self.away()
-        if not self.isotropic:
-            return "Not known: the run with isotropic cells has failed, so there is nothing to compare."
-        if self.seeds < KNOWN:
-            return (
-                f"Not known: {self.seeds} seeds are too few for a standard deviation; {KNOWN} tell it to a third. The "
-                f"same command with --seeds {KNOWN} or more goes on from these."
-            )
-        if not away:
-            return f"{time} no column differs between the seeds: there is nothing to compare."
-        outside = [f"{name} ({number:+.1f} deviations)" for name, number in away.items() if abs(number) > WITHIN]
-        words = f"do not stand for random ones: outside of the spread are {', '.join(outside)}."
-        if not outside:
-            words = (
-                f"lie within {WITHIN:g} deviations of the mean of {self.seeds} seeds in all {len(away)} columns: they "
-                "say what one sample of random cells would."
-            )
+        """What the end of the first columns is, and how far seeds are apart."""
+        time, seeds = f"At time {self.table()['time'][-1]:g}", len(self.histories)
+        if not self.shown:
+            return f"{time} no column differs between the {seeds} seeds."
+        ends = [(name, *(values[-1] for values in self.statistics[name].values())) for name in self.shown[:2]]
+        parts = [
+            f"{name} is {mean:.4g}, with a standard deviation of {deviation:.2g}" for name, mean, deviation, *_ in ends
+        ]
         means = "; ".join(only_for_means(self.scene))
         note = f" The deviations are not those of the whole body: {means}." if means else ""
-        return f"{time} isotropic cells {words}{note}"
+        return f"{time}, mean of {seeds} seeds: {'; '.join(parts)}.{note}"
 
     def figure(self) -> Figure:
         """Columns that differ between seeds, over time."""
-        figure, grid = panels(len(self.shown[:PANELS]), 2.2)
+        (figure, grid), time = panels(len(self.shown[:PANELS]), 2.2), self.table()["time"]
         for axes, name in zip(grid, self.shown, strict=False):
-            mean, deviation, least, most = self.statistics(name).values()
+            mean, deviation, least, most = self.statistics[name].values()
             band: dict[str, Any] = {"color": COLOURS[0], "linewidth": 0}
-            axes.plot(self.time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
-            if self.seeds >= KNOWN:
-                words = "mean and one standard deviation"
-                axes.fill_between(self.time, mean - deviation, mean + deviation, alpha=0.35, label=words, **band)
-            axes.fill_between(self.time, least, most, alpha=0.15, label="least to most of all seeds", **band)
-            if name in self.isotropic:
-                axes.plot(self.time, self.isotropic[name], "--", color=COLOURS[1], label="isotropic cells")
-            axes.set(xlabel="time", ylabel=label(self.scene, name), xlim=(0, self.time[-1]))
+            axes.plot(time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
+            words = "mean and one standard deviation"
+            axes.fill_between(time, mean - deviation, mean + deviation, alpha=0.35, label=words, **band)
+            axes.fill_between(time, least, most, alpha=0.15, label="least to most of all seeds", **band)
+            axes.set(xlabel="time", ylabel=label(self.scene, name), xlim=(0, time[-1]))
         if self.shown:
             figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         return figure
@@ -347,13 +300,7 @@ class Ensemble(Sweep):
 def ensemble(
     scene: Scene, folder: Path | str | None = None, seeds: int = 32, jobs: int | None = None, quiet: bool = True
 ) -> tuple[Path, Ensemble]:
-    """Run a scene with many seeds, and with isotropic cells."""
-    points, scenes = scenes_of_seeds(scene, seeds)
-    return _answered(Ensemble, points, {}, Study("ensemble", scene, folder, scenes, jobs, quiet))
-
-
-def scenes_of_seeds(scene: Scene, seeds: int) -> tuple[dict[str, dict[str, Number]], dict[str, Scene]]:
-    """Points of a sweep of seeds, from the scene's own on, and their scenes, and one with isotropic cells."""
+    """Run a scene with many seeds, from its own on."""
     if seeds < FEWEST_RUNS:
         raise SceneError(f"--seeds {seeds}: allowed is a whole number at least {FEWEST_RUNS}")
     if not scene.has_random_cells:
@@ -361,10 +308,6 @@ def scenes_of_seeds(scene: Scene, seeds: int) -> tuple[dict[str, dict[str, Numbe
     if scene.time.tolerance is not None and not scene.time.is_equilibrium:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
     first = scene.cells.seed
-    points: dict[str, dict[str, Number]] = {f"seed-{n}": {"cells.seed": n} for n in range(first, first + seeds)}
-    random = [name for name, properties in scene.properties().items() if properties.cells.initial == "random"]
-    # with its profile isotropic cells would have steps of a tolerance, not the seeds'
-    isotropic: dict[str, object] = {f"{in_region(name)}cells.initial": ISOTROPIC for name in random} | {"profile": None}
-    every = points | {ISOTROPIC: isotropic}
-    named = {name: {"output.fields": False, "name": name, **change} for name, change in every.items()}
-    return points, {name: scene.with_values(values) for name, values in named.items()}
+    points = {f"seed-{n}": {"cells.seed": n} for n in range(first, first + seeds)}
+    scenes = {name: scene.with_values({"output.fields": False, "name": name, **p}) for name, p in points.items()}
+    return _answered(Ensemble, points, {}, Study("ensemble", scene, folder, scenes, jobs, quiet))

@@ -8,11 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import AUTO, choice, is_for_means, objections, step_cost
@@ -22,8 +21,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.studies.page import COLOURS, Answer, aligned
-from remodel_fenicsx.studies.study import FEWEST_RUNS, Run, Study, TooFewRuns
+from remodel_fenicsx.studies.study import COLOURS, FEWEST_RUNS, Answer, Study, TooFewRuns
 from remodel_fenicsx.system.files import make_own_folder, write_whole
 
 log = logging.getLogger(__name__)
@@ -32,8 +30,6 @@ Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- settings of a scene from coarse to fine
-SECONDS_PER_POINT = 3e-5  # of a step: a first guess, corrected by the runs
-START_SECONDS = 3.0  # of a run before its first step, roughly
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
 STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
@@ -65,11 +61,11 @@ class Setting:
         return 1.0 / (self.scene.mesh.refinement * self.scene.mesh.degree**2)
 
     @property
-    def expected_seconds(self) -> float:
-        """Seconds of one run, roughly."""
+    def cost(self) -> float:
+        """What orders them: about in proportion to the time of one run."""
         time = self.scene.time
         steps = time.number_of_steps if time.tolerance is None else DEGREES_PER_RUN / time.tolerance
-        return SECONDS_PER_POINT * step_cost(self.scene, self.scene.model.kinematics) * steps
+        return step_cost(self.scene, self.scene.model.kinematics) * steps
 
 
 def ladder(scene: Scene) -> list[Setting]:
@@ -92,7 +88,7 @@ def ladder(scene: Scene) -> list[Setting]:
         steps = f"step-{time.step:g}" if time.tolerance is None else f"tolerance-{time.tolerance:g}"
         name = f"{changed.model.kinematics}-{changed.mesh.refinement}-degree-{changed.mesh.degree}-{steps}"
         found.setdefault(name, Setting(f"profile-{profile}" if profile else name, changed, seeds))
-    return sorted(found.values(), key=lambda setting: setting.expected_seconds)
+    return sorted(found.values(), key=lambda setting: setting.cost)
 
 
 def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -127,7 +123,7 @@ def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
 
 def as_run(setting: Setting, seed: int = 1) -> Scene:
     """The scene of a run of the study: only what is compared is measured."""
-    columns = [*compared_lengths(setting.scene)[1], "substeps", "seconds", "processor_seconds", *PROFILE]
+    columns = [*compared_lengths(setting.scene)[1], "processor_seconds", *PROFILE]
     values = {"output.fields": False, "output.columns": columns, "output.every": 1, "output.times": []}
     return setting.scene.with_values({**values, "cells.seed": seed, "name": f"{setting.name}-{seed}"})
 
@@ -139,23 +135,21 @@ FINER = 1.99  # how much finer steps and elements of the finest must be than tho
 
 @dataclass(frozen=True)
 class Result:
-    """What the runs of a setting give, (seeds, columns, times), and the seconds of one of them."""
+    """What the runs of a setting give, (seeds, columns, times), and the processor seconds of one of them."""
 
     setting: Setting
     angles: Array
     lengths: Array
     seconds: float
-    wall_seconds: float
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A row of the table."""
 
     setting: Setting
-    seconds: float
     angle_error: float
     length_error: float
+    seconds: float
     doubt: str
     on_front: bool = False
 
@@ -179,23 +173,24 @@ def compared(results: Sequence[Result]) -> list[Row]:
     finest = min(results, key=lambda result: result.setting.step * result.setting.element)
     rows = [_row(result, finest) for result in sorted(results, key=lambda result: result.seconds)]
     on_front = pareto([row.seconds for row in rows], [row.angle_error for row in rows])
-    return [Row(**vars(row) | {"on_front": is_best}) for row, is_best in zip(rows, on_front, strict=True)]
+    return [row._replace(on_front=is_best) for row, is_best in zip(rows, on_front, strict=True)]
 
 
 def _row(result: Result, finest: Result) -> Row:
     setting, seeds = result.setting, len(result.angles)
     if result is finest:
-        return Row(setting, result.seconds, np.nan, np.nan, "the others are compared with it")
+        return Row(setting, np.nan, np.nan, result.seconds, "the others are compared with it")
     apart = result.angles - finest.angles  # seed by seed: steps are compared on the same cells
     noise = typical(np.std(apart, axis=0, ddof=1)) / seeds**0.5 if seeds > 1 else 0.0
     error, ratio = typical(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
-    shared = ["steps"] if setting.step < FINER * finest.setting.step else []
-    if not KINEMATICS[setting.scene.model.kinematics].homogeneous and setting.element < FINER * finest.setting.element:
-        shared.append("elements")
+    sizes = {"steps": (setting.step, finest.setting.step)}
+    if not KINEMATICS[setting.scene.model.kinematics].homogeneous:
+        sizes["elements"] = setting.element, finest.setting.element
+    shared = [name for name, (own, least) in sizes.items() if own < FINER * least]
     doubt = f"the finest has no finer {' and '.join(shared)}" if shared else ""
     if NOISY * noise > error:
         doubt = f"noise of random cells {noise:.2g}"
-    return Row(setting, result.seconds, error, float(np.nanmax(np.abs(ratio - 1))), doubt)
+    return Row(setting, error, float(np.nanmax(np.abs(ratio - 1))), result.seconds, doubt)
 
 
 # ---------------------------------------------------------------- the runs
@@ -211,64 +206,37 @@ def trade(
     return study.answered(study.answer)
 
 
-@dataclass(frozen=True)
-class _SettingRun(Run):
-    setting: Setting
-
-
 class _TradeStudy(Study):
     """Runs in the order of their cost, within a budget."""
 
     def __init__(self, scene: Scene, folder: Path | str | None, budget: float, *how: Any):
-        super().__init__("trade", scene, folder, {}, *how)
-        self.settings, self.budget, self.deadline = ladder(scene), budget, clock.monotonic() + budget
-        for setting in self.settings:
-            for seed in setting.seeds:
-                run = as_run(setting, seed)
-                self.runs.append(_SettingRun(run.name, run, self.folder / run.name, setting))
+        deadline = clock.monotonic() + budget
+        runs = [(setting, as_run(setting, seed)) for setting in ladder(scene) for seed in setting.seeds]
+        super().__init__("trade", scene, folder, {run.name: run for _, run in runs}, *how)
+        self.settings = {run.name: setting for setting, run in runs}
+        self.budget, self.deadline = budget, deadline
         self._results: dict[Setting, Result] = {}
 
     @property
     def left(self) -> list[Setting]:
         """Settings that have neither ended nor failed."""
-        failed = {run.setting for run in self.runs if run.name in self.failed}
-        return [one for one in self.settings if one not in failed and one not in self._results]
+        done = {*self._results, *map(self.settings.get, self.failed)}
+        return [setting for setting in dict.fromkeys(self.settings.values()) if setting not in done]
 
     def answer(self) -> Trade:
         """The table of what was run."""
         if len(self._results) < FEWEST_RUNS:
-            reached = f"{len(self._results)} of {len(self.settings)} settings reached the end"
-            advice = f"a larger budget goes on{self._needed()}" if self.left else "the same command tries again"
+            reached = f"{len(self._results)} of {len({*self.settings.values()})} settings reached the end"
+            advice = "a larger budget goes on" if self.left else "the same command tries again"
             raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, advice)
         names = ", ".join(setting.name for setting in self.left)
         notes = [f"left out, over the budget: {names}"] if names else []
         return Trade(self.scene, compared([*self._results.values()]), notes, self.failed)
 
-    def fits(self, run: Run) -> bool:
-        """Whether a run that begins now would end in time, by what others have taken."""
-        assert isinstance(run, _SettingRun)
-        return clock.monotonic() + self._seconds(run.setting) < self.deadline
-
-    def _seconds(self, setting: Setting) -> float:
-        """Seconds of a run, in proportion to those that have ended, of which the dearest count most."""
-        took = sum(result.wall_seconds for result in self._results.values())
-        expected = sum(setting.expected_seconds for setting in self._results)
-        return START_SECONDS + setting.expected_seconds * (took / expected if expected else 1.0)
-
-    def _progress(self) -> str:
-        return super()._progress() + self._needed()
-
-    def _needed(self) -> str:
-        """What the settings that are left take, once one has ended; nothing where the budget has it."""
-        seconds = sum(self._seconds(setting) * len(setting.seeds) for setting in self.left) / self.jobs
-        if not self._results or seconds < self.deadline - clock.monotonic():
-            return ""
-        return f"; all settings take about {seconds / 60:.2g} min more (--budget)"
-
     def learn(self) -> None:
         """Read what is new."""
         for setting in self.left:
-            runs = [run for run in self.runs if run.setting is setting]
+            runs = [run for run in self.runs if self.settings[run.name] is setting]
             with suppress(RecordingError):  # one that is damaged will be among those that have failed
                 if all(run.is_complete() for run in runs):
                     self._results[setting] = read(setting, [run.history() for run in runs])
@@ -281,10 +249,8 @@ def read(setting: Setting, histories: Sequence[Mapping[str, Array]]) -> Result:
     def columns(names: Sequence[str]) -> Array:
         return np.array([[np.interp(times, each["time"], each[name]) for name in names] for each in histories])
 
-    seconds, wall = (
-        float(np.mean([np.nansum(each[name]) for each in histories])) for name in ("processor_seconds", "seconds")
-    )
-    return Result(setting, columns(PROFILE), columns(compared_lengths(setting.scene)[1]), seconds, wall)
+    seconds = float(np.mean([np.nansum(each["processor_seconds"]) for each in histories]))
+    return Result(setting, columns(PROFILE), columns(compared_lengths(setting.scene)[1]), seconds)
 
 
 # ---------------------------------------------------------------- the answer: words, a table, a picture, scenes
@@ -301,40 +267,20 @@ class Trade(Answer):
     notes: list[str] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
 
-    name = "trade"
+    name, about = "trade", "error and cost of its settings"
     caption = "Errors against the finest setting; filled: no other setting is as good for less."
-
-    @property
-    def title(self) -> str:
-        """Of the picture."""
-        return f"{self.scene.name}: error and cost of its settings"
+    only_in_file = "scene", "trusted"
 
     def table(self) -> dict[str, list[Any]]:
         """A row for each setting."""
-        rows = self.rows
-        return {
-            "setting": [row.setting.name for row in rows],
-            "scene": [f"{ROWS}/{row.setting.name}.toml" for row in rows],
-            "error_degrees": [row.angle_error for row in rows],
-            f"error_{compared_lengths(self.scene)[0]}": [row.length_error for row in rows],
-            "cpu_seconds": [row.seconds for row in rows],
-            "on_front": [int(row.on_front) for row in rows],
-            "trusted": [int(not row.doubt) for row in rows],
-            "doubt": [row.doubt for row in rows],
-        }
-
-    def lines(self) -> list[str]:
-        """A row for each setting."""
-        rows, lengths = self.rows, f"{compared_lengths(self.scene)[0]} %"
-        numbers = {
-            "seconds": [row.seconds for row in rows],
-            "degrees": [row.angle_error for row in rows],
-            lengths: [100 * row.length_error for row in rows],
-        }
-        names = [row.setting.name + (f"  ({row.doubt})" if row.doubt else "") for row in rows]
-        about = "*: no other setting is as good for less. Errors are differences from the finest setting; degrees: "
-        stars = ["*" if row.on_front else "" for row in rows]
-        return [*aligned({"": stars, **numbers, "setting": names}, 1, 2), f"{about}fibre angle, root mean square."]
+        rows = [
+            (one.setting.name, f"{ROWS}/{one.setting.name}.toml", one.angle_error, one.length_error, one.seconds,
+             int(one.on_front), int(not one.doubt), one.doubt)
+            for one in self.rows
+        ]  # fmt: skip
+        lengths = f"error_{compared_lengths(self.scene)[0]}"
+        names = "setting", "scene", "error_degrees", lengths, "cpu_seconds", "on_front", "trusted", "doubt"
+        return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
 
     def verdict(self) -> str:
         """What `WANTED` degrees cost."""
@@ -357,21 +303,20 @@ class Trade(Answer):
         super().write(folder)
 
     def figure(self) -> Figure:
-        """Cost against error; beside the axes stands what the front is, from left to right."""
-        places = [(row.seconds, row.angle_error, row) for row in self.rows if row.angle_error > 0]
-        front = [place for place in places if place[2].on_front]
+        """Cost against error; beside the axes stands what the front is."""
+        known = [row for row in self.rows if row.angle_error > 0]
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         axes = figure.subplots()
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
-        for shown, line, face in ((places, "o", "white"), (front, "o-", COLOURS[0])):
-            if shown:
-                axes.plot(*zip(*((x, y) for x, y, _ in shown), strict=True), line, color=COLOURS[0], mfc=face, lw=0.8)
-        if front:
-            place: dict[str, Any] = {"loc": "outside right center", "handlelength": 0, "fontsize": 6.5}
-            place |= {"title": "filled, from left to right: no\nother one is as good for less", "title_fontsize": 7.5}
-            names = [row.setting.name for *_, row in front]
-            figure.legend([Line2D([], [], linestyle="")] * len(front), names, **place)
+        axes.plot(
+            [row.seconds for row in known], [row.angle_error for row in known], "o", color=COLOURS[0], mfc="white"
+        )
+        for row in known:
+            if row.on_front:
+                axes.plot(row.seconds, row.angle_error, "o", label=row.setting.name)
+        look = {"title": "filled: no other one\nis as good for less", "title_fontsize": 7.5, "fontsize": 6.5}
+        figure.legend(loc="outside right center", **look)
         return figure

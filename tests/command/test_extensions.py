@@ -22,7 +22,7 @@ DRIVER = """from remodel_fenicsx.extend import DRIVERS, Driver
 DRIVERS["mine"] = Driver(lambda F, stresses: stresses.cauchy, material=False)
 """
 
-WITHOUT_A_BODY = """import sys, numpy; from remodel_fenicsx import cli; from remodel_fenicsx.pictures import bodies
+WITHOUT_A_BODY = """import sys, numpy; from remodel_fenicsx import cli; from remodel_fenicsx import pictures as bodies
 bodies.render = lambda job: [numpy.zeros((9, 9, 3), numpy.uint8)]; sys.exit(cli.main(sys.argv[1:]))"""
 SCENE = """preset = "kuhl-holzapfel-2007"
 geometry.shape = "cube"

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from remodel_fenicsx import Recording, cli
-from remodel_fenicsx.pictures import bodies as rendering
+from remodel_fenicsx import pictures as rendering
 from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx.results.whole_body import WholeBody
 from tests.conftest import Refused

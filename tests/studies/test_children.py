@@ -63,7 +63,7 @@ def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
     command = [sys.executable, "-c", COMMAND, *words]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        assert process.stderr.readline().startswith("artery ensemble: 0 of 33 runs done")
+        assert process.stderr.readline().startswith("artery ensemble: 0 of 32 runs done")
         (child,) = members(process.pid, CHILDREN)
         process.send_signal(number)
         said = "" if number == signal.SIGKILL else process.stderr.read()

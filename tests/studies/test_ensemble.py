@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from remodel_fenicsx import Recording, SceneError, cli, read_scene
+from remodel_fenicsx import Recording, SceneError, cli
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.studies import sweep as study
-from remodel_fenicsx.studies.study import Run, Study, TooFewRuns
+from remodel_fenicsx.studies.study import Study, TooFewRuns
 from remodel_fenicsx.system.interrupts import Paused
 from tests.conftest import Refused, forked_children
 from tests.parts import pulled_cube
@@ -31,14 +31,9 @@ def scene(**tables: object) -> Scene:
     return pulled_cube(END, **tables)
 
 
-def runs_of(scene: Scene, folder: Path, seeds: int) -> list[Run]:
-    """Those of an ensemble."""
-    return [Run(name, one, folder / name) for name, one in study.scenes_of_seeds(scene, seeds)[1].items()]
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, study.Ensemble]:
-    """Three seeds, of which the second cannot write, and isotropic cells."""
+    """Three seeds, of which the second cannot write."""
     folder = tmp_path_factory.mktemp("ensemble") / "out"
     folder.mkdir()
     (folder / "seed-2").write_text("a file of the user's\n")
@@ -51,14 +46,14 @@ def test_one_that_fails_loses_only_itself(
 ) -> None:
     """The others are evaluated, and not run again; the command names it, and its exit code is 3."""
     folder, found = made
-    assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"] and found.seeds == 2
-    assert status(folder) == [f"{folder}: 3 runs: 3 finished"]  # the fourth has not begun
+    assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"] and len(found.histories) == 2
+    assert status(folder) == [f"{folder}: 2 runs: 2 finished"]  # the third has not begun
     (tmp_path / "scene.toml").write_text(scene().to_toml())
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")}
     with forked_children():
         assert cli.main(["ensemble", str(tmp_path / "scene.toml"), "-o", str(folder), "--seeds", "3", "-q"]) == 3
     written = capsys.readouterr()
-    assert "time 5, 2 seeds" in written.out and "seed-2 has failed: " in written.err
+    assert "At time 5, mean of 2 seeds: " in written.out and "seed-2 has failed: " in written.err
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")} == before
     assert (folder / "seed-2").read_text() == "a file of the user's\n"
     with pytest.raises(SceneError, match="holds a run of another scene"):
@@ -67,14 +62,12 @@ def test_one_that_fails_loses_only_itself(
 
 def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> None:
     folder, _ = made
-    runs = [Recording(folder / name) for name in ("seed-1", "seed-3", "isotropic")]
-    assert [run.scene.cells.seed for run in runs[:2]] == [1, 3] and runs[2].scene.cells.initial == "isotropic"
+    runs = [Recording(folder / name) for name in ("seed-1", "seed-3")]
+    assert [run.scene.cells.seed for run in runs] == [1, 3]
     rows = list(csv.DictReader((folder / "ensemble.csv").read_text().splitlines()))
-    found = [
-        [float(row[f"mean_stretch_{kind}"]) for row in rows] for kind in ("mean", "deviation", "most", "isotropic")
-    ]
-    one, two, isotropic = (run.history["mean_stretch"] for run in runs)
-    expected = [(one + two) / 2, np.abs(one - two) / 2**0.5, np.maximum(one, two), isotropic]
+    found = [[float(row[f"mean_stretch_{kind}"]) for row in rows] for kind in ("mean", "deviation", "most")]
+    one, two = (run.history["mean_stretch"] for run in runs)
+    expected = [(one + two) / 2, np.abs(one - two) / 2**0.5, np.maximum(one, two)]
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
     assert [float(row["time"]) for row in rows] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert (folder / "ensemble.png").stat().st_size > 10_000
@@ -93,7 +86,8 @@ def test_what_was_stopped_goes_on(
     tmp_path: Path, made: tuple[Path, study.Ensemble], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At a step of its own choice; the same command goes on to the same end."""
-    both = Study("ensemble", scene(), tmp_path, {"seed-3": study.scenes_of_seeds(scene(), 3)[1]["seed-3"]}, jobs=1)
+    third = {"output.fields": False, "name": "seed-3", "cells.seed": 3}
+    both = Study("ensemble", scene(), tmp_path, {"seed-3": scene().with_values(third)}, jobs=1)
     (member,) = both.runs
     solve = Staggered.solve
 
@@ -113,36 +107,25 @@ def test_what_was_stopped_goes_on(
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])
 
 
-def of_seeds(scene: Scene, columns: dict[str, np.ndarray], isotropic: dict[str, np.ndarray]) -> study.Ensemble:
-    """An ensemble of columns (seeds, rows) at times 0, 1, ..., and those of isotropic cells."""
+def of_seeds(scene: Scene, columns: dict[str, np.ndarray]) -> study.Ensemble:
+    """An ensemble of columns (seeds, rows) at times 0, 1, ..."""
     seeds, rows = next(iter(columns.values())).shape
     time = {"time": np.arange(float(rows))}
     histories = {f"seed-{n}": time | {name: values[n] for name, values in columns.items()} for n in range(seeds)}
     points = {name: {"cells.seed": number} for number, name in enumerate(histories)}
-    return study.Ensemble(scene, points, histories | ({"isotropic": time | isotropic} if isotropic else {}))
+    return study.Ensemble(scene, points, histories)
 
 
-def some_seeds(last: float, number: int = 8) -> study.Ensemble:
-    """Stretches of mean 3 and standard deviation 1 at the end, and an extreme; `last` of isotropic cells."""
+def test_words_say_how_far_seeds_are_apart() -> None:
+    """Stretches of mean 3 and standard deviation 1 at the end; what is the same for all is left out."""
     ends = np.array([-1.0, 1.0] * 4) * np.sqrt(7 / 8) + 3.0
     values = {"mean_stretch": np.stack([np.ones(8), ends], axis=1), "force": np.ones((8, 2))}
-    values["min_stretch"] = values["mean_stretch"] / 2
-    isotropic = {name: np.array([1.0, last]) for name in values} if last else {}
-    return of_seeds(pulled_cube(1.0), {name: column[:number] for name, column in values.items()}, isotropic)
-
-
-def test_words_say_whether_the_cheap_model_is_enough() -> None:
-    """Extremes are not compared: isotropic cells have none. Five seeds tell a deviation to 35 %."""
-    text = some_seeds(3.4).in_words()
+    text = of_seeds(pulled_cube(1.0), values).in_words()
     assert "mean_stretch" in text and "force" not in text
-    assert text.splitlines()[-1] == (
-        "At time 1 isotropic cells lie within 2 deviations of the mean of 8 seeds in all 1 columns: they say what one "
-        "sample of random cells would."
-    )
-    assert some_seeds(30.0).verdict().endswith("outside of the spread are mean_stretch (+27.0 deviations).")
-    few = some_seeds(30.0, 5)
-    assert few.verdict().startswith("Not known: 5 seeds are too few")
-    assert some_seeds(0.0).verdict().startswith("Not known: the run with isotropic cells has failed")
+    said = "At time 1, mean of 8 seeds: mean_stretch is 3, with a standard deviation of 1."
+    assert text.splitlines()[-1] == said
+    same = of_seeds(pulled_cube(1.0), {"force": values["force"]})
+    assert same.verdict() == "At time 1 no column differs between the 8 seeds."
 
 
 def test_bad_input_is_one_line(tmp_path: Path, refused: Refused) -> None:
@@ -153,14 +136,7 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Refused) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_seeds_of_a_quarter_have_its_means_and_isotropic_cells_its_steps(tmp_path: Path) -> None:
-    """A profile has other steps for isotropic cells: these must not come back when the scene is read again."""
+def test_seeds_of_a_quarter_say_that_their_deviations_are_not_those_of_the_whole() -> None:
     tube = {"preset": "kuhl-holzapfel-2007", "profile": "balanced", "geometry": {"shape": "tube"}}
-    whole = scene_from_dict(tube)
-    for member in runs_of(whole, tmp_path, 2):
-        path = tmp_path / f"{member.name}.toml"
-        path.write_text(member.scene.to_toml())
-        assert read_scene(path) == member.scene and member.scene.time.tolerance is None
-        assert member.scene.model.kinematics == "sector"
-    found = of_seeds(whole, {"outer_radius": np.eye(6)[:, 4:]}, {"outer_radius": np.zeros(2)})
+    found = of_seeds(scene_from_dict(tube), {"outer_radius": np.eye(6)[:, 4:]})
     assert "The deviations are not those of the whole body: 'sector': " in found.verdict()

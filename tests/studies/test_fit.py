@@ -133,10 +133,10 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
     (folder / "data.toml").write_text(PAIR.replace("0.01", "0.04"))  # wide bands, far from a straight line
     _, found = fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out", starts=1)
     assert set(found.profiles) == {"material.chain_density", "material.contour_length"}
-    one = found.profiles["material.contour_length"]
-    assert one.increases.min() == 0.0 and one.lower < found.values[1] < one.upper
+    lower, upper = found.profiles["material.contour_length"]
+    assert lower < found.values[1] < upper
     problem = Problem(read_scene(folder / "scene.toml"), *read_measurements(folder / "data.toml", found.scene))
-    held = np.log([found.values[0], one.upper])
+    held = np.log([found.values[0], upper])
     again = minimised(problem, held, held=1)
     least = float(np.sum(problem.residuals(np.log(found.values)) ** 2))
     assert 2 * again.cost - least == pytest.approx(3.84, rel=0.03)
@@ -148,7 +148,9 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
         warnings.simplefilter("error")
         assert wide.open == ["both", "both"]
         np.testing.assert_allclose(wide.band, found.problem.bounds.T)
-    assert (folder / "out" / "profiles.csv").exists()
+    with (folder / "out" / "fit.csv").open() as file:
+        ends = [float(row["profile_upper"]) for row in csv.DictReader(file)]
+    assert ends[1] == pytest.approx(upper, rel=1e-6)
 
 
 PAIR = (FITS / "pair.toml").read_text()
@@ -187,7 +189,7 @@ def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path) -> None:
         found[name] = fit(scene, data, tmp_path / name, starts=1)[1]
     for name, one in found.items():
         assert one.limited_by == ("noise" if name == "noise" else "model")
-        assert ("limited by the model, not the noise" in one.in_words()) is (name != "noise")
+        assert ("times those of the noise, for the model limits them" in one.in_words()) is (name != "noise")
     np.testing.assert_allclose(found["a"].band, found["b"].band, rtol=1e-3)
     assert found["a"].open == [""] and found["a"].band[0] < found["a"].logarithms < found["a"].band[1]
     assert found["bound"].open == ["upper"] and found["bound"].values == pytest.approx([12.0])

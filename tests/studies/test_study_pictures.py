@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from remodel_fenicsx.scene.scene import preset_scene
-from remodel_fenicsx.studies.page import Answer, Page
+from remodel_fenicsx.studies.study import Answer, Page
 from remodel_fenicsx.studies.stability import Analysis
 from remodel_fenicsx.studies.trade import Trade
 from tests.studies.test_ensemble import of_seeds
@@ -23,7 +22,7 @@ def the_ensemble(seeds: int) -> Answer:
     time, rng = np.arange(151.0), np.random.default_rng(1)
     names = ("inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_outer", "max_chain_extension")
     columns = {name: 1 + rng.normal(0, 0.1, (seeds, 1)) * time for name in names}
-    return of_seeds(scene, columns, {name: 1 + 0.01 * time for name in names})
+    return of_seeds(scene, columns)
 
 
 def the_analysis(factor: float) -> Answer:
@@ -79,9 +78,9 @@ def test_the_verdict_on_settings_is_that_of_trusted_ones() -> None:
     said = f"{cheapest.seconds:.2g} s of the processor for an error of {cheapest.angle_error:.2g} degrees."
     verdict = Trade(artery(), rows).verdict()
     assert verdict.startswith("The cheapest setting within 1 degree is ") and verdict.endswith(said)
-    others = [dataclasses.replace(row, doubt="noise") if row is cheapest else row for row in rows]
+    others = [row._replace(doubt="noise") if row is cheapest else row for row in rows]
     assert not Trade(artery(), others).verdict().endswith(said)
     coarse = Trade(artery(), [row for row in rows if row.angle_error > 1.0])
     assert coarse.verdict().startswith("No setting is known to be within 1 degree; the closest is ")
-    doubted = Trade(artery(), [dataclasses.replace(row, doubt="noise") for row in rows])
+    doubted = Trade(artery(), [row._replace(doubt="noise") for row in rows])
     assert doubted.verdict() == f"Not known: all {len(rows)} errors are doubted; trade.csv says why."

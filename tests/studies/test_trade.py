@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +35,7 @@ def made_up(setting: trade.Setting, noise: float = 0.0) -> trade.Result:
     scatter = noise * np.random.default_rng(len(setting.name)).normal(size=(len(setting.seeds), *SMOOTH.shape))
     angles = 45.0 + error + scatter
     cost = {"full": 100.0}.get(setting.scene.model.kinematics, 1.0) / setting.element / step
-    return trade.Result(setting, angles, 2.0 * (1 + 0.01 * (angles[..., :2] - 45.0)), cost, cost)
+    return trade.Result(setting, angles, 2.0 * (1 + 0.01 * (angles[..., :2] - 45.0)), cost)
 
 
 def compared(noise: float = 0.0, **changes: Any) -> list[trade.Row]:
@@ -96,7 +94,7 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
     assert {f"profile-{name}" for name in PROFILES} <= set(named)
     fast = {"model.kinematics": "radial", "time.tolerance": 1.0, "mesh.formulation": "auto"}
     assert named["profile-fast"].scene == scene.with_values(fast)
-    assert named["profile-reference"].expected_seconds < 5.0  # measured: 1.4
+    assert named["profile-reference"].cost < 0.1 * named["full-1-degree-1-step-1"].cost  # measured: a fiftieth
     for setting in settings:
         run = trade.as_run(setting, 3)
         assert run.cells.seed == 3 and not run.output.times and not run.output.fields
@@ -160,10 +158,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert code == 0 and "left out, over the budget: point-1-degree-1-tolerance-0.5" in said
     code, said = traded(tmp_path / "none", "0.001s")
     assert code == 4 and "0 of 4 settings reached the end within the budget of 0.001 s, at least 2 are needed" in said
-    shutil.copytree(out / f"{names[0]}-1", tmp_path / "one" / f"{names[0]}-1")  # one run says what all take
-    assert re.search(
-        r"all settings take about [\d.e-]+ min more \(--budget\)\n$", traded(tmp_path / "one", "0.001s")[1]
-    )
+    assert "a larger budget goes on" in said
 
 
 @pytest.mark.slow

@@ -36,6 +36,7 @@ PARTS.angles = (data, arrays, clock) => {
   };
   const last = clock.times.length - 1;
   const others = [...new Set([0, 1, 2, 3, 4].map((k) => Math.round((k * last) / 4)))];
+  if (layers < 2) document.getElementById("profile").closest("section").remove();
   const profile = document.getElementById("profile"), rose = document.getElementById("rose");
   clock.onChange(() => {
     if (profile) profile.replaceChildren(profileDrawing(data, clock, others, profileAt));

@@ -119,7 +119,7 @@ class Elements {
 }
 
 // Ribbons of the chains of an element on one of its faces: they stay in it and clear of its edge, so that those of
-// neighbours do not read as one line. The rule is that of the figures (pictures/bodies.py).
+// neighbours do not read as one line. The rule is that of the figures (pictures.py).
 function ribbonsOn(face, corners, inside, chains, rule) {
   const middle = mean(corners);
   let normal = corners.length === 4

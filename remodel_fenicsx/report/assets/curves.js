@@ -2,7 +2,12 @@
 const CURVE_COLOURS = ["--first", "--second", "--third", "--fourth", "--fifth"];
 
 PARTS.curves = (data, arrays, clock) => {
-  const all = data.curves.map((curve, k) => new Curve(document.getElementById(`curve-${k}`), data.times, curve, clock));
+  const all = data.curves.map((curve, k) => {
+    const place = element("div", { class: "curve", id: `curve-${k}` }), unit = element("span", { class: "note" }, curve.unit);
+    const card = element("section", { class: "card third" }, element("h2", {}, `${curve.title} `, unit), place);
+    document.querySelector("[data-part=curves]").append(card);
+    return new Curve(place, data.times, curve, clock);
+  });
   clock.onChange(() => all.forEach((curve) => curve.mark()));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => all.forEach((curve) => curve.draw()));
 };

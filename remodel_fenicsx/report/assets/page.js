@@ -1,13 +1,5 @@
 // The page as a whole: its parts, downloads and keys.
 PARTS.warnings = (data, arrays) => {
-  const copy = document.getElementById("copy"), again = document.getElementById("again");
-  copy.addEventListener("click", async () => {
-    getSelection().selectAllChildren(again);  // where nothing may be put into the clipboard it can be copied by hand
-    try {
-      await navigator.clipboard.writeText(again.textContent);
-      copy.textContent = "copied";
-    } catch { copy.textContent = "selected"; }
-  });
   for (const link of document.querySelectorAll(".download")) {
     link.addEventListener("click", (event) => {
       event.preventDefault();
@@ -31,7 +23,18 @@ function listenToKeys(clock) {
   });
 }
 
+// What is drawn has its place and its words; what this run has not goes.
+function showParts() {
+  for (const card of document.querySelectorAll("[data-part]")) {
+    const data = PAGE.parts[card.dataset.part];
+    card.hidden = false;
+    if (!data) card.remove();
+    else for (const place of card.querySelectorAll("[data-text]")) place.textContent = data[place.dataset.text];
+  }
+}
+
 async function start() {
+  showParts();
   const arrays = await unpacked();
   const times = PAGE.parts.view?.times ?? PAGE.parts.curves?.times ?? [0];
   const clock = new Clock(times);

@@ -1,6 +1,6 @@
 """The body of a run in PyVista: a grid with its fields, a plotter with its chains, pictures and animations.
 
-A child process draws pictures, ``python3 -m remodel_fenicsx.pictures.bodies JOB``: a VTK that
+A child process draws pictures, ``python3 -m remodel_fenicsx.pictures JOB``: a VTK that
 knows only X (Debian 13's) kills its process where there is no display, so the child gets one of its
 own from xvfb-run. A VTK that can draw without (EGL) gets by without that program.
 """
@@ -16,7 +16,6 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Collection, Sequence
-from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -27,21 +26,16 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from remodel_fenicsx._version import __version__
+from remodel_fenicsx.errors import BAD_ENVIRONMENT, FigureError
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
     CHAIN_LOOK,
     RecordedRun,
-    RecordingError,
     VIEWS,
     kept_times,
-    unit_of,
-    with_unit,
-    words,
 )
-from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines, has_a_body
-from remodel_fenicsx.schema import same_time
-from remodel_fenicsx.studies.page import FigureError
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines
 from remodel_fenicsx.system.children import environment_of_child, last_line
 from remodel_fenicsx.system.files import TakenError, numbered, write_new
 
@@ -77,21 +71,14 @@ def grid(
     found = pyvista.UnstructuredGrid({kind: whole.elements}, whole.points)
     if displacement is not None:
         found.point_data["displacement"] = displacement
-    for name, values in {"layer": whole.layer, **fields}.items():
-        found.cell_data[name] = values
+    cells: dict[str, NDArray[Any]] = {"layer": whole.layer, **fields}
+    found.cell_data.update(cells)
     return found if shown is None else found.extract_cells(shown)
 
 
 def deformed(found: pyvista.UnstructuredGrid) -> pyvista.UnstructuredGrid:
     """Move the points of a grid, where displacements were recorded."""
     return found.warp_by_vector("displacement") if "displacement" in found.point_data else found
-
-
-def whole_body(recording: RecordedRun) -> WholeBody:
-    """Turn what a run recorded into its whole body, or raise RecordingError."""
-    if not has_a_body(recording):
-        raise RecordingError(f"{recording.path}: the run recorded no fields of a body (output.fields)")
-    return WholeBody(recording)
 
 
 def new_plotter(**options: Any) -> pyvista.Plotter:
@@ -183,7 +170,7 @@ def render(job: Job) -> list[Pixels]:
         result = file.with_suffix(".npy")
         if child.returncode != 0 or not result.exists():
             said = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"
-            raise FigureError(f"no picture in space: {said}; are xvfb and xauth there?", 5)
+            raise FigureError(f"no picture in space: {said}; are xvfb and xauth there?", BAD_ENVIRONMENT)
         return list(np.load(result))
 
 
@@ -251,7 +238,7 @@ class Viewing(NamedTuple):
             x = y = z = math.nan
         if not 0 < math.hypot(x, y, z) < math.inf:
             allowed = f"{', '.join(VIEWS)} or X,Y,Z, where the eye is from the middle of the body"
-            raise FigureError(f"view {self.view}: allowed is {allowed}", 2)
+            raise FigureError(f"view {self.view}: allowed is {allowed}")
         return x, y, z
 
 
@@ -261,7 +248,7 @@ def shown_elements(whole: WholeBody, viewing: Viewing) -> NDArray[np.bool_]:
     if layers is not None and not 1 <= layers <= count:
         start = whole.recording.scene.geometry.depth_in_words[1]
         rule = f"allowed is a whole number from 1 to {count}, from the {start}"
-        raise FigureError(f"layers {layers}: {rule}", 2)
+        raise FigureError(f"layers {layers}: {rule}")
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
 
 
@@ -270,13 +257,13 @@ def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
     if cut is None:
         return np.zeros(len(whole.elements), dtype=bool)
     middle = (whole.points.min(axis=0) + whole.points.max(axis=0)) / 2
-    x, y, _ = (whole.points[whole.elements].mean(axis=1) - middle).T
+    x, y, _ = (whole.centres - middle).T
     slack = 1e-6 * np.ptp(whole.points)  # an element on the border stays
     found = {"half": y < -slack, "quarter": (y < -slack) & (x > slack)}
     if cut not in found:
-        raise FigureError(f"cut {cut}: allowed are {', '.join(found)}", 2)
+        raise FigureError(f"cut {cut}: allowed are {', '.join(found)}")
     if not found[cut].any():
-        raise FigureError(f"cut {cut}: no whole element of this body lies in that part", 2)
+        raise FigureError(f"cut {cut}: no whole element of this body lies in that part")
     return found[cut]
 
 
@@ -294,76 +281,60 @@ def draw_picture(
     path: Path | None,
 ) -> Path:
     """Draw the body of a run at some of its times, beside each other."""
-    _check_new(path, (".png", ".pdf"))
-    recording = RecordedRun(folder)
-    shown = _nearest(recording, times)
+    whole = _body_for(folder, path, (".png", ".pdf"))
+    recorded = whole.recording.times
+    for time in times or ():
+        if not recorded[0] <= time <= recorded[-1]:
+            raise FigureError(f"times {time:g}: allowed are times from {recorded[0]:g} to {recorded[-1]:g}")
+    shown = dict.fromkeys(float(recorded[np.abs(recorded - time).argmin()]) for time in times or recorded[-1:])
     if len(shown) > MOST_PANELS:
         rule = f"allowed are {MOST_PANELS} in a picture (animate shows more)"
-        raise FigureError(f"times: {len(shown)} times; {rule}", 2)
-    return _draw(recording, [shown], viewing, path, ".png")
+        raise FigureError(f"times: {len(shown)} times; {rule}")
+    return _draw(whole, [[*shown]], viewing, path, ".png")
 
 
 def draw_animation(folder: str | os.PathLike[str], frames: int, viewing: Viewing, path: Path | None) -> Path:
     """Draw the body of a run as it moves through time."""
-    _check_new(path, (".gif", ".webp"))
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
         rule = f"allowed is a whole number from {FEWEST_FRAMES} to {MOST_FRAMES}"
-        raise FigureError(f"--frames {frames}: {rule}", 2)
-    recording = RecordedRun(folder)
-    recorded = whole_body(recording).recording.times
+        raise FigureError(f"--frames {frames}: {rule}")
+    whole = _body_for(folder, path, (".gif", ".webp"))
+    recorded = whole.recording.times
     if len(recorded) == 1:
         fault = "fields of one time alone are recorded, so nothing moves"
-        raise FigureError(f"{recording.path}: {fault}", 2)
-    times = kept_times(recorded, frames)
-    return _draw(recording, [[float(t)] for t in times], viewing, path, ".gif")
+        raise FigureError(f"{whole.recording.path}: {fault}")
+    return _draw(whole, [[float(time)] for time in kept_times(recorded, frames)], viewing, path, ".gif")
 
 
-def _check_new(path: Path | None, endings: Sequence[str]) -> None:
-    """Refuse a file that cannot be made before anything is drawn."""
-    if path is None:
-        return
-    if path.suffix.lower() not in endings:
-        raise FigureError(f"path {path}: allowed is a name that ends in {', '.join(endings)}", 2)
-    if os.path.lexists(path):
-        raise TakenError(path)
-    if not path.parent.is_dir():
-        raise FigureError(f"path {path}: there is no folder {path.parent}", 2)
-
-
-def _nearest(recording: RecordedRun, wanted: Sequence[float] | None) -> list[float]:
-    """Find the recorded times nearest to these, each once; the last one where none are wanted."""
-    recorded = whole_body(recording).recording.times
-    first, last = float(recorded[0]), float(recorded[-1])
-    for time in wanted or ():
-        if not first <= time <= last:
-            raise FigureError(f"times {time:g}: allowed are times from {first:g} to {last:g}", 2)
-    nearest = [float(recorded[np.abs(recorded - time).argmin()]) for time in wanted or (last,)]
-    return list(dict.fromkeys(nearest))
+def _body_for(folder: str | os.PathLike[str], path: Path | None, endings: Sequence[str]) -> WholeBody:
+    """Read the body of a run; a file that cannot be made is refused before anything is drawn."""
+    if path is not None:
+        if path.suffix.lower() not in endings:
+            raise FigureError(f"path {path}: allowed is a name that ends in {', '.join(endings)}")
+        if os.path.lexists(path):
+            raise TakenError(path)
+        if not path.parent.is_dir():
+            raise FigureError(f"path {path}: there is no folder {path.parent}")
+    return WholeBody(RecordedRun(folder))
 
 
 def _draw(
-    recording: RecordedRun,
-    sheets: Sequence[Sequence[float]],
-    viewing: Viewing,
-    path: Path | None,
-    ending: str,
+    whole: WholeBody, sheets: Sequence[Sequence[float]], viewing: Viewing, path: Path | None, ending: str
 ) -> Path:
     """Draw sheets of some times each, and write them into a new file."""
-    direction, whole, scene = viewing.direction, whole_body(recording), recording.scene
-    shown = shown_elements(whole, viewing)
+    recording, scene, shown = whole.recording, whole.recording.scene, shown_elements(whole, viewing)
     if ANGLE not in recording.fields(sheets[0][0], {ANGLE}):
-        raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)", 2)
-    drawn = [[(_title(recording, t), deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times] for times in sheets]
+        raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)")
+    drawn = [[(f"t = {t:g}", deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times] for times in sheets]
     along, across = scene.geometry.angle_in_words
     scale = f"angle of the collagen, deformed: 0 {along}, 90 {across} (degrees)"
     notes = f"{scene.name}: {len(whole.elements):,} elements. "
     notes += " ".join(whole.notes("displacement" in drawn[0][0][1].point_data))
-    images = render(Job(drawn, direction, scale, textwrap.fill(notes, 110)))
+    images = render(Job(drawn, viewing.direction, scale, textwrap.fill(notes, 110)))
     first, *others = map(Image.fromarray, images)
     texts, title = PngInfo(), f"{scene.name}: angle of the collagen"
-    versions = "; ".join(f"{name} {version}" for name, version in recording.versions.items())
-    made_with = f"remodel_fenicsx {__version__}"
-    about = {"Title": title, "Description": notes, "Software": made_with, "Source": versions}
+    source = "; ".join(f"{name} {version}" for name, version in recording.versions.items())
+    about = {"Title": title, "Description": notes, "Software": f"remodel_fenicsx {__version__}", "Source": source}
     for key, value in about.items():
         texts.add_text(key, value)
     durations = [FRAME_TIME] * len(others) + [LAST_TIME]
@@ -371,31 +342,14 @@ def _draw(
     file = io.BytesIO()
     kind = (path.suffix.lower() if path else ending)[1:]
     first.save(file, kind, pnginfo=texts, title=title, **(moving if others else {}))
-    return _write(recording, [sheets[0][0], sheets[-1][-1]], path, ending, file.getvalue())
-
-
-def _title(recording: RecordedRun, time: float) -> str:
-    """Say the time and its loads, where the history has a row of it."""
-    scene, history, found = recording.scene, recording.history, []
-    row = np.flatnonzero([same_time(recorded, time) for recorded in history["time"]])
-    for name in scene.loads:
-        column = scene.load_kinds[name].make_column(name)
-        if len(row) and column.name in history:
-            value = with_unit(float(history[column.name][row[0]]), unit_of(scene, column.unit))
-            found.append(f"{words(column.name)} {value}")
-    return "\n".join([f"t = {time:g}", *found])
-
-
-def _write(recording: RecordedRun, times: Sequence[float], path: Path | None, ending: str, data: bytes) -> Path:
-    """Write a new file: this one, or one that is named by its times in the folder."""
-    if path is not None:
-        write_new(path, data)
-        return path
-    stem = "-".join([recording.scene.name, *dict.fromkeys(f"t{time:g}" for time in times)])
-    for free in numbered(recording.path / f"{stem}{ending}"):
-        with suppress(TakenError):
-            write_new(free, data)
+    stem = "-".join([scene.name, *dict.fromkeys(f"t{times[0]:g}" for times in (sheets[0], sheets[-1][-1:]))])
+    for free in [path] if path else numbered(recording.path / f"{stem}{ending}"):
+        try:
+            write_new(free, file.getvalue())
             break
+        except TakenError:
+            if path:
+                raise
     return free
 
 
