@@ -13,6 +13,7 @@ makes no page, --report makes it from what is there. What is recorded is used ag
 
 from __future__ import annotations
 
+import math
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,6 @@ from docs.making.pages import DOCS, FIGURES, between_marks, filled, lines, made_
 from remodel_fenicsx.body.shape import PROFILE, profile_weights
 from remodel_fenicsx.scene.presets import PROFILES
 from remodel_fenicsx.scene.scene import Scene, preset_scene
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.studies.study import COLOURS, STYLE, Page
 from remodel_fenicsx.studies.trade import Setting, as_run, ladder, pareto, typical
 from tests.reference.radial import solve_radial
@@ -128,7 +128,7 @@ class Kept:
         if name in self:
             return
         rows = rows_of(as_run(setting).with_values({"output.times": TIMES}))
-        asked = [next(row for row in rows if same_time(row["time"], time)) for time in TIMES]
+        asked = [next(row for row in rows if math.isclose(row["time"], time)) for time in TIMES]
         angles, lengths = ([[row[n] for n in names] for row in asked] for names in (PROFILE, LENGTHS))
         seconds = np.array(sum(row["processor_seconds"] for row in rows))
         self.keep(name, {"angles": np.array(angles), "lengths": np.array(lengths), "seconds": seconds})

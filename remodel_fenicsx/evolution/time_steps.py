@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.life_cycle import Remodels, Values
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, Watcher
 from remodel_fenicsx.model.tensors import largest_change_of_length
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.solver.attempts import SHORTER_STEP, attempted, say
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Earlier, Numbers
@@ -261,7 +260,7 @@ class StepControl:
     def remaining(self) -> list[float]:
         """Return the stops that are left."""
         time = self.state.time
-        return [stop for stop in self.stops if stop > time and not same_time(stop, time)]
+        return [stop for stop in self.stops if stop > time and not math.isclose(stop, time)]
 
     def _accepted(self, stop: float, watchers: Sequence[Watcher]) -> Step:
         """The next step, shortened until it is accepted."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import logging
 from collections.abc import Callable, Collection, Sequence
 from functools import cache, partial
@@ -20,7 +21,6 @@ from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_ch
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, NO_PRESTRETCH, REGION, UNLOADED
-from remodel_fenicsx.schema import SAME_TIME, same_time
 from remodel_fenicsx.system.files import ClosedAtEnd
 
 Array = NDArray[np.float64]
@@ -177,7 +177,7 @@ class Fields(Watcher, ClosedAtEnd):
 
     def solved(self, step: Step) -> None:
         """Note the solved state, if it is its turn."""
-        asked = any(same_time(time, step.time) for time in self.times)
+        asked = any(math.isclose(time, step.time) for time in self.times)
         is_due = step.number % self.every == 0 or step.is_last or asked
         self._solved = self._gathered() if is_due else None
 
@@ -227,4 +227,4 @@ def _continued(path: Path, after: float | None) -> TransientGrid | None:
     if not path.exists():
         log.warning("%s is missing: a new one begins with the next step", path.name)
         return None
-    return TransientGrid.continued(path, after * (1 + SAME_TIME))
+    return TransientGrid.continued(path, after * (1 + 1e-9))  # as far as `math.isclose` takes times as the same

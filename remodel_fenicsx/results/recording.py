@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import csv
 import fcntl
 import os
@@ -18,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.environment import check_extensions
 from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, open_own, part_of, read_regular
 
@@ -238,7 +238,7 @@ class RecordedRun:
 
     def _number_of(self, time: float, times: Array, what: str) -> int:
         """Which of the times this one is."""
-        found = [number for number, recorded in enumerate(times) if same_time(recorded, time)]
+        found = [number for number, recorded in enumerate(times) if math.isclose(recorded, time)]
         if not found:
             raise RecordingError(f"{self.path}: no {what} at time {time:g}; recorded are {_in_words(times)}")
         return found[0]

@@ -31,7 +31,6 @@ from remodel_fenicsx.results.recording import (
     is_vacant,
 )
 from remodel_fenicsx.results.vtkhdf import check_series
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.files import ClosedAtEnd, numbered, open_own, read_regular, write_whole
 
 
@@ -210,7 +209,7 @@ def size_of_rows(path: Path, after: LastStep) -> int:
         texts = [line.decode("utf-8") for line in lines]
         found, *read = csv.reader(texts)
         whole = len(read) == rows and texts[-1].endswith("\n")
-        right = whole and same_time(float(read[-1][found.index("time")]), after.time)
+        right = whole and math.isclose(float(read[-1][found.index("time")]), after.time)
     except (ValueError, IndexError, csv.Error):
         right = False
     if not right:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import time as clock
@@ -13,7 +14,6 @@ import numpy as np
 
 from remodel_fenicsx.results.checkpoint_file import time_of_checkpoint
 from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, LOG, SCENE, RecordedRun, RecordingError, writer
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.system.files import read_regular, typed
 from remodel_fenicsx.system.terminal import duration
 
@@ -72,7 +72,7 @@ def log_entries(folder: Path) -> list[tuple[str, str, str]]:
 def state_of(recording: RecordedRun) -> tuple[str, str]:
     """Whether a run has "finished", "failed", "stopped" or is "running", and what run.log says of why."""
     times = recording.history["time"]
-    if len(times) and same_time(float(times[-1]), recording.scene.last_time):
+    if len(times) and math.isclose(float(times[-1]), recording.scene.last_time):
         return "finished", ""
     state, reason = _said_of_its_end(recording.path)
     return ("running" if not reason and writer(recording.path)[1] else state), reason

@@ -49,7 +49,6 @@ from remodel_fenicsx.schema.tables import (
     shown,
     with_key,
 )
-from remodel_fenicsx.schema import is_multiple, same_time
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
 
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
@@ -909,7 +908,7 @@ class Load(Table):
 
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
-        hit = next((corner for corner, _ in self.ramp if same_time(time, corner)), time)  # exact at its own times
+        hit = next((corner for corner, _ in self.ramp if math.isclose(time, corner)), time)  # exact at its own times
         times, factors = zip(*self.ramp, strict=True)
         return float(np.interp(hit, times, factors))
 
@@ -998,7 +997,7 @@ class Time(Table):
 
     def is_hit(self, time: float) -> bool:
         """Whether a step ends at a time, or may end there."""
-        return self.tolerance is not None or is_multiple(time, self.step)
+        return self.tolerance is not None or math.isclose(time, round(time / self.step) * self.step)
 
     def check_hit(self, time: float, key: str) -> None:
         """Refuse a time at which no step ends."""

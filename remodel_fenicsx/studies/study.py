@@ -43,7 +43,6 @@ from remodel_fenicsx.results.recording import (
 from remodel_fenicsx.running import with_files_kept
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
-from remodel_fenicsx.schema import same_time
 from remodel_fenicsx.initial import with_choices
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.children import Worker, cores, wait_for_one
@@ -259,7 +258,7 @@ class Run:
         except RecordingError:  # a last row that is not whole is done again
             return False
         times = history["time"]
-        if not len(times) or not same_time(float(times[-1]), self.scene.last_time):
+        if not len(times) or not math.isclose(float(times[-1]), self.scene.last_time):
             return False
         if not {column.name for column in self.scene.columns()} <= set(history) or (np.diff(times) <= 0).any():
             raise RecordingError(f"{self.folder}: its history has other columns or rows than its scene asks for")
