@@ -38,7 +38,7 @@ class EquilibriumStability(Watcher):
         self.stepper, self.state = stepper, stepper.state
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
-        self.curvature = Curvature(stepper)
+        self._vector = Earlier(self.state, "stability_vector", self.state.unknown.copy, 1)
         self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
         # eigenvalues that are known, and Newton iterations since the last look
         self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
@@ -59,7 +59,8 @@ class EquilibriumStability(Watcher):
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
-        suspicious = bool(step.work.newton_iterations) and self.curvature.is_negative() and known == 0
+        factorisation = self.stepper.coupling.newton.factorisation() if step.work.newton_iterations else None
+        suspicious = factorisation is not None and self._curvature(factorisation) < 0 and known == 0
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
             overdue = False
@@ -113,26 +114,13 @@ class EquilibriumStability(Watcher):
         if self.state.comm.rank == 0:
             log.log(level, "%s", text)
 
-
-class Curvature:
-    """What Newton's last tangent tells for one substitution: the sign of its eigenvalue nearest to zero."""
-
-    def __init__(self, stepper: Stepper):
-        self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
-        self._vector = Earlier(stepper.state, "stability_vector", stepper.state.unknown.copy, 1)
-
-    def is_negative(self) -> bool:
-        """Whether an equilibrium that was stable no longer seems to be."""
-        factorisation = self.newton.factorisation()
-        return factorisation is not None and self._curvature(factorisation) < 0
-
     def _curvature(self, factorisation: PETSc.PC) -> float:
         """Of the remembered vector after one more inverse iteration."""
         vector, image = factorisation.getOperators()[0].createVecs()
         first = not self._vector.known
         if first:
             uneven(vector)
-            free = np.isnan(self.equilibrium.prescribed_values()[: vector.getLocalSize()])
+            free = np.isnan(self.inertia.equilibrium.prescribed_values()[: vector.getLocalSize()])
             vector.array[:] *= free  # prescribed ones have an eigenvalue of their own, one
         else:
             vector.array[:] = self._vector.values[0][: vector.getLocalSize()]
