@@ -194,9 +194,10 @@ class BucklingWarning(WarnsOnce):
 
     def lumen_area(self) -> float:
         """Present area of the lumen's section, from the mean radius of the nodes on its wall."""
-        kinematics, unknown = self.state.kinematics, self.state.unknown
+        kinematics, unknown, radius = self.state.kinematics, self.state.unknown, self.strut.inner_radius
+        assert radius is not None
         nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
-        here = np.isclose(np.linalg.norm(nodes[:, :2], axis=1), self.strut.inner_radius, rtol=1e-6)
+        here = np.isclose(np.linalg.norm(nodes[:, :2], axis=1), radius, rtol=1e-6)
         deformed = np.linalg.norm((nodes + kinematics.nodal_displacement(unknown))[here, :2], axis=1)
         total, number = self.state.comm.allreduce(np.array([deformed.sum(), here.sum()]))
         return float(np.pi * (total / number) ** 2)
@@ -230,7 +231,7 @@ class BucklingWarning(WarnsOnce):
             strains = np.zeros(3)
             np.add.at(strains, list(axes), np.multiply(signs, h))
             total += np.prod(signs) * self._energy(strains)
-        return total / (2 * h) ** len(axes)
+        return np.asarray(total / (2 * h) ** len(axes))
 
     def _energy(self, strains: Array) -> Array:
         """W at the points after further stretches exp(strains) along the directions."""
