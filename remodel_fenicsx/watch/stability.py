@@ -157,7 +157,7 @@ def described(mode: Mode, unloaded: float) -> str:
 STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6
 # The estimate is 0.8 to 1.1 where whole slender tubes lose their stability (docs/theory.md, Buckling)
 WARNED_LOAD = 0.9
-AROUND, ALONG = 1, 2
+AROUND, ALONG = range(1, 3)
 
 
 class BucklingWarning(WarnsOnce):
