@@ -124,7 +124,7 @@ class Positive:
         # where all is held.
         unknown, matrix = dolfinx.fem.Function(self.space), self._matrix
         answer = unknown.x.petsc_vec
-        load = answer.duplicate()
+        load, conditions = answer.duplicate(), list(conditions)
         assemble_matrix(matrix, [self._form], conditions)
         with load.localForm() as local:
             local.array_w[:] = 0.0

@@ -56,6 +56,7 @@ FOLDER = Path(__file__).parent
 NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 NOT_FINITE = 2  # mark of a point with NaN or infinity
 HEADER = "suitesparse/cholmod.h"
+C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}  # of numpy's characters; all others are double
 NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
 """What tensor.c takes from Python: the numbers that tune."""
 FIRST = 5  # CHOLMOD's version that has single precision
@@ -116,11 +117,9 @@ class Library:
 
     def _argument(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            if value.dtype in (np.bool_, np.uint8):
-                return self._ffi.from_buffer("uint8_t[]", value)
-            if value.dtype == np.int32:
-                return self._ffi.from_buffer("int32_t[]", np.ascontiguousarray(value))
-            return self._ffi.from_buffer("double[]", np.ascontiguousarray(value, np.float64))
+            kind = C_TYPES.get(value.dtype.char, "double")
+            values = np.ascontiguousarray(value, np.float64 if kind == "double" else None)
+            return self._ffi.from_buffer(f"{kind}[]", values)
         return self._ffi.NULL if value is None else value
 
 

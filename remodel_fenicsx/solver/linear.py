@@ -35,7 +35,7 @@ CURVED = 1e-8  # cosine between a step and the change of the residual, below whi
 class Secants:
     """Betters the steps of a kept factor by what earlier steps have shown of the present tangent."""
 
-    def __init__(self, comm: Comm) -> None:
+    def __init__(self, comm: MPI.Intracomm) -> None:
         self._comm = comm
         # a step s, the change z of the residual over it, and H z with the kept inverse H; with s . z
         self._pairs: deque[tuple[Array, float]] = deque(maxlen=REMEMBERED_PAIRS)

@@ -281,8 +281,8 @@ class GuardedNewton:
             raise Interrupted(extension.stop_signal)
         text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
         scales = self.convergence.tolerance(), self.convergence.force_scale
-        shares = (norm / max(scale, float(np.finfo(np.float64).tiny)) for scale in scales)
-        raise SolveFailure(text, found, *shares, stagnates=norm > STAGNATION * self._present.previous)
+        left, relative = (norm / max(scale, float(np.finfo(np.float64).tiny)) for scale in scales)
+        raise SolveFailure(text, found, left, relative, norm > STAGNATION * self._present.previous)
 
     def _reach(self) -> float:
         """`Solution.reach` of the present unknowns."""

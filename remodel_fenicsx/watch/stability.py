@@ -38,7 +38,7 @@ class EquilibriumStability(Watcher):
         self.stepper, self.state = stepper, stepper.state
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
-        self.curvature = Curvature(stepper)
+        self._vector = Earlier(self.state, "stability_vector", self.state.unknown.copy, 1)
         self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
         # eigenvalues that are known, and Newton iterations since the last look
         self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
@@ -59,7 +59,8 @@ class EquilibriumStability(Watcher):
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
-        suspicious = bool(step.work.newton_iterations) and self.curvature.is_negative() and known == 0
+        factorisation = self.stepper.coupling.newton.factorisation() if step.work.newton_iterations else None
+        suspicious = factorisation is not None and self._curvature(factorisation) < 0 and known == 0
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
             overdue = False
@@ -113,26 +114,13 @@ class EquilibriumStability(Watcher):
         if self.state.comm.rank == 0:
             log.log(level, "%s", text)
 
-
-class Curvature:
-    """What Newton's last tangent tells for one substitution: the sign of its eigenvalue nearest to zero."""
-
-    def __init__(self, stepper: LoadCaseSolver):
-        self.newton, self.equilibrium = stepper.coupling.newton, stepper.coupling.equilibrium
-        self._vector = Earlier(stepper.state, "stability_vector", stepper.state.unknown.copy, 1)
-
-    def is_negative(self) -> bool:
-        """Whether an equilibrium that was stable no longer seems to be."""
-        factorisation = self.newton.factorisation()
-        return factorisation is not None and self._curvature(factorisation) < 0
-
     def _curvature(self, factorisation: PETSc.PC) -> float:
         """Of the remembered vector after one more inverse iteration."""
         vector, image = factorisation.getOperators()[0].createVecs()
         first = not self._vector.known
         if first:
             uneven(vector)
-            free = np.isnan(self.equilibrium.prescribed_values()[: vector.getLocalSize()])
+            free = np.isnan(self.inertia.equilibrium.prescribed_values()[: vector.getLocalSize()])
             vector.array[:] *= free  # prescribed ones have an eigenvalue of their own, one
         else:
             vector.array[:] = self._vector.values[0][: vector.getLocalSize()]
@@ -169,7 +157,7 @@ def described(mode: Mode, unloaded: float) -> str:
 STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6
 # The estimate is 0.8 to 1.1 where whole slender tubes lose their stability (docs/theory.md, Buckling)
 WARNED_LOAD = 0.9
-AROUND, ALONG = 1, 2
+AROUND, ALONG = range(1, 3)
 
 
 class BucklingWarning(WarnsOnce):
@@ -206,9 +194,10 @@ class BucklingWarning(WarnsOnce):
 
     def lumen_area(self) -> float:
         """Present area of the lumen's section, from the mean radius of the nodes on its wall."""
-        kinematics, unknown = self.state.kinematics, self.state.unknown
+        kinematics, unknown, radius = self.state.kinematics, self.state.unknown, self.strut.inner_radius
+        assert radius is not None
         nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
-        here = np.isclose(np.linalg.norm(nodes[:, :2], axis=1), self.strut.inner_radius, rtol=1e-6)
+        here = np.isclose(np.linalg.norm(nodes[:, :2], axis=1), radius, rtol=1e-6)
         deformed = np.linalg.norm((nodes + kinematics.nodal_displacement(unknown))[here, :2], axis=1)
         total, number = self.state.comm.allreduce(np.array([deformed.sum(), here.sum()]))
         return float(np.pi * (total / number) ** 2)
@@ -242,7 +231,7 @@ class BucklingWarning(WarnsOnce):
             strains = np.zeros(3)
             np.add.at(strains, list(axes), np.multiply(signs, h))
             total += np.prod(signs) * self._energy(strains)
-        return total / (2 * h) ** len(axes)
+        return np.asarray(total / (2 * h) ** len(axes))
 
     def _energy(self, strains: Array) -> Array:
         """W at the points after further stretches exp(strains) along the directions."""
