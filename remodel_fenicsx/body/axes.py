@@ -23,7 +23,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.domain import Domain, cells_of, dof_of_node
-from remodel_fenicsx.body.mesh_faces import area_vectors
+from remodel_fenicsx.body.mesh_faces import ROLES, area_vectors
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import Positive, SolveStopped, of_all_ranks, over_ranks
 from remodel_fenicsx.fem.compat import geometry_dofmap
@@ -48,13 +48,10 @@ SQUARE_TO_RADIAL = 10.0
 TINY = 1e-12  # of a squared length of about one: no direction is divided by zero
 
 
-FACES = ("inner", "outer", "inlet", "outlet")
-
-
 def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     """Radial and axial direction, lengths from inner and outer face, inlet and outlet: functions. Collective."""
     mesh, degree = domain.mesh, quadrature.element_degree
-    inner, outer, starts, ends = map(domain.facets, FACES)
+    inner, outer, starts, ends = map(domain.facets, ROLES)
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
     dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
     stiffness = slopes(mesh, degree, dx)
@@ -131,7 +128,7 @@ def _normal_to_ends(function: Function, starts: Facets, ends: Facets) -> Dirichl
     for facets, sign in ((starts, -1.0), (ends, 1.0)):
         cells, local = cells_of(space.mesh, facets)
         for cell, number, vector in zip(cells, local, outward_areas(space.mesh, facets), strict=True):
-            values[space.dofmap.cell_dofs(cell)[layout.entity_closure_dofs(2, number)]] += sign * vector
+            values[space.dofmap.cell_dofs(int(cell))[layout.entity_closure_dofs(2, number)]] += sign * vector
     sums.x.scatter_reverse(dolfinx.la.InsertMode.add)
     sums.x.scatter_forward()
     sizes = np.linalg.norm(values, axis=1)
@@ -178,8 +175,8 @@ class UndefinedAxes(SceneError):
 
 
 def found_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
-    """Local axes of a mesh with `FACES`. Collective."""
-    if missing := [face for face in FACES if face not in domain.faces]:
+    """Local axes of a mesh with `ROLES`. Collective."""
+    if missing := [face for face in ROLES if face not in domain.faces]:
         raise UndefinedAxes(f"geometry.faces: the local axes of a wall need a face {', '.join(map(repr, missing))}")
     try:
         radial, axial, *lengths = _fields(domain, quadrature)

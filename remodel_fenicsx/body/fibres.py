@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,8 +31,8 @@ SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
 GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
 OF_GROUPS = {name: tuple(f"{name}_{c}" for c in parts) for name, parts in GROUPS.items()}
-SINGLE = ("element", "angle", "weight")
-OF_TABLES = (*"xyz", *SINGLE, *itertools.chain(*OF_GROUPS.values()))
+OF_ONE_COLUMN = ("element", "angle", "weight")
+OF_TABLES = (*"xyz", *OF_ONE_COLUMN, *itertools.chain(*OF_GROUPS.values()))
 # ParaView writes the number of a component, and Points for places
 SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
 SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_"}
@@ -95,10 +96,14 @@ def read_fibre_file(path: Path) -> FibreFile:
 def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     """Columns by name: structure_tensor_xx ..., fibre_x ..., fibre_2_x ..., weight, angle; element, or x, y, z."""
     columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
-    groups = {"structure_tensor": [f"structure_tensor_{c}" for c in SYMMETRIC_COMPONENTS]}, OF_GROUPS
-    groups += ({"places": "xyz"} | {name: (name,) for name in SINGLE},)
-    measured, used = {}, set()
-    for name, keys in itertools.chain(*map(dict.items, groups)):
+    groups: list[tuple[str, Sequence[str]]] = [
+        *OF_GROUPS.items(),
+        ("places", "xyz"),
+        *((name, [name]) for name in OF_ONE_COLUMN),
+    ]
+    groups.insert(0, ("structure_tensor", [f"structure_tensor_{c}" for c in SYMMETRIC_COMPONENTS]))
+    measured, used = dict[str, Array](), set[str]()
+    for name, keys in groups:
         if set(keys) <= set(columns):
             measured[name] = np.stack([columns[key] for key in keys], axis=1)
             used |= {*keys}

@@ -139,7 +139,7 @@ class Loading:
         # on the sub-space's own dofs alone the value is a Constant, as for faces
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace))
 
-    def hold_facets(self, facets: NDArray[np.int32], name: str | None = None, way: Array | None = None) -> None:
+    def hold_facets(self, facets: NDArray[np.int32], name: str | None = None, way: Array | float = 0.0) -> None:
         """u = magnitude times `way` on local facets, of the full displacement.
 
         Parameters

@@ -24,7 +24,7 @@ from remodel_fenicsx.body.mesh_file import (
     split_wedges,
     triangles_of,
 )
-from remodel_fenicsx.body.wall import shared_out
+from remodel_fenicsx.body.wall import Wall, shared_out
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import LARGEST_MESH
@@ -168,10 +168,8 @@ class GrownWall(NamedTuple):
 
 def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[str, float], through: int) -> GrownWall:
     """Prisms outwards of a surface, bent as the given one: thickness (points,), of which each layer has its share."""
-    counts = shared_out(list(layers.values()), max(through, len(layers)))
-    shares, ends = np.array(list(layers.values())), np.cumsum([0.0, *layers.values()])
-    levels = np.concatenate([[0.0], *(np.linspace(ends[k], ends[k + 1], n + 1)[1:] for k, n in enumerate(counts))])
-    levels /= shares.sum()
+    ends, counts = np.cumsum([0.0, *layers.values()]), shared_out([*layers.values()], max(through, len(layers)))
+    levels = Wall((*layers,), (*ends,), counts).nodes(1) / ends[-1]
     openings = rims(surface.triangles)
     size, layer = len(surface.points), np.arange(len(levels) - 1)[:, None, None]
     wedges = np.concatenate([surface.triangles, surface.triangles + size], axis=1) + size * layer

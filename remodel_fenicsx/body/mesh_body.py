@@ -50,7 +50,6 @@ ON_FACES: dict[str, Callable[[str], LoadKind]] = {
     "pressure": lambda face: LoadKind(_by_hold_faces, f"pressure on the deformed face {face}", STRESS),
     "displacement": lambda face: LoadKind(_by_hold_faces, f"way of the face {face} along its normal, outwards", LENGTH),
 }
-ROLES = ("inner", "outer", "inlet", "outlet")
 Names = tuple[str | int, ...]
 _ENTRY: JsonDict = {"type": ["string", "integer"]}
 _GROUPS: JsonDict = {
@@ -101,7 +100,7 @@ def _file(value: Any) -> Any:
 
 def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
     """The keys with surfaces that faces give as files, inner = { file = "lumen.vtp" }, after the mesh."""
-    faces, file = geometry.get("faces"), geometry.get("file")
+    faces, file = geometry.get("faces", {}), geometry.get("file")
     files, found = file if isinstance(file, (list, tuple)) else [file], {}
     for face, one in faces.items() if isinstance(faces, Mapping) else ():
         if isinstance(one, Mapping) and _ends_with(one.get("file"), SURFACES):
@@ -306,13 +305,13 @@ class FileBody(WithRegions, FromFile):
             numbers[name], *others = _numbers(f"regions.{name}", entries, file.names[3], file.cell_groups)
             groups[np.isin(groups, others)] = numbers[name]
         own = ~mesh_faces.again(file.corners, groups, numbers.values())
-        others = {name: number for name, number in file.names[3].items() if number not in numbers.values()}
+        further = {name: number for name, number in file.names[3].items() if number not in numbers.values()}
         return replace(
             file,
             cells=file.cells[own],
             cell_numbers=file.cell_numbers[own],
             cell_groups=groups[own],
-            names={**file.names, 3: others | numbers},
+            names={**file.names, 3: further | numbers},
         )
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
@@ -356,7 +355,7 @@ class FileBody(WithRegions, FromFile):
             if load == "displacement" and kind not in HELD_ACROSS:
                 able = " or ".join(map(repr, HELD_ACROSS))
                 raise SceneError(f"{key}: its support ({kind!r}) lets it move; a face that is displaced must be {able}")
-            if load == "displacement" and domain.boundary.goes_around(face):
+            if load == "displacement" and domain.boundary.goes_around(face):  # type: ignore[attr-defined]
                 raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
             if load == "displacement" and face in moved:
                 raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
@@ -490,7 +489,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         ),
         *WalledMesh.columns_on_request,
     )
-    face_names = ROLES
+    face_names = mesh_faces.ROLES
     thickness_in_words = "mean thickness of the wall"
 
     shape: Literal["mesh"] = "mesh"

@@ -89,7 +89,7 @@ def shared(
     found = agreed(comm, lambda: read() if comm.rank == 0 else None)
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as in `domain`
     told = cells = groups = None
-    points = np.empty((0, 3))
+    points: Array = np.empty((0, 3))
     if found is not None:
         file, boundary, regions = found
         points, cells, groups = file.points, file.cells[:, node_order(file)], file.cell_groups.astype(np.int32)

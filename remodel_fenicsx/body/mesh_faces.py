@@ -25,6 +25,7 @@ FACETS = {
     "hexahedron": ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
 }
 FLAT = 1e-12  # of the mean |det J| of the elements: below it one has no volume
+ROLES = ("inner", "outer", "inlet", "outlet")  # faces of a vessel
 NOT_AROUND = 0.5  # length of the mean normal of a face that has a direction: that of a half sphere
 Groups = Mapping[str, Sequence[int]]
 

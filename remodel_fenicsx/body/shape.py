@@ -629,7 +629,7 @@ class Shape(_Is):  # type: ignore[misc]
             lambda: self.axes_at(places),
             lambda: self.depth(places),
             lambda: self.station(places),
-            lambda: self.depth(domain.mesh.geometry.x),
+            lambda: self.depth(domain.mesh.geometry.x.astype(np.float64)),
         )
 
     def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
