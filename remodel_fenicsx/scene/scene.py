@@ -247,7 +247,7 @@ class Scene(Table):
     remodel_fenicsx.schema.tables.SceneError: remodeling.kappa = -1.0: must be a finite number at least 0
     """
 
-    rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
+    _rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none."""
@@ -315,13 +315,13 @@ class Scene(Table):
         _check_name("profile", profile, presets.PROFILES)
         return _with_profile(profile, made)
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         """What its tables do not bear of each other, once numbers of experiments are those of the model."""
         whole = presets.with_own_numbers(self, Scene.whole)
         over = partial(Region.over, others=whole.whole())
         regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
         self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
-        for rule in self.rules:
+        for rule in self._rules:
             yield from rule(self)
 
     @property

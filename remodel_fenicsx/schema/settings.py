@@ -103,7 +103,7 @@ class Mesh(Table):
         f"needs 'displacement'. {meanings(FORMULATIONS)} (docs/what_may_go_wrong.md).",
     )
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         pair = self.element, self.degree
         if self.formulation != AUTO and not FORMULATIONS[self.formulation].has(*pair):
             able = named(FORMULATIONS, lambda formulation: formulation.has(*pair))
@@ -140,7 +140,7 @@ class Support(Table):
     """For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown may twist. With 0 a
     tube may be solved on one radius, which cannot twist."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if self.kind == "elastic" and self.stiffness is None:
             yield "missing; a support of kind 'elastic' needs it, as in '10 kPa/mm'", "stiffness", None
 
@@ -282,7 +282,7 @@ class Prestretch(Table):
     radial: float | None = Field(default=None, gt=0)
     """Stretch across the wall."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if not _set(self):
             yield "needs one of " + ", ".join(type(self).model_fields), "", self
 
@@ -310,7 +310,7 @@ class NaturalLayer(_From):  # type: ignore[misc]
     prestretch: Prestretch
     """Stretches from the layer's natural state to the unloaded body."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         low, high = self.share
         if not low < high:
             yield f"must be smaller than to = {shown(high)}", "from", low
@@ -352,7 +352,7 @@ class Natural(Table):
         """Whether the mesh is free of stress."""
         return self.opening_angle == 0.0 and not self.layers and not self.fibres
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         for (_, other), (index, layer) in itertools.combinations(enumerate(self.layers), 2):
             if (layer.region is None) != (other.region is None):
                 rule = "some layers have a region and some a share of the wall: allowed is one kind"
@@ -422,7 +422,7 @@ class Cells(Table):
     """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It stays in the repulsive
     energy while the cells remodel."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if (rule := self.fault_of_length()) is not None:
             yield rule, "initial", self.initial
 
@@ -614,7 +614,7 @@ class Turnover(_WithStart):  # type: ignore[misc]
         """Whether there is any."""
         return self.time is not None
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if self.time is None and self != Turnover.model_construct():
             yield "missing; turnover needs its time", "time", None
 
@@ -714,7 +714,7 @@ class Remodeling(Table):
         """Whether exponent or threshold is another than the paper's."""
         return self.exponent != 2.0 or self.threshold != 0.0
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         law, driver, coupling = LAWS[self.law], DRIVERS[self.driver], COUPLINGS[self.coupling]
         able = named(LAWS, lambda law: law.takes_set_points)
         for key, plain in (("exponent", 2), ("threshold", 0)):
@@ -864,7 +864,7 @@ class Load(Table):
     face: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"})
     """For a further load of a body of your own: the face that it acts on."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         for given, missing in (("kind", "face"), ("face", "kind")):
             if getattr(self, given) is not None and getattr(self, missing) is None:
                 yield f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None
@@ -948,7 +948,7 @@ class Time(Table):
     that of lengths (1 degree stands for 1.7 %; docs/theory.md, Error-controlled steps). With end = 'equilibrium'
     the default is 3 degrees, or 0.5 where a load falls."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if self.is_equilibrium:
             return
         if self.step > self.end:
@@ -1063,7 +1063,7 @@ class Solver(Table):
     """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_... and mat_.... Options
     that run code or write files are refused."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
             yield "must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0
 

@@ -81,13 +81,13 @@ class Table(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         """What does not fit together in its keys: what is allowed, the key and its value."""
         yield from ()
 
     @model_validator(mode="after")
     def _has_none(self) -> Self:
-        for broken in self.faults():
+        for broken in self._faults():
             raise fault(*broken)
         return self
 
