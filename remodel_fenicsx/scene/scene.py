@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
+from pydantic import BaseModel, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, choice
@@ -210,12 +210,6 @@ FORGOTTEN_AFTER = (
 # ---------------------------------------------------------------- the scene
 
 
-def _name(value: object) -> object:
-    if not isinstance(value, str) or not re.fullmatch(r"\w(?:[\w .+-]{0,98}[\w+-])?", value):
-        raise fault("must be a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first")
-    return value
-
-
 class Scene(Table):
     """A whole scene: all keys above the first table, and the tables.
 
@@ -251,8 +245,12 @@ class Scene(Table):
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none."""
-    name: Annotated[str, BeforeValidator(_name)] = Field(
-        default="scene", json_schema_extra={"allowed": "a file name without a path"}
+    name: str = Field(
+        default="scene",
+        pattern=r"^\w(?:[\w .+-]{0,98}[\w+-])?$",
+        json_schema_extra={
+            "allowed": "a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first"
+        },
     )
     """Name of the scene and of its results folder. Default: the name of the file without `.toml`."""
     preset: Annotated[str | None, OneOf(presets.PRESETS)] = None

@@ -454,11 +454,6 @@ class Cells(Table):
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
-def _nothing_is_missing(scene: object) -> str | None:
-    """Of scenes as they are."""
-    return None
-
-
 @dataclass(frozen=True)
 class CouplingKind:
     """How equilibrium and remodeling of one step are coupled, as scenes know it.
@@ -506,7 +501,7 @@ class CouplingKind:
     takes_cases: bool = False
     takes_turnover: bool = False
     solves_cells: bool = False
-    missing: Callable[[Any], str | None] = _nothing_is_missing
+    missing: Callable[[Any], str | None] | None = None
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -826,22 +821,10 @@ def _set(table: Table) -> dict[str, object]:
 # ---------------------------------------------------------------- loads and time
 
 
-def _later_and_later(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    """A fault names the entry."""
-    for index, (time, _) in enumerate(ramp):
-        if time < 0:
-            raise fault("must be at least 0, where the simulation starts", f"[{index}][0]", time)
-        if index and time <= ramp[index - 1][0]:
-            rule = f"must be later than the time {shown(ramp[index - 1][0])} of the entry before"
-            raise fault(rule, f"[{index}][0]", time)
-    return ramp
-
-
 Ramp = Annotated[
     tuple[Annotated[tuple[float, float], IN_A_LIST], ...],
     IN_A_LIST,
     Field(min_length=1),
-    AfterValidator(_later_and_later),
 ]
 
 
@@ -865,6 +848,12 @@ class Load(Table):
     """For a further load of a body of your own: the face that it acts on."""
 
     def _faults(self) -> Faults:
+        for index, (time, _) in enumerate(self.ramp):
+            if time < 0:
+                yield "must be at least 0, where the simulation starts", f"ramp[{index}][0]", time
+            if index and time <= self.ramp[index - 1][0]:
+                rule = f"must be later than the time {shown(self.ramp[index - 1][0])} of the entry before"
+                yield rule, f"ramp[{index}][0]", time
         for given, missing in (("kind", "face"), ("face", "kind")):
             if getattr(self, given) is not None and getattr(self, missing) is None:
                 yield f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None
@@ -999,18 +988,6 @@ class Time(Table):
 # ---------------------------------------------------------------- solver and output
 
 
-def _are_options(options: dict[str, str | float | bool]) -> dict[str, str | float | bool]:
-    """A fault names the option."""
-    for name, value in options.items():
-        if not re.fullmatch(r"[A-Za-z]\w*", name):
-            raise fault("not a PETSc option; write its name without the leading '-'", quoted(name), value)
-        if name in ("snes_rtol", "snes_atol", "snes_stol"):
-            raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, value)
-        if refused := fault_of_option(name, value):
-            raise fault(refused, name, value)
-    return options
-
-
 class Solver(Table):
     """Solution of the nonlinear problem of each step.
 
@@ -1056,7 +1033,7 @@ class Solver(Table):
     unstable: Literal["warn", "stop"] = "warn"
     """What to do at an equilibrium that the body would leave. 'warn': say where, and go on. 'stop': look in every step,
     and end the run after the last stable one (exit code 3)."""
-    petsc_options: Annotated[dict[str, str | bool | int | float], AfterValidator(_are_options)] = Field(
+    petsc_options: dict[str, str | bool | int | float] = Field(
         default_factory=dict,
         json_schema_extra={"allowed": "a table with a string, a finite number, true or false for each option"},
     )
@@ -1064,6 +1041,14 @@ class Solver(Table):
     that run code or write files are refused."""
 
     def _faults(self) -> Faults:
+        for name, value in self.petsc_options.items():
+            key = f"petsc_options.{quoted(name)}"
+            if not re.fullmatch(r"[A-Za-z]\w*", name):
+                yield "not a PETSc option; write its name without the leading '-'", key, value
+            if name in ("snes_rtol", "snes_atol", "snes_stol"):
+                yield "has no effect; use solver.relative_tolerance, solver.absolute_tolerance", key, value
+            if refused := fault_of_option(name, value):
+                yield refused, key, value
         if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
             yield "must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0
 
@@ -1085,12 +1070,6 @@ ALL_FIELDS = (*FIELDS_BY_NAME, *CONSTANT_FIELDS)
 _FieldName = Annotated[str, OneOf(ALL_FIELDS)]
 
 
-def _increasing(times: tuple[float, ...]) -> tuple[float, ...]:
-    if any(later <= time for time, later in itertools.pairwise(times)):
-        raise fault("times must increase")
-    return times
-
-
 class Output(Table):
     """What a run writes beside its history table."""
 
@@ -1107,7 +1086,7 @@ class Output(Table):
     measured, with time and loads."""
     every: int = Field(default=1, ge=1)
     """Write the fields of every n-th step, and of the last one."""
-    times: Annotated[tuple[Annotated[float, Field(gt=0)], ...], IN_A_LIST, AfterValidator(_increasing)] = Field(
+    times: Annotated[tuple[Annotated[float, Field(gt=0)], ...], IN_A_LIST] = Field(
         default=(), json_schema_extra={"allowed": "a list of increasing times above 0"}
     )
     """Times up to time.end that have a row and fields in any case. They must be multiples of time.step; with
@@ -1117,3 +1096,7 @@ class Output(Table):
     checkpoint: int | None = Field(default=None, ge=0)
     """Number of steps between two checkpoints; 0 means only at the end. Without it at most 10 minutes are lost, and
     checkpoints cost less than 5 % of the run."""
+
+    def _faults(self) -> Faults:
+        if any(later <= time for time, later in itertools.pairwise(self.times)):
+            yield "times must increase", "times", self.times

@@ -423,8 +423,12 @@ def allowed(field: FieldInfo) -> str:
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
     nouns: dict[object, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
-    limits = [(word, getattr(entry, name, None)) for entry in field.metadata for name, word in words.items()]
-    bounds = [f"{word} {limit}" for word, limit in limits if limit is not None]
+    bounds = [
+        f"{word} {getattr(entry, name)}"
+        for entry in field.metadata
+        for name, word in words.items()
+        if hasattr(entry, name)
+    ]
     return " ".join(filter(None, [f"must be {nouns[_kind(field)]}", " and ".join(bounds)]))
 
 
