@@ -213,11 +213,11 @@ class OutputError(RemodelError):
     exit_code = BAD_ENVIRONMENT
 
 
-def _say(text: str) -> None:
+def _say(*lines: object) -> None:
     if not interrupts.is_first_rank():
         return
     try:
-        print(text, flush=True)
+        print(*lines, sep="\n", flush=True)
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python will flush once more
         if not isinstance(error, BrokenPipeError):  # whoever read the output has seen enough
@@ -327,7 +327,7 @@ def _status(options: argparse.Namespace) -> None:
     """Say where the run in DIR is, how fast it is, and whether it is alive."""
     from remodel_fenicsx.results.status import status
 
-    _say("\n".join(map(printable, status(options.folder))))
+    _say(*map(printable, status(options.folder)))
 
 
 @command(
@@ -345,7 +345,7 @@ def _report(options: argparse.Namespace) -> None:
     from remodel_fenicsx.report import write_report
 
     written = write_report(options.folder, options.output)
-    _say(str(written))
+    _say(written)
     if options.open:
         import webbrowser  # slow to import, and seldom asked for
 
@@ -369,7 +369,7 @@ def _picture(options: argparse.Namespace) -> None:
     from remodel_fenicsx.pictures import Viewing, draw_picture
 
     viewing = Viewing(options.layers, options.cut, options.view)
-    _say(str(draw_picture(options.folder, options.time, viewing, options.output)))
+    _say(draw_picture(options.folder, options.time, viewing, options.output))
 
 
 @command(
@@ -388,7 +388,7 @@ def _animate(options: argparse.Namespace) -> None:
     from remodel_fenicsx.pictures import Viewing, draw_animation
 
     viewing = Viewing(options.layers, options.cut, options.view)
-    _say(str(draw_animation(options.folder, options.frames, viewing, options.output)))
+    _say(draw_animation(options.folder, options.frames, viewing, options.output))
 
 
 @command("revolve artery", RUN_FOLDER, alone=True)
@@ -396,7 +396,7 @@ def _revolve(options: argparse.Namespace) -> None:
     """Write the fields of a reduced run in DIR on the whole body, for ParaView."""
     from remodel_fenicsx.results.whole_body import revolve
 
-    _say("\n".join(map(str, revolve(options.folder))))
+    _say(*revolve(options.folder))
 
 
 @command(
@@ -415,7 +415,7 @@ def _export(options: argparse.Namespace) -> None:
     """Write the fibres of the run in DIR for FEBio, Abaqus, ParaView or as a table."""
     from remodel_fenicsx.results.export import export
 
-    _say(str(export(options.folder, options.format, options.output, options.time)))
+    _say(export(options.folder, options.format, options.output, options.time))
 
 
 @command(
@@ -454,7 +454,7 @@ def _wall(options: argparse.Namespace) -> None:
         lines = write_wall(
             options.surface, path, options.thickness, options.layers or (), options.size, options.through
         )
-    _say("\n".join(lines))
+    _say(*lines)
 
 
 @command("validate artery.toml", SCENE_AND_CHANGES)
@@ -466,7 +466,7 @@ def _validate(options: argparse.Namespace) -> None:
     if interrupts.is_first_rank():
         unseen, warnings = _unseen_files(scene), scene.warnings()
     _say(f"{options.file}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
-    _say("\n".join([scene.summary(), *explained(scene), scene.formulation_in_words()]))
+    _say(scene.summary(), *explained(scene), scene.formulation_in_words())
     if scene.profile is not None:
         _say(presets.profile_for(scene.profile, scene).in_words(scene.profile))
     for warning in warnings:

@@ -5,4 +5,4 @@ from remodel_fenicsx.scene.scene import Scene, preset_scene, read_scene, scene_f
 from remodel_fenicsx.schema.tables import SceneError
 
 __all__ = ["Scene", "SceneError", "preset_scene", "read_scene", "scene_from_dict"]
-Scene.rules = RULES  # they know the class
+Scene._rules = RULES  # they know the class

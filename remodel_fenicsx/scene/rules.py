@@ -252,7 +252,7 @@ def weights_and_factors(scene: Scene) -> Faults:
 def coupling_and_mean(scene: Scene) -> Faults:
     """What the coupling and the mean over load cases ask of the rest."""
     remodeling, coupling = scene.remodeling, COUPLINGS[scene.remodeling.coupling]
-    if (missing := coupling.missing(scene)) is not None:
+    if missing := coupling.missing and coupling.missing(scene):
         yield f"needs {missing}", "remodeling.coupling", remodeling.coupling
     if remodeling.mean != "tensor" and not scene.cases:
         yield "needs [[cases]]", "remodeling.mean", remodeling.mean

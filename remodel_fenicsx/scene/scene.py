@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, BeforeValidator, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
+from pydantic import BaseModel, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, choice
@@ -209,12 +209,6 @@ FORGOTTEN_AFTER = (
 # ---------------------------------------------------------------- the scene
 
 
-def _name(value: object) -> object:
-    if not isinstance(value, str) or not re.fullmatch(r"\w(?:[\w .+-]{0,98}[\w+-])?", value):
-        raise fault("must be a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first")
-    return value
-
-
 class Scene(Table):
     """A whole scene: all keys above the first table, and the tables.
 
@@ -246,12 +240,16 @@ class Scene(Table):
     remodel_fenicsx.schema.tables.SceneError: remodeling.kappa = -1.0: must be a finite number at least 0
     """
 
-    rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
+    _rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
     """Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none."""
-    name: Annotated[str, BeforeValidator(_name)] = Field(
-        default="scene", json_schema_extra={"allowed": "a file name without a path"}
+    name: str = Field(
+        default="scene",
+        pattern=r"^\w(?:[\w .+-]{0,98}[\w+-])?$",
+        json_schema_extra={
+            "allowed": "a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first"
+        },
     )
     """Name of the scene and of its results folder. Default: the name of the file without `.toml`."""
     preset: Annotated[str | None, OneOf(presets.PRESETS)] = None
@@ -314,13 +312,13 @@ class Scene(Table):
         _check_name("profile", profile, presets.PROFILES)
         return _with_profile(profile, made)
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         """What its tables do not bear of each other, once numbers of experiments are those of the model."""
         whole = presets.with_own_numbers(self, Scene.whole)
         over = partial(Region.over, others=whole.whole())
         regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
         self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
-        for rule in self.rules:
+        for rule in self._rules:
             yield from rule(self)
 
     @property

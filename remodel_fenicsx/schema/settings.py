@@ -102,7 +102,7 @@ class Mesh(Table):
         f"needs 'displacement'. {meanings(FORMULATIONS)} (docs/what_may_go_wrong.md).",
     )
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         pair = self.element, self.degree
         if self.formulation != AUTO and not FORMULATIONS[self.formulation].has(*pair):
             able = named(FORMULATIONS, lambda formulation: formulation.has(*pair))
@@ -139,7 +139,7 @@ class Support(Table):
     """For 'elastic': stiffness across N over stiffness along N. Below 0.5 a wall that has grown may twist. With 0 a
     tube may be solved on one radius, which cannot twist."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if self.kind == "elastic" and self.stiffness is None:
             yield "missing; a support of kind 'elastic' needs it, as in '10 kPa/mm'", "stiffness", None
 
@@ -281,7 +281,7 @@ class Prestretch(Table):
     radial: float | None = Field(default=None, gt=0)
     """Stretch across the wall."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if not _set(self):
             yield "needs one of " + ", ".join(type(self).model_fields), "", self
 
@@ -309,7 +309,7 @@ class NaturalLayer(_From):  # type: ignore[misc]
     prestretch: Prestretch
     """Stretches from the layer's natural state to the unloaded body."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         low, high = self.share
         if not low < high:
             yield f"must be smaller than to = {shown(high)}", "from", low
@@ -351,7 +351,7 @@ class Natural(Table):
         """Whether the mesh is free of stress."""
         return self.opening_angle == 0.0 and not self.layers and not self.fibres
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         for (_, other), (index, layer) in itertools.combinations(enumerate(self.layers), 2):
             if (layer.region is None) != (other.region is None):
                 rule = "some layers have a region and some a share of the wall: allowed is one kind"
@@ -421,7 +421,7 @@ class Cells(Table):
     """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It stays in the repulsive
     energy while the cells remodel."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if (rule := self.fault_of_length()) is not None:
             yield rule, "initial", self.initial
 
@@ -451,11 +451,6 @@ class Cells(Table):
         elif self.initial == "aligned":
             lengths = [r0 if axis == self.aligned_axis else 0.0 for axis in (1, 2, 3)]
         return np.tile(np.array(lengths), (number_of_elements, 1))
-
-
-def _nothing_is_missing(scene: object) -> str | None:
-    """Of scenes as they are."""
-    return None
 
 
 @dataclass(frozen=True)
@@ -505,7 +500,7 @@ class CouplingKind:
     takes_cases: bool = False
     takes_turnover: bool = False
     solves_cells: bool = False
-    missing: Callable[[Any], str | None] = _nothing_is_missing
+    missing: Callable[[Any], str | None] | None = None
 
     @property
     def make(self) -> Callable[..., Any]:
@@ -613,7 +608,7 @@ class Turnover(_WithStart):  # type: ignore[misc]
         """Whether there is any."""
         return self.time is not None
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if self.time is None and self != Turnover.model_construct():
             yield "missing; turnover needs its time", "time", None
 
@@ -751,7 +746,7 @@ class Remodeling(Table):
         """Whether exponent or threshold is another than the paper's."""
         return self.exponent != 2.0 or self.threshold != 0.0
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         law, driver, coupling = LAWS[self.law], DRIVERS[self.driver], COUPLINGS[self.coupling]
         able = named(LAWS, lambda law: law.takes_set_points)
         for key, plain in (("exponent", 2), ("threshold", 0)):
@@ -863,22 +858,10 @@ def _set(table: Table) -> dict[str, object]:
 # ---------------------------------------------------------------- loads and time
 
 
-def _later_and_later(ramp: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    """A fault names the entry."""
-    for index, (time, _) in enumerate(ramp):
-        if time < 0:
-            raise fault("must be at least 0, where the simulation starts", f"[{index}][0]", time)
-        if index and time <= ramp[index - 1][0]:
-            rule = f"must be later than the time {shown(ramp[index - 1][0])} of the entry before"
-            raise fault(rule, f"[{index}][0]", time)
-    return ramp
-
-
 Ramp = Annotated[
     tuple[Annotated[tuple[float, float], IN_A_LIST], ...],
     IN_A_LIST,
     Field(min_length=1),
-    AfterValidator(_later_and_later),
 ]
 
 
@@ -901,7 +884,13 @@ class Load(Table):
     face: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"})
     """For a further load of a body of your own: the face that it acts on."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
+        for index, (time, _) in enumerate(self.ramp):
+            if time < 0:
+                yield "must be at least 0, where the simulation starts", f"ramp[{index}][0]", time
+            if index and time <= self.ramp[index - 1][0]:
+                rule = f"must be later than the time {shown(self.ramp[index - 1][0])} of the entry before"
+                yield rule, f"ramp[{index}][0]", time
         for given, missing in (("kind", "face"), ("face", "kind")):
             if getattr(self, given) is not None and getattr(self, missing) is None:
                 yield f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None
@@ -985,7 +974,7 @@ class Time(Table):
     that of lengths (1 degree stands for 1.7 %; docs/theory.md, Error-controlled steps). With end = 'equilibrium'
     the default is 3 degrees, or 0.5 where a load falls."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         if self.is_equilibrium:
             return
         if self.step > self.end:
@@ -1036,18 +1025,6 @@ class Time(Table):
 # ---------------------------------------------------------------- solver and output
 
 
-def _are_options(options: dict[str, str | float | bool]) -> dict[str, str | float | bool]:
-    """A fault names the option."""
-    for name, value in options.items():
-        if not re.fullmatch(r"[A-Za-z]\w*", name):
-            raise fault("not a PETSc option; write its name without the leading '-'", quoted(name), value)
-        if name in ("snes_rtol", "snes_atol", "snes_stol"):
-            raise fault("has no effect; use solver.relative_tolerance, solver.absolute_tolerance", name, value)
-        if refused := fault_of_option(name, value):
-            raise fault(refused, name, value)
-    return options
-
-
 class Solver(Table):
     """Solution of the nonlinear problem of each step.
 
@@ -1093,14 +1070,22 @@ class Solver(Table):
     unstable: Literal["warn", "stop"] = "warn"
     """What to do at an equilibrium that the body would leave. 'warn': say where, and go on. 'stop': look in every step,
     and end the run after the last stable one (exit code 3)."""
-    petsc_options: Annotated[dict[str, str | bool | int | float], AfterValidator(_are_options)] = Field(
+    petsc_options: dict[str, str | bool | int | float] = Field(
         default_factory=dict,
         json_schema_extra={"allowed": "a table with a string, a finite number, true or false for each option"},
     )
     """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_... and mat_.... Options
     that run code or write files are refused."""
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
+        for name, value in self.petsc_options.items():
+            key = f"petsc_options.{quoted(name)}"
+            if not re.fullmatch(r"[A-Za-z]\w*", name):
+                yield "not a PETSc option; write its name without the leading '-'", key, value
+            if name in ("snes_rtol", "snes_atol", "snes_stol"):
+                yield "has no effect; use solver.relative_tolerance, solver.absolute_tolerance", key, value
+            if refused := fault_of_option(name, value):
+                yield refused, key, value
         if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
             yield "must be greater than 0 where absolute_tolerance is 0", "relative_tolerance", 0.0
 
@@ -1122,12 +1107,6 @@ ALL_FIELDS = (*FIELDS_BY_NAME, *CONSTANT_FIELDS)
 _FieldName = Annotated[str, OneOf(ALL_FIELDS)]
 
 
-def _increasing(times: tuple[float, ...]) -> tuple[float, ...]:
-    if any(later <= time for time, later in itertools.pairwise(times)):
-        raise fault("times must increase")
-    return times
-
-
 class Output(Table):
     """What a run writes beside its history table."""
 
@@ -1144,7 +1123,7 @@ class Output(Table):
     measured, with time and loads."""
     every: int = Field(default=1, ge=1)
     """Write the fields of every n-th step, and of the last one."""
-    times: Annotated[tuple[Annotated[float, Field(gt=0)], ...], IN_A_LIST, AfterValidator(_increasing)] = Field(
+    times: Annotated[tuple[Annotated[float, Field(gt=0)], ...], IN_A_LIST] = Field(
         default=(), json_schema_extra={"allowed": "a list of increasing times above 0"}
     )
     """Times up to time.end that have a row and fields in any case. They must be multiples of time.step; with
@@ -1154,3 +1133,7 @@ class Output(Table):
     checkpoint: int | None = Field(default=None, ge=0)
     """Number of steps between two checkpoints; 0 means only at the end. Without it at most 10 minutes are lost, and
     checkpoints cost less than 5 % of the run."""
+
+    def _faults(self) -> Faults:
+        if any(later <= time for time, later in itertools.pairwise(self.times)):
+            yield "times must increase", "times", self.times

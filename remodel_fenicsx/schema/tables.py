@@ -95,13 +95,13 @@ class Table(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
-    def faults(self) -> Faults:
+    def _faults(self) -> Faults:
         """What does not fit together in its keys: what is allowed, the key and its value."""
         yield from ()
 
     @model_validator(mode="after")
     def _has_none(self) -> Self:
-        for broken in self.faults():
+        for broken in self._faults():
             raise fault(*broken)
         return self
 
@@ -451,8 +451,12 @@ def allowed(field: FieldInfo) -> str:
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
     nouns: dict[object, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
-    limits = [(word, getattr(entry, name, None)) for entry in field.metadata for name, word in words.items()]
-    bounds = [f"{word} {limit}" for word, limit in limits if limit is not None]
+    bounds = [
+        f"{word} {getattr(entry, name)}"
+        for entry in field.metadata
+        for name, word in words.items()
+        if hasattr(entry, name)
+    ]
     return " ".join(filter(None, [f"must be {nouns[_kind(field)]}", " and ".join(bounds)]))
 
 
