@@ -165,8 +165,9 @@ def render(job: Job) -> list[Pixels]:
         # the backend of a notebook is one that only its kernel may know
         environment = environment_of_child() | {"PYVISTA_OFF_SCREEN": "true", "MPLBACKEND": "agg"}
         # Python looks for modules where it is started, which must not be anybody's folder
-        silent: Any = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
-        child = subprocess.run(command, env=environment, cwd=folder, **silent)
+        child = subprocess.run(
+            command, env=environment, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True
+        )
         result = file.with_suffix(".npy")
         if child.returncode != 0 or not result.exists():
             said = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"

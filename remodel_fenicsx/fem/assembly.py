@@ -167,7 +167,7 @@ def over_ranks(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
 
 def integral(form: Form) -> float:
     """Value of a compiled form without arguments, over all ranks. Collective."""
-    return float(over_ranks(form.mesh.comm, np.real(dolfinx.fem.assemble_scalar(form)), MPI.SUM))
+    return float(form.mesh.comm.allreduce(np.real(dolfinx.fem.assemble_scalar(form)), MPI.SUM))
 
 
 def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:

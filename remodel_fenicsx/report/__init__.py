@@ -24,7 +24,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.shape import Column, columns_of_region
@@ -446,7 +446,7 @@ def _family(name: str) -> str:
     return "_".join([first, *others[:1]]) if len(others) > 1 else first
 
 
-def _finite(values: NDArray[np.floating[Any]] | np.floating[Any]) -> object:
+def _finite(values: ArrayLike) -> object:
     """Nested lists of numbers with 7 digits; None where there is none."""
     if isinstance(values, np.ndarray):
         return [*map(_finite, values)]

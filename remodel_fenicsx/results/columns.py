@@ -242,16 +242,20 @@ class Measurement:
         deformed
             Whether by the deformed area.
         """
-        return self._over_face(face, deformed, nodal_values) / self.face_area(face, deformed)
+        weighted, area = self._over_face(face, deformed, nodal_values, 1.0)
+        return weighted / area
 
     def face_area(self, face: str, deformed: bool = False) -> float:
         """Reference or deformed area of a named face."""
-        return self._over_face(face, deformed, 1.0)
+        return self._over_face(face, deformed, 1.0)[0]
 
-    def _over_face(self, face: str, deformed: bool, nodal_values: Array | float) -> float:
+    def _over_face(self, face: str, deformed: bool, *nodal_values: Array | float) -> list[float]:
         field, form = self.tool((face, deformed), lambda: _face_form(self, face, deformed))
-        field.x.array.reshape(-1, field.function_space.dofmap.index_map_bs)[:, 0] = nodal_values
-        return integral(form)
+        at_nodes, found = field.x.array.reshape(-1, field.function_space.dofmap.index_map_bs)[:, 0], []
+        for values in nodal_values:
+            at_nodes[:] = values
+            found.append(integral(form))
+        return found
 
     def end_force(self, face: str) -> EndForce:
         """Of a tube whose inner face has this name, at the end z = length."""

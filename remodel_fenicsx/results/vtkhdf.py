@@ -45,7 +45,7 @@ _OF_TOPOLOGY = ("Steps/CellOffsets", "Steps/ConnectivityIdOffsets")
 _ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
 # of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
 # floats become smaller by a fifth only, and a step would take twice as long
-_COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+_COMPRESSION: dict[str, object] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
 class PatientFile(io.FileIO):

@@ -14,7 +14,7 @@ from functools import cached_property, partial
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -346,7 +346,7 @@ def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scen
     return scene.model_copy(update={"loads": loads}).with_values(changes)
 
 
-class Kept(dict[Any, tuple[Simulation, Snapshot]]):
+class Kept(dict[object, tuple[Simulation, Snapshot]]):
     """Simulations on the way, which nobody hears: they stay, and get other numbers where a scene differs in no more."""
 
     def __init__(self, keys: tuple[str, ...]):
@@ -530,7 +530,7 @@ class LostProcess(RemodelError):  # noqa: N818
     exit_code = BAD_ENVIRONMENT
 
 
-Task = Callable[[Problem], Any]
+Task = Callable[[Problem], "OptimizeResult"]
 
 
 @dataclass(frozen=True)
@@ -550,7 +550,7 @@ class Part(Run):
         worker.begin([PART, str(file)], self.beside(".txt"))
 
     @property
-    def answer(self) -> Any:
+    def answer(self) -> OptimizeResult:
         """What its process has left."""
         return pickle.loads(self.beside(".pickle").read_bytes())
 
@@ -558,7 +558,7 @@ class Part(Run):
 class _FitStudy(Study):
     """Parts of a fit, side by side."""
 
-    def answers(self, problem: Problem, place: Path, tasks: Mapping[str, Task]) -> list[Any]:
+    def answers(self, problem: Problem, place: Path, tasks: Mapping[str, Task]) -> list[OptimizeResult]:
         """What the tasks make of the problem, which then knows what was evaluated for them."""
         parts = [Part(name, self.scene, self.folder / name, (problem, task)) for name, task in tasks.items()]
         self.runs = [*parts]
@@ -696,7 +696,7 @@ def result_of(problem: Problem, found: Sequence[OptimizeResult]) -> Fit:
     return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
 
 
-def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Task]], list[Any]]) -> Fit:
+def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Task]], list[OptimizeResult]]) -> Fit:
     """The fit with profiles of what goes together: the others are fitted again at each value."""
     best, ends = found.logarithms, problem.bounds.T
     least, near = float(np.sum(problem.residuals(best) ** 2)), (best, problem.jacobian(best, central=True))

@@ -309,7 +309,7 @@ class Study:
     ):
         self.name, self.scene, self.jobs, self.quiet = name, scene, jobs or cores(), quiet
         self.folder = Path(folder or Path("results") / f"{scene.name}-{name}")
-        self.runs: list[Any] = [Run(run, changed, self.folder / run) for run, changed in scenes.items()]
+        self.runs = [Run(run, changed, self.folder / run) for run, changed in scenes.items()]
         self.failed: dict[str, str] = {}
         self.deadline = math.inf
         self._waiting: list[Run] = []
