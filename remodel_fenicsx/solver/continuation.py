@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import dolfinx.fem
 import numpy as np
@@ -18,6 +17,7 @@ from petsc4py import PETSc
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.fem.assembly import over_ranks
 from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import attempted
@@ -324,6 +324,6 @@ class Blend:
         return (1.0 - done) * quadrature.minimum(room)
 
 
-def shares(old: UnitCell, new: UnitCell, theta: Any) -> list[UnitCell]:
+def shares(old: UnitCell, new: UnitCell, theta: UflOrArray) -> list[UnitCell]:
     """(1 - theta) of an old cell and theta of a new one, UFL or arrays."""
     return [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Any
 
 import dolfinx.fem
 import numpy as np
@@ -53,7 +52,7 @@ class Inertia:
     def __init__(self, equilibrium: Equilibrium):
         self.equilibrium = equilibrium
         self._tangent: PETSc.Mat | None = None
-        self._symmetric: Any = None
+        self._symmetric: PETSc.Mat = None
         self._factorised: PETSc.Mat | None = None
         self._factorisation: PETSc.PC | None = None
         self._is_unsymmetric = False

@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -98,12 +98,12 @@ class KeptFactor:
     comm: Comm = PETSc.COMM_SELF
 
     def __init__(self) -> None:
-        self.preconditioner: Any = None
+        self.preconditioner: PETSc.PC = None
         self._options: ProblemOptions | None = None
         self._kind = ""
         self._takes_single = kernels.is_available()
         self._single: kernels.SingleFactor | None = None
-        self._soft: Any = None  # the softest motion that is known: a vector of length one
+        self._soft: PETSc.Vec = None  # the softest motion that is known: a vector of length one
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """PETSc asks for y, the inverse of the kept tangent times x; NaN where there is none: the solve then fails."""
@@ -214,10 +214,10 @@ class GatheredFactor:
 
     def __init__(self, comm: Comm):
         self.comm, self.first = comm, KeptFactor()
-        self._whole: Any = None  # a matrix of all ranks, whose rows and columns are the first one's
-        self._scatter: Any = None
-        self._right: Any = None  # of the first rank; empty on others
-        self._answer: Any = None
+        self._whole: PETSc.Mat = None  # a matrix of all ranks, whose rows and columns are the first one's
+        self._scatter: PETSc.Scatter = None
+        self._right: PETSc.Vec = None  # of the first rank; empty on others
+        self._answer: PETSc.Vec = None
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """As of `KeptFactor`. Collective."""
