@@ -131,7 +131,7 @@ class FileBody(WithRegions, FromFile):
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"}
     )
     """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
-    `.stl`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."""
+    `.stl`, `.ply`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."""
     tags: str | None = Field(
         default=None,
         min_length=1,
