@@ -897,9 +897,9 @@ class Load(Table):
 
     def factor(self, time: float) -> float:
         """Factor on the value at a time: piecewise linear, held before the first and after the last pair."""
-        hit = next((corner for corner, _ in self.ramp if math.isclose(time, corner)), time)  # exact at its own times
         times, factors = zip(*self.ramp, strict=True)
-        return float(np.interp(hit, times, factors))
+        hits = [corner for corner in times if math.isclose(time, corner)]  # exact at its own times
+        return float(np.interp(hits[0] if hits else time, times, factors))
 
     @property
     def falls(self) -> bool:
