@@ -76,6 +76,9 @@ def _faces(value: Any) -> Any:
     return found
 
 
+Groups = Annotated[dict[str, Names], BeforeValidator(_faces), Field(json_schema_extra=_GROUPS)]
+
+
 def _files(value: Any) -> list[str]:
     """Paths of a mesh and of its surfaces, of one or a list; nothing where they are none."""
     mesh, *surfaces = value if isinstance(value, (list, tuple)) and value else [value]
@@ -143,15 +146,11 @@ class FileBody(WithRegions, FromFile):
         default=None, json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))}
     )
     """Unit of the numbers in the file, where it differs from `length_unit`."""
-    faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={}, json_schema_extra=_GROUPS
-    )
+    faces: Groups = {}
     """Names of faces, each with the name or number of a face in the file, or a list of them:
     `inner`, `outer`, `inlet` and `outlet` where the file has other names, and more for supports
     and loads. A surface of its own is a face too: `{ file = "lumen.vtp" }`."""
-    regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={}, json_schema_extra=_GROUPS
-    )
+    regions: Groups = {}
     """Names of regions, each with the name or number of a volume in the file, or a list of
     them. Default: the names in the file."""
     open_boundary: bool = False
@@ -352,18 +351,20 @@ class FileBody(WithRegions, FromFile):
             key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
             if face not in domain.faces:
                 raise SceneError(f"{key}: the body has no such face; it has {', '.join(domain.faces)}")
-            if load == "displacement" and kind not in HELD_ACROSS:
-                able = " or ".join(map(repr, HELD_ACROSS))
-                raise SceneError(f"{key}: its support ({kind!r}) lets it move; a face that is displaced must be {able}")
-            if load == "displacement" and domain.boundary.goes_around(face):  # type: ignore[attr-defined]
-                raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
-            if load == "displacement" and face in moved:
-                raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
-            if load == "pressure" and kind in HELD_ACROSS:
+            if load == "displacement":
+                if kind not in HELD_ACROSS:
+                    able = " or ".join(map(repr, HELD_ACROSS))
+                    rule = f"its support ({kind!r}) lets it move; a face that is displaced must be {able}"
+                    raise SceneError(f"{key}: {rule}")
+                if domain.boundary.goes_around(face):  # type: ignore[attr-defined]
+                    raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
+                if face in moved:
+                    raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
+                moved[face] = name
+            elif kind in HELD_ACROSS:
                 raise SceneError(
                     f"{key}: its support ({kind!r}) takes all of the pressure; allowed are faces that move"
                 )
-            moved |= {face: name} if load == "displacement" else {}
 
     def hold_faces(
         self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]

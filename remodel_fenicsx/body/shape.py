@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
@@ -203,8 +204,9 @@ COLUMNS: dict[str, Column] = {
 """Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
 
 
-def _turned_over(name: str, m: Any) -> float:
-    return float(m.observer.stepper.part("turnover").mean(name))
+def _of_turnover(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
+    """Make a column of a function of `evolution.turnover.Turnover`."""
+    return Column(name, unit, meaning, lambda m: float(value(m.observer.stepper.part("turnover"))), by_case=False)
 
 
 COLUMNS_ON_REQUEST: dict[str, Column] = {
@@ -239,12 +241,11 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             by_case=False,
         ),
         *(
-            Column(
+            _of_turnover(
                 name,
                 "",
                 f"{what} of the collagen over that at the start, volume mean; with remodeling.turnover",
-                partial(_turned_over, name),
-                by_case=False,
+                methodcaller("mean", name),
             )
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
         ),
@@ -255,19 +256,17 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio),
             by_case=False,
         ),
-        Column(
+        _of_turnover(
             "collagen_share",
             "",
             "share of the tissue's volume that is collagen, mean over the volume at the start",
-            lambda m: m.observer.stepper.part("turnover").collagen_share(),
-            by_case=False,
+            methodcaller("collagen_share"),
         ),
-        Column(
+        _of_turnover(
             TURNOVER_POWER,
             "stress length^3 / time",
             "power that turnover releases at the F of the row, without growth",
-            lambda m: m.observer.stepper.part("turnover").power(),
-            by_case=False,
+            methodcaller("power"),
         ),
         Column(
             "processor_seconds",

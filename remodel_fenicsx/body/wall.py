@@ -45,9 +45,8 @@ class Wall(NamedTuple):
 
     def nodes(self, degree: int) -> Array:
         """Radii of the nodes of elements of this degree, equally spaced within a layer."""
-        layers = zip(itertools.pairwise(self.radii), self.counts, strict=True)
-        parts = [np.linspace(a, b, degree * count + 1) for (a, b), count in layers]
-        return np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
+        ends = degree * np.cumsum([0, *self.counts])
+        return np.interp(np.arange(ends[-1] + 1), ends, self.radii)
 
     def marked(self, domain: Domain) -> Domain:
         """The domain with its layers as regions: an element is where the middle of its radii is."""
@@ -102,29 +101,6 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
 # G leads from where the tissue is free of stress to the mesh.
 
 
-def tube_layers(wall: Wall, natural: Natural, tissues: Mapping[str, Tissue]) -> list[Any]:
-    """Of a round wall: where tissue or prestretch change."""
-    from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
-
-    inner, outer = wall.radii[0], wall.radii[-1]
-    edges = set(wall.radii)
-    for layer in natural.layers:
-        edges |= {inner + share * (outer - inner) for share in layer.share}
-    apart = [a for a, b in itertools.pairwise(sorted(edges)) if b - a > 1e-9 * outer] + [outer]
-    found = []
-    for low, high in itertools.pairwise(apart):
-        middle = (low + high) / 2
-        region = wall.names[int(np.searchsorted(wall.radii[1:-1], middle))]
-        share = (middle - inner) / (outer - inner)
-        of_layer = [
-            layer.prestretch.stretches
-            for layer in natural.layers
-            if (layer.share[0] <= share < layer.share[1] if layer.region is None else layer.region == region)
-        ]
-        found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
-    return found
-
-
 def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array:
     """Circumferential, axial and radial stretch of the layers at the points, (elements, points, 3)."""
     depth = local_axes.depth
@@ -169,15 +145,11 @@ def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str =
                 if configuration
                 else f"{ANGLE_IN} {words}"
             ),
-            partial(_of, mean, name),
+            lambda m, mean=mean: mean(m, getattr(m, name)),  # type: ignore[misc]
             by_case=bool(configuration),
         )
         for where, (words, mean) in means.items()
     )
-
-
-def _of(mean: AngleOf, name: str, m: Any) -> float:
-    return mean(m, getattr(m, name))
 
 
 STRESSES = {"hoop": ("around", 0), "axial": ("along", 1), "radial": ("across", 2)}
@@ -192,7 +164,7 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ..
             "stress",
             f"Cauchy stress {direction} the deformed wall, "
             + (FITTED_TO_FACE if where in FACES else f"mean over the elements of `fibre_angle_{where}`"),
-            partial(_stress_at_face, where, component) if where in FACES else partial(_stress, mean, component),
+            partial(_stress, where, mean, component),
         )
         for name, (direction, component) in STRESSES.items()
         for where, (_, mean) in means.items()
@@ -205,10 +177,6 @@ def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column
     return (*itertools.chain(*angles), *stress_columns(means), *Walled.columns_on_request)
 
 
-def _stress(mean: AngleOf, component: int, m: Any) -> float:
-    return mean(m, m.wall_stress[..., component])
-
-
 FACES = ("inner", "outer")
 FITTED_TO_FACE = (
     "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
@@ -217,8 +185,10 @@ ON_THE_FACE = 1e-6  # normalised depth: rounding of coordinates
 SECOND_LAYER = 1.5  # layers: deeper than this the third begins, and the second begins above
 
 
-def _stress_at_face(face: str, component: int, m: Any) -> float:
-    return float(m.tool_of_step(("stress at", face), lambda: _fitted_to_face(face, m))[component])
+def _stress(where: str, mean: AngleOf, component: int, m: Any) -> float:
+    if where in FACES:
+        return float(m.tool_of_step(("stress at", where), lambda: _fitted_to_face(where, m))[component])
+    return mean(m, m.wall_stress[..., component])
 
 
 def _fitted_to_face(face: str, m: Any) -> Array:
@@ -253,10 +223,6 @@ def _fitted_to_face(face: str, m: Any) -> Array:
     return np.linalg.solve(normal, right)[0]
 
 
-def _in_region(name: str) -> AngleOf:
-    return lambda m, values: m.quadrature.mean_of_known(values, m.elements_of_region(name))
-
-
 class Walled(Shape):
     """A body with a wall: angles are those in it, and a scene may give it `natural.layers`.
 
@@ -289,7 +255,8 @@ class Walled(Shape):
     @classmethod
     def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
         """Stresses in the wall."""
-        return stress_columns({name: (f"of the region `{name}`", _in_region(name))})
+        words = f"of the region `{name}`"
+        return stress_columns({name: (words, lambda m, v: m.quadrature.mean_of_known(v, m.elements_of_region(name)))})
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Angle of the chain direction in the wall, degrees, (...,): circumferential 0, axial 90, NaN across."""
@@ -304,8 +271,31 @@ class RoundWall(Walled, WithRegions, Unloads):
     """A wall between two radii that numbers describe: regions are layers that fill it, it may close from a sector."""
 
     @abstractmethod
+    def wall(self, elements: int, regions: Mapping[str, Region]) -> Wall:
+        """Return its wall with so many elements through it."""
+
     def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
-        """Where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
+        """Return where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
+        from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
+
+        wall = self.wall(len(regions), regions)
+        inner, outer = wall.radii[0], wall.radii[-1]
+        edges = set(wall.radii)
+        for layer in natural.layers:
+            edges |= {inner + share * (outer - inner) for share in layer.share}
+        apart = [a for a, b in itertools.pairwise(sorted(edges)) if b - a > 1e-9 * outer] + [outer]
+        found = []
+        for low, high in itertools.pairwise(apart):
+            middle = (low + high) / 2
+            region = wall.names[int(np.searchsorted(wall.radii[1:-1], middle))]
+            share = (middle - inner) / (outer - inner)
+            of_layer = [
+                layer.prestretch.stretches
+                for layer in natural.layers
+                if (layer.share[0] <= share < layer.share[1] if layer.region is None else layer.region == region)
+            ]
+            found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
+        return found
 
     def fills(self, regions: Collection[str]) -> bool:
         """The outermost ends at the outer radius."""
