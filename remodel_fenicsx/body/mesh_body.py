@@ -26,13 +26,23 @@ from remodel_fenicsx.body.mesh_file import (
     of_gmsh,
     read_mesh,
 )
-from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
+from remodel_fenicsx.body.shape import (
+    Column,
+    Columns,
+    FromFile,
+    LoadKind,
+    Loads,
+    Supports,
+    Unloads,
+    WithRegions,
+    cauchy_columns,
+)
 from remodel_fenicsx.body.wall import AngleOf, Walled, angle_columns, columns_on_request
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
 
@@ -317,7 +327,7 @@ class FileBody(WithRegions, FromFile):
         """Refuse faces that cannot be those of the body. On rank 0."""
 
     # ------------------------------------------------------------ supports
-    def supports_of(self, supports: Mapping[str, Support]) -> dict[str, Support]:
+    def supports_of(self, supports: Supports) -> dict[str, Support]:
         """Those of a scene, and others that the body has where it says nothing."""
         return dict(supports)
 
@@ -333,11 +343,11 @@ class FileBody(WithRegions, FromFile):
         """Whether they are all volumes of the file."""
         return bool(regions) and set(self._regions(self._mesh())) <= set(regions)
 
-    def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
+    def held_faces(self, supports: Supports) -> list[str]:
         """All but those that are free."""
         return [face for face, support in self.supports_of(supports).items() if support.kind != "free"]
 
-    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+    def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
         """Whether they are there, the body cannot move as a whole, and no support takes all of a pressure."""
         for name in supports:
             if name not in domain.faces:
@@ -366,9 +376,7 @@ class FileBody(WithRegions, FromFile):
                     f"{key}: its support ({kind!r}) takes all of the pressure; allowed are faces that move"
                 )
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
+    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
         """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective."""
         from remodel_fenicsx.body.mesh_domain import GUIDE, add_support
 
@@ -429,8 +437,8 @@ class WalledMesh(Walled):
     Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
     """
 
-    columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
-    columns_on_request: ClassVar[tuple[Column, ...]] = columns_on_request(MEANS_ON_A_MESH)
+    columns: ClassVar[Columns] = angle_columns(MEANS_ON_A_MESH)
+    columns_on_request: ClassVar[Columns] = columns_on_request(MEANS_ON_A_MESH)
     axis_kinds = ("local", "global")
     constant_fields = CONSTANT_FIELDS
     defaults = {"cells": {"axes": "local"}}
@@ -508,7 +516,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
                 "lost there; try mesh.refinement = 2"
             )
 
-    def supports_of(self, supports: Mapping[str, Support]) -> dict[str, Support]:
+    def supports_of(self, supports: Supports) -> dict[str, Support]:
         """Inlet and outlet are guided."""
         return {"inlet": Support(), "outlet": Support()} | dict(supports)
 

@@ -38,6 +38,10 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.loading import Loading
     from remodel_fenicsx.fem.quadrature import Quadrature
 
+Regions = Mapping[str, Region]
+Supports = Mapping[str, Support]
+Loads = Mapping[str, Load]
+
 
 # ---------------------------------------------------------------- the columns of a history
 # Those of every shape, those on request, and which a scene has.
@@ -103,6 +107,9 @@ class Column:
         """
         name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
         return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
+
+
+Columns = tuple[Column, ...]
 
 
 # ---------------------------------------------------------------- the fibre angle through a body, whatever the mesh
@@ -288,7 +295,7 @@ def columns_of(
     regions: Iterable[str] = (),
     cases: int = 1,
     held: Iterable[str] = (),
-) -> tuple[Column, ...]:
+) -> Columns:
     """The columns of a shape's history, in the order of the file, those on request last.
 
     Where some of the others are requested too, only they are there, with time and loads.
@@ -534,8 +541,8 @@ class Shape(_Is):  # type: ignore[misc]
     """
 
     loads: ClassVar[dict[str, LoadKind]]
-    columns: ClassVar[tuple[Column, ...]]
-    columns_on_request: ClassVar[tuple[Column, ...]] = ()
+    columns: ClassVar[Columns]
+    columns_on_request: ClassVar[Columns] = ()
     angle_layers: ClassVar[dict[str, float]] = {}
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
@@ -667,16 +674,16 @@ class Shape(_Is):  # type: ignore[misc]
             On all ranks, if Gmsh fails.
         """
 
-    def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+    def build_with(self, regions: Regions, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the body with the regions of a scene, where the scene draws them. Collective."""
         return self.build(mesh, comm)
 
-    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+    def region_depths(self, regions: Regions) -> dict[str, tuple[float, float]]:
         """Where regions that lie one behind the other begin and end in `depth`; empty where they do not."""
         return {}
 
     @classmethod
-    def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
+    def region_columns_on_request(cls, name: str) -> Columns:
         """Further columns that a scene may name of its region `name`."""
         return ()
 
@@ -711,7 +718,7 @@ class Shape(_Is):  # type: ignore[misc]
             if name in loads if loads is not None else known:
                 kind.add(self, loading, name)
 
-    def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
+    def held_faces(self, supports: Supports) -> list[str]:
         """Faces whose supports are `[supports.NAME]`, and none of the shape's own.
 
         Parameters
@@ -736,7 +743,7 @@ class Shape(_Is):  # type: ignore[misc]
         """
         return cls.loads
 
-    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+    def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
         """Refuse supports of, and loads on, faces of a mesh that cannot have them. Collective.
 
         Parameters
@@ -752,9 +759,7 @@ class Shape(_Is):  # type: ignore[misc]
             On all ranks; one line that names the key.
         """
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
+    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
         """Hold faces as `[supports.NAME]` says.
 
         Parameters
@@ -820,7 +825,7 @@ class WithRegions(Shape):
     ['tube', 'mesh', 'solid']
     """
 
-    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+    def check_regions(self, regions: Regions, mesh: Mesh) -> None:
         """Refuse what the regions of a scene ask of the body and it cannot have, with the key.
 
         Parameters
@@ -867,7 +872,7 @@ def axial_dead_force(face: str) -> LoadKind:
     )
 
 
-def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
+def uniaxial_columns(top: str, length: str) -> Columns:
     """Columns of a body that is pulled along z: its stretches and its mean fibre angle.
 
     Parameters
@@ -917,7 +922,7 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
     )
 
 
-def cauchy_columns(*names: str) -> tuple[Column, ...]:
+def cauchy_columns(*names: str) -> Columns:
     """Columns of Cauchy's stress, volume means: of "x" the normal one along x, of "xy" the shear stress.
 
     Parameters

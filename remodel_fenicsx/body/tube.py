@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,7 +15,8 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body import reductions as reduced
-from remodel_fenicsx.body.shape import Column, End, LoadKind, Shape, check_lengths
+from remodel_fenicsx.body.reductions import ReducedScene
+from remodel_fenicsx.body.shape import Column, End, LoadKind, Loads, Regions, Shape, Supports, check_lengths
 from remodel_fenicsx.body.wall import (
     FACES,
     AngleOf,
@@ -27,9 +28,9 @@ from remodel_fenicsx.body.wall import (
     columns_on_request,
 )
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
-from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
+from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import Array, Integers
-from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support
+from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 
@@ -46,7 +47,7 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 # ---------------------------------------------------------------- what stands for all of a tube
 
 
-def build_in_half_plane(dimension: int, scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
+def build_in_half_plane(dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """Mesh the wall on the x axis (1) or in the half-plane y = 0, x > 0 (2), with the body's elements there."""
     from remodel_fenicsx.body.domain import lattice_domain
 
@@ -66,14 +67,14 @@ def build_in_half_plane(dimension: int, scene: reduced.ReducedScene, comm: MPI.I
     return wall.marked(lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm))
 
 
-def build_quarter(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
+def build_quarter(scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The body's elements with x > 0 and y > 0; one layer along z where all sections are alike."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)
     return whole_tube(scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1)
 
 
-def layers(scene: reduced.ReducedScene) -> int:
+def layers(scene: ReducedScene) -> int:
     """Elements of a quarter along z: one where nothing but u_z depends on z, which is linear in it."""
     alike = reduced.free_ends(scene) is None and reduced.same_cells(scene) is None
     return 1 if alike else PAPER[2] * scene.mesh.refinement
@@ -102,7 +103,7 @@ def _in_layers(points: Array, elements: Integers) -> reduced.Body:
     return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
 
 
-def springs_across(scene: reduced.ReducedScene) -> str | None:
+def springs_across(scene: ReducedScene) -> str | None:
     """Springs along the wall pull its sections out of their planes."""
     for face, support in scene.supports.faces.items():
         if support.tangential:
@@ -110,7 +111,7 @@ def springs_across(scene: reduced.ReducedScene) -> str | None:
     return None
 
 
-def mirrored_draws(scene: reduced.ReducedScene) -> str | None:
+def mirrored_draws(scene: ReducedScene) -> str | None:
     """Random cells of the quarter stand for those of the whole tube in the mean alone, and nearly."""
     if reduced.drawn_once(scene) is None:
         return None
@@ -362,9 +363,7 @@ class Tube(RoundWall):
     length: Annotated[float, LENGTH] = Field(gt=0)
     """Length along z, in the scene's unit of length."""
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
+    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
         """Springs of what surrounds it."""
         for face, support in supports.items():
             from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # which few tubes need
@@ -373,7 +372,7 @@ class Tube(RoundWall):
             if loading.kinematics.moves_rigidly:
                 warn_of_twist(face, support, loading.domain.comm)
 
-    def wall(self, elements: int, regions: Mapping[str, Region]) -> Wall:
+    def wall(self, elements: int, regions: Regions) -> Wall:
         """Return its wall with so many elements through it."""
         return Wall.of(self.inner_radius, self.outer_radius, elements, regions)
 
@@ -402,15 +401,15 @@ class Tube(RoundWall):
         """The paper's 16 elements around, 8 through the wall and 12 along, times the refinement."""
         return self.build_with({}, mesh, comm)
 
-    def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+    def build_with(self, regions: Regions, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The same with the scene's layers: as many elements, equally thick in each layer, none in two."""
         return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm, regions)
 
-    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+    def check_regions(self, regions: Regions, mesh: Mesh) -> None:
         """Regions are layers of the wall, from the lumen outwards by their outer radii."""
         check_layers(self.inner_radius, self.outer_radius, _counts(mesh)[1], regions)
 
-    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+    def region_depths(self, regions: Regions) -> dict[str, tuple[float, float]]:
         """Of the layers, from the inside outwards."""
         wall = self.wall(len(regions), regions)
         places = ((np.array(wall.radii) - wall.radii[0]) / np.ptp(wall.radii)).tolist()
@@ -486,7 +485,7 @@ class Tube(RoundWall):
 
 def whole_tube(
     shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None,
-    regions: Mapping[str, Region] | None = None, quarters: int = 4,
+    regions: Regions | None = None, quarters: int = 4,
 ) -> Domain:  # fmt: skip
     """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective."""
     # The nodes lie exactly on the radii, equally spaced through each layer; some are on the positive and negative x and

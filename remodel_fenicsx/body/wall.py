@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.shape import Column, Shape, Unloads, WithRegions
+from remodel_fenicsx.body.shape import Column, Columns, Regions, Shape, Unloads, WithRegions
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.model.energy import Tissue
@@ -36,7 +36,7 @@ class Wall(NamedTuple):
     counts: tuple[int, ...]
 
     @classmethod
-    def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> Wall:
+    def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> Wall:
         """The wall of a scene's regions with so many elements through it, as many as layers or more."""
         order = sorted(regions, key=lambda name: _outer(regions[name], outer_radius)) or ["body"]
         inside = [_outer(regions[name], outer_radius) for name in order[:-1]]
@@ -71,7 +71,7 @@ def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> None:
+def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> None:
     """Refuse regions that are no layers of the wall between two radii with so many elements through it."""
     # A layer is at least as thick as Gmsh can mesh (`length_fault`).
     seen: dict[float, str] = {}
@@ -133,7 +133,7 @@ CONFIGURATIONS = {
 """Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
 
 
-def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str = "") -> tuple[Column, ...]:
+def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str = "") -> Columns:
     """Of the cells' own configuration, or of another one of `CONFIGURATIONS`."""
     name = f"fibre_angle_{configuration}" if configuration else "fibre_angle"
     return tuple(
@@ -156,7 +156,7 @@ STRESSES = {"hoop": ("around", 0), "axial": ("along", 1), "radial": ("across", 2
 """Components of Cauchy's stress in the wall, by name: their direction, and where `Measurement.wall_stress` has them."""
 
 
-def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
     """Cauchy's stress in the wall: at its faces, and means where the angles are."""
     return tuple(
         Column(
@@ -171,7 +171,7 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ..
     )
 
 
-def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
     """Of a body with these means: angles in other configurations, stresses, and what all walls have."""
     angles = (angle_columns(means, name) for name in CONFIGURATIONS)
     return (*itertools.chain(*angles), *stress_columns(means), *Walled.columns_on_request)
@@ -235,7 +235,7 @@ class Walled(Shape):
     ['tube', 'mesh']
     """
 
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
+    columns_on_request: ClassVar[Columns] = (
         Column(
             "radial_share",
             "",
@@ -253,7 +253,7 @@ class Walled(Shape):
     angle_in_words = ("around", "along")
 
     @classmethod
-    def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
+    def region_columns_on_request(cls, name: str) -> Columns:
         """Stresses in the wall."""
         words = f"of the region `{name}`"
         return stress_columns({name: (words, lambda m, v: m.quadrature.mean_of_known(v, m.elements_of_region(name)))})
@@ -271,10 +271,10 @@ class RoundWall(Walled, WithRegions, Unloads):
     """A wall between two radii that numbers describe: regions are layers that fill it, it may close from a sector."""
 
     @abstractmethod
-    def wall(self, elements: int, regions: Mapping[str, Region]) -> Wall:
+    def wall(self, elements: int, regions: Regions) -> Wall:
         """Return its wall with so many elements through it."""
 
-    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
+    def layers_of_tissue(self, natural: Natural, regions: Regions, tissues: Mapping[str, Tissue]) -> Any:
         """Return where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
         from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
 
