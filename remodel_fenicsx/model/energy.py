@@ -155,7 +155,7 @@ MATRICES: dict[str, Term] = {"neo-hookean": neo_hookean}
 F = I. Formulations other than "displacement" require a `Matrix`."""
 
 
-# ---------------------------------------------------------------- the repulsion: W_rep = -c/2 g(r0) M
+# ---------------------------------------------------------------- repulsion: W_rep = -c/2 g(r0) M
 # The repulsion makes the unloaded tissue stress-free. M has several forms. `axes` is the paper's
 # (eq. 4c) and depends on the axes of a cell. `log` depends only on the structure tensor A = sum_I
 # l_I^2 n_I (x) n_I. It equals `axes` if C and the cell are coaxial, is isotropic for isotropic

@@ -74,7 +74,7 @@ class Drive(NamedTuple):
         Contribution of a stress's rounding to the noise, in the unit of the tensor; (n,) or a
         number.
     exponent, least_tension
-        Arguments of `tensor_law.target` and `tensor_law.awake`.
+        Exponent of `tensor_law.target`, and threshold of the activation.
     parameters
         Values of the law's additional parameters (`Law.parameters`) by name.
 
@@ -121,7 +121,7 @@ class Drive(NamedTuple):
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
-    """Return the cells of the relaxed structure tensor A = A_old + factor (A_new - A_old)."""
+    """Return cells of the relaxed structure tensor A = A_old + factor (A_new - A_old)."""
     # The dimensions are the square roots of the eigenvalues of A, the axes its eigenvectors, in the
     # order of the new axes that they continue. If eigenvalues agree, the new axes decide. The
     # factor is (n,) or a number; the number 1 returns the new cells unchanged.
@@ -335,7 +335,8 @@ def _turn_towards(fibre: Array, goal: Array, relative_step: float) -> Array:
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.einsum("na,na->n", fibre, goal))
     turn = angle - angle_left(angle, relative_step)
-    return across * np.divide(turn, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]  # 0: parallel
+    # The sine is zero if fibre and goal are parallel.
+    return across * np.divide(turn, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]
 
 
 def angle_left(angle: Array, relative_step: float) -> Array:
@@ -374,12 +375,12 @@ def turned_in_part(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
 
 
 def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """Return the cells unchanged."""
+    """Return cells unchanged, without remodeling."""
     return cells
 
 
 def tensor_target(drive: Drive) -> tensor_law.Target:
-    """Return the target of the structure tensor (`tensor_law.target`, `tensor_law.awake`)."""
+    """Return the target of the structure tensor, with a switch reduced below the threshold."""
     found = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
         return found

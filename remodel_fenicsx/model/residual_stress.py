@@ -96,7 +96,7 @@ class Panels:
         return found
 
 
-# ---------------------------------------------------------------- the natural configuration of a tube
+# ---------------------------------------------------------------- natural configuration of a tube
 # A sector, whose layers may be prestretched before they are joined, closes to a ring of known
 # radii. In cylindrical axes
 #     G = diag(k r/R, g_z, dr/dR) P,    k = 360/(360 - opening angle),
@@ -323,7 +323,8 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
 
     knots = np.concatenate([edges[:1], np.repeat(edges, 2), edges[-1:]])
     spline = BSpline(knots, np.eye(len(knots) - 3), 2)
-    functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]  # zero at the lumen
+    # The functions are zero at the lumen.
+    functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]
     depth, steepness, inner = rings.radius - edges[0], np.ones_like(rings.radius), edges[0]
     axial: Array | float = 1.0
     k = 1.0

@@ -210,7 +210,8 @@ def _length(vectors: Array) -> Array:
 def _normalised(vectors: Array) -> Array:
     """Return unit vectors (..., 3); zero vectors stay zero."""
     largest = _largest(vectors)
-    vectors = vectors / np.where(largest > 0.0, largest, 1.0)[..., None]  # squares must not overflow
+    # Scaled, because squares must not overflow.
+    vectors = vectors / np.where(largest > 0.0, largest, 1.0)[..., None]
     length = _length(vectors)
     return vectors / np.where(length > 0.0, length, 1.0)[..., None]
 
