@@ -1,4 +1,4 @@
-"""A scene brought to life: builds the parts in their order and steps them through time."""
+"""Simulation of a scene: construction of its components, and time stepping."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TIME_ERROR = "time_error"  # the column
 
 
 class Simulation:
-    """Everything that a scene needs, built and ready to step.
+    """Simulation of a scene, ready for time stepping.
 
     Parameters
     ----------
@@ -40,26 +40,27 @@ class Simulation:
     comm
         MPI communicator of the mesh.
     domain
-        A mesh of the scene's body to take in place of the one that the scene asks for.
+        Mesh of the scene's body in place of the mesh that the scene specifies.
     coupling
-        Makes a coupling in place of the one that the scene names.
+        Factory of a coupling in place of the coupling that the scene names.
 
     Attributes
     ----------
     domain, unknown, quadrature, cells, loading, state, tissue, stepper, observer
-        The parts, each usable by itself (see demos/).
+        Components of the simulation, each usable alone (see demos/).
     way
-        Goes through time: in steps of one length, in chosen ones where the scene has a tolerance, or until all rests.
+        Time stepping strategy: constant steps, adaptive steps if the scene has a tolerance, or
+        steps to the steady state.
     watchers
-        Who follows its steps, in their order: the stability of equilibria, the observer, and those of
-        `extend.WATCHERS`; what they remember is part of the state.
+        Watchers of the steps, in order: stability of equilibria, the observer, and those of
+        `extend.WATCHERS`. Their records belong to the state.
 
     Raises
     ------
     SceneError
         If `domain` is not a mesh of the scene's body and elements.
     TypeError
-        If `scene` is none.
+        If `scene` is not a `Scene`.
 
     Examples
     --------
@@ -70,7 +71,7 @@ class Simulation:
     ...     print(step.time, round(step.row["mean_stretch"], 3))
     1.0 1.081
     2.0 1.172
-    >>> simulation.cells.dimension_values.shape  # l_I of this rank, (elements, points, 3), in link lengths
+    >>> simulation.cells.dimension_values.shape  # l_I of this rank, (elements, points, 3)
     (1, 8, 3)
     >>> simulation.close()
     """
@@ -95,19 +96,32 @@ class Simulation:
         self.watchers = watchers(self.scene, parts)
 
     def load_values(self, time: float, case: int = 0) -> LoadValues:
-        """Magnitude of every load at a time, in a load case; the first is 0."""
+        """Return the magnitudes of all loads at a time.
+
+        Parameters
+        ----------
+        time
+            The time.
+        case
+            Index of the load case; 0 is the first.
+        """
         return values_of_loads(list(self.scene.each_case())[case].loads, time)
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """Solve and remodel step by step, from where the state is; what is yielded has been accepted.
+        """Solve and remodel from the present state, and yield each accepted step.
 
-        The row and the fields belong to the solved state. With the couplings "staggered" and "relaxed" the cells seen
-        at a yield are one pass ahead of them (docs/theory.md, Couplings).
+        The row and the fields belong to the solved state. With the couplings "staggered" and
+        "relaxed" the cells at a yield are one pass ahead of them (docs/theory.md, Couplings).
 
         Parameters
         ----------
         watchers
-            Who else follows the steps; those who watch the stability and fill each step's row come first.
+            Additional watchers; those of the simulation come first.
+
+        Yields
+        ------
+        Step
+            The accepted steps.
 
         Raises
         ------
@@ -125,7 +139,7 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Parts:
-    """What a scene needs: its choices made, the mesh, and who goes through time; the state is the stepper's."""
+    """Components of a simulation: resolved scene, mesh, stepper, observer and time stepping."""
 
     scene: Scene
     domain: Domain
@@ -135,12 +149,12 @@ class Parts:
 
 
 def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: Maker | None = None) -> Parts:
-    """The parts of a scene in their order. Collective."""
+    """Build the components of a scene in their order. Collective."""
     scene, domain = meshed(scene, comm, domain)
     fibres = measured_fibres(scene, domain)
     state, *others = initial_states(scene, domain, fibres)
     if others and coupling is not None:
-        raise SceneError("cases: a coupling of your own solves one load case; leave out [[cases]]")
+        raise SceneError("cases: a custom coupling solves one load case; remove [[cases]]")
     tissue, kappa = parameters_of(scene.properties(), domain)
     solver, (first, *more) = _solver(scene), (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, first, coupling, kappa)
@@ -156,7 +170,8 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
 
 
 def _solver(scene: Scene) -> Solver:
-    """Its settings; a prediction costs more than it gives where neither a tolerance nor rest asks for exact rows."""
+    """Return the solver settings, without a predictor if it costs more time than it saves."""
+    # A predictor helps only if a tolerance or the steady state requires accurate rows.
     solver, time = scene.solver, scene.time
     if solver.predictor == "with-tolerance" and time.tolerance is None and not time.is_equilibrium:
         return solver.model_copy(update={"predictor": "none"})
@@ -164,16 +179,17 @@ def _solver(scene: Scene) -> Solver:
 
 
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
-    """Its settings; on a path to rest through random cells no step is short enough, and passes swing."""
+    """Return the remodeling settings; the path to a steady state with random cells is relaxed."""
+    # No step is small enough to resolve changes of order of random cells, and passes oscillate.
     if not (scene.time.is_equilibrium and scene.has_random_cells and scene.jumps_by_rank):
         return scene.remodeling
     if comm.rank == 0:
-        log.info("the path to the equilibrium takes the coupling 'relaxed': random cells swing from rank to rank")
+        log.info("the path to the equilibrium takes the coupling 'relaxed': random cells oscillate")
     return scene.remodeling.model_copy(update={"coupling": "relaxed"})
 
 
 def _way(scene: Scene, stepper: Stepper) -> Way:
-    """Who goes through time: in steps of one length, in chosen ones, or until all rests."""
+    """Return the time stepping: constant steps, adaptive steps, or steps to the steady state."""
     time, stops = scene.time, scene.stops()
     if not (time.is_equilibrium or time.chooses or TIME_ERROR in scene.output.columns):
         return FixedSteps(stepper, time.end, time.step)
@@ -195,7 +211,7 @@ def _way(scene: Scene, stepper: Stepper) -> Way:
 
 
 def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
-    """Who follows the steps, in their order: a row has the eigenvalues, and warnings come after it."""
+    """Return the watchers in order: eigenvalues before the row, warnings after the row."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
     found: list[Watcher | None] = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
@@ -209,11 +225,12 @@ def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
 
 
 def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
-    """From its start, with other numbers of tissue, kappa, loads and opening angle of its scene; whether it can."""
+    """Reset a simulation with new numbers of its scene; return False if it must be rebuilt."""
+    # The numbers are those of tissue, kappa, loads and opening angle.
     tissue, kappa = parameters_of(scene.properties(), simulation.domain)
     known, stepper, kinematics = simulation.stepper.tissue.parameters, simulation.stepper, simulation.state.kinematics
     varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
-    # by who knows numbers
+    # Adaptive time stepping, growth and the stability check hold numbers of the scene.
     chosen = not isinstance(simulation.way, FixedSteps)
     watched = chosen or kinematics.grows or scene.solver.unstable == "stop"
     if watched or any(varies[name] and not isinstance(known[name], Function) for name in varies):
