@@ -134,8 +134,8 @@ class Coupling(Protocol):
 
     `RemodelingPass.apply` and `replace` change the cells and compute the power. Values that carry
     over from step to step belong to the state (`State.remember`, `state.Numbers`). The coupling
-    calls `before`, `settle` in equilibrium, and `after` of all that remodels in addition to the
-    cells (`RemodelingPass.beside`).
+    calls `before`, `settle` in equilibrium, and `after` of the remodeling processes in addition to
+    the cells (`RemodelingPass.beside`).
 
     Attributes
     ----------
@@ -260,7 +260,7 @@ class Staggered:
             part.before(time, self.traits.order)
 
     def balanced(self, time: float, loads: LoadValues, again: bool = False) -> Work:
-        """Solve for equilibrium with the remodeled values, and call `settle` of all objects.
+        """Solve for equilibrium with remodeled values; call `settle` of remodeling processes.
 
         Parameters
         ----------
@@ -436,7 +436,7 @@ class Extrapolated(Staggered):
 
     @property
     def better(self) -> UnitCell:
-        """Cells by the targets at both ends of the step; by the end target in a first step."""
+        """Cells by the targets at both ends of the step, or only by the first target of a point."""
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
         mean = known(self._older).towards(self._found, weight).where(self._begins, self._found)
         return self.remodeling.followed(mean, self._duration, self._start)

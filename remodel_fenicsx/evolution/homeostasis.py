@@ -118,7 +118,7 @@ class Homeostasis:
         return work
 
     def _rest_before(self, held: float, change: float, work: Work) -> None:
-        """Integrate to the steady state under constant loads, then start what waits for it."""
+        """Integrate to the steady state under constant loads, then start waiting processes."""
         stops = [*(stop for stop in self.plan.stops if stop <= held), self.plan.stops[-1]]
         control = self.control.with_stops(stops)
         with self.stepper.holding(held):
@@ -174,7 +174,7 @@ class Homeostasis:
         return max(part.left(soon, residual) for part in self.remodels)
 
     def _is_over(self, left: float, waiting: float) -> bool:
-        """Return whether the path ends: in equilibrium, or because it is not reached."""
+        """Return whether the path ends, because of equilibrium or because there is none."""
         if left <= REST:
             return True
         if without := [text for part in self.remodels if (text := part.without_rest(waiting))]:
@@ -227,7 +227,7 @@ class Homeostasis:
         return False
 
     def _to_the_limit(self, time: float, residual: float) -> list[Array]:
-        """Return the changes to the limit of all that remodels."""
+        """Return the changes to the limit of all remodeling processes."""
         return [part.to_the_limit(time, 1 / self.stepper.slowest, residual) for part in self.remodels]
 
     def _size(self, changes: Sequence[Array]) -> float:
@@ -263,7 +263,7 @@ class Homeostasis:
             log.log(level, text, *values)
 
     def remodel(self, time: float) -> float:
-        """Log the distance of the cells from those of their own stress; return no power."""
+        """Log the distance to the cells of the row's own stress, fronts, and slack regions."""
         self.remodeling.look_ahead(time, self._residual)
         quadrature, r0 = self.quadrature, float(
             assembly.largest(self.stepper.tissue.end_to_end_length, self.quadrature.mesh)

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 Values: TypeAlias = Any  # type: ignore[explicit-any]
-"""Values at all points of something that remodels; its class defines the type."""
+"""Values of a remodeling process at all points; its class defines the type."""
 
 
 class Remodels:
-    """Base class of what remodels in a step; a subclass overrides the methods that it needs.
+    """Base class of a remodeling process; a subclass overrides the methods that it needs.
 
     Values are flattened over the quadrature points, with a type that the subclass defines. As
     components they are an array (n, components) whose differences are meaningful.
@@ -46,7 +46,8 @@ class Remodels:
 
     Examples
     --------
-    demos/extensions/decaying_collagen.py has a complete example. All that remodels in a simulation:
+    demos/extensions/decaying_collagen.py has a complete example. The remodeling processes of a
+    simulation:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> [part.name for part in Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.remodels]
@@ -133,4 +134,4 @@ class Remodels:
         return ""
 
     def rested(self, time: float) -> None:
-        """Start at a time what waits for the steady state."""
+        """Start at a time, if the process waits for the steady state."""

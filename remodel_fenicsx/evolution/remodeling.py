@@ -67,7 +67,7 @@ class RemodelingPass(Remodels):
         kappa: float | Function | None = None,
         beside: Sequence[Remodels] = (),
     ):
-        # `beside` has all that remodels in addition to the cells.
+        # `beside` has the remodeling processes in addition to the cells.
         self.state, self.settings, self.beside = state, settings, list(beside)
         self.quadrature = state.cells.quadrature
         # Drives of further load cases, which have the same cells.

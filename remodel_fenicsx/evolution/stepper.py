@@ -360,16 +360,16 @@ class Stepper(LoadCaseSolver):
 
     @property
     def remodels(self) -> list[Remodels]:
-        """All that remodels: the cells first, then `RemodelingPass.beside`."""
+        """Remodeling processes: the cells first, then `RemodelingPass.beside`."""
         return [self.remodeling, *self.remodeling.beside]
 
     def part(self, name: str) -> Any:  # type: ignore[explicit-any]  # the name tells the class
-        """Return the object that remodels under this name, or None.
+        """Return the remodeling process of this name, or None.
 
         Parameters
         ----------
         name
-            Name of the object, such as "turnover" (`Remodels.name`).
+            Name of the process, such as "turnover" (`Remodels.name`).
         """
         return next((part for part in self.remodels if part.name == name), None)
 

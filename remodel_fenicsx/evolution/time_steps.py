@@ -41,7 +41,7 @@ class Estimate:
     row: float
 
 
-AllValues = Sequence[Values]  # values of all that remodels, in order
+AllValues = Sequence[Values]  # values of all remodeling processes, in order
 
 
 class TimeError:
@@ -168,7 +168,7 @@ class TimeError:
 
     # ------------------------------------------------------------ distances
     def _apart(self, rows: AllValues, betters: AllValues) -> float:
-        """Return the largest distance over all that remodels, in degrees."""
+        """Return the largest distance over all remodeling processes, in degrees."""
         return max(part.apart(*pair) for part, *pair in zip(self.remodels, rows, betters, strict=True))
 
     def _strain(self, step: Step, remodeled: AllValues) -> tuple[float, bool]:
@@ -224,7 +224,7 @@ TELLING_ERROR = 1e-4  # smallest error over the tolerance that affects the next 
 
 
 class StepTooLongError(Exception):
-    """Rejected step, whose error exceeds the tolerance."""
+    """Step rejected because its error exceeds the tolerance."""
 
     def __init__(self, step: Step, duration: float, error: float):
         super().__init__(f"error of {error:g} times the tolerance")
@@ -325,7 +325,7 @@ class StepControl:
         return duration * min(most, max(SHRINKAGE, ratio))
 
     def _next(self, error: float, duration: float) -> float:
-        """Return the next step size; it changes only if the change is large."""
+        """Return the next step size, the present one within the deadband."""
         if self._rejected:
             return self._best(error, duration, 1.0)
         # A lagging error rises a second time after a larger step, by the same amount.

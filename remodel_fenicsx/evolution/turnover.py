@@ -98,7 +98,7 @@ class Growth:
 
 
 class Slowing:
-    """Monitor of rates: compares them with those after a quarter to a half of the time."""
+    """Monitor that compares a rate with the rate at a quarter to a half of the time."""
 
     INITIAL = dict.fromkeys(("early_time", "early_rate", "late_time", "late_rate"), 0.0)
 

@@ -7,7 +7,7 @@ eq.       content                                                where
 (3), (4)  W = W_iso + W_chn + W_rep                              `energy` (W is written only here)
 (5)       end-to-end length r from the cell's I_I = n_I . C n_I  `cells` (the unit cell), `energy`
 (6), (7)  Cauchy stress, by differentiation of W                 `energy`: `Tissue.stresses`
-(8)       principal values and axes of the driving tensor        `drivers` (tensor), `spectral` (axes)
+(8)       principal values and axes of the driving tensor        `drivers`, `spectral`
 (9)       n_I = the principal axes, l_I -> r0 e                  `drivers` (frames), `spectral`
 (10)      rate of l_I                                            `laws.rate`
 (11)      l_I in closed form                                     `laws.explicit`

@@ -70,8 +70,9 @@ class LocalAxes:
     >>> from remodel_fenicsx.extend import LocalAxes
     >>> tube = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
     >>> points = np.array([[2.0, 0.0, 4.0]])
-    >>> local = LocalAxes(points, axes=lambda: tube.axes_at(points), depth=lambda: tube.depth(points),
-    ...                   station=lambda: tube.station(points), nodal_depth=lambda: None)
+    >>> local = LocalAxes(points, axes=lambda: tube.axes_at(points),
+    ...                   depth=lambda: tube.depth(points), station=lambda: tube.station(points),
+    ...                   nodal_depth=lambda: None)
     >>> local.axes[0]  # circumferential, axial, radial
     array([[-0.,  1.,  0.],
            [ 0.,  0.,  1.],

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Driver:
-    """Driving tensor of the remodeling.
+    """Driving tensor, whose principal directions the cells follow.
 
     Attributes
     ----------

@@ -256,7 +256,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
 
 
 def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """Set axes to principal directions (eqs. 8, 9), change dimensions to r0 e (eqs. 10, 11)."""
+    """Set principal axes (eqs. 8 and 9), and move dimensions towards r0 e (eqs. 10 and 11)."""
     values, axes = principal_directions(drive, cells.axes, drive.pairing)
     direction, active = drive.kernels.positive_direction(values, threshold=drive.noise)
     target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
