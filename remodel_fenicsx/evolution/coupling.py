@@ -79,7 +79,7 @@ class Predictor:
 
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
         """Record the rate of a solved step from the unknowns before it, or of its first solve."""
-        speed: Array = (self.state.unknown.x.array - before) / step.duration
+        speed = np.asarray((self.state.unknown.x.array - before) / step.duration, dtype=np.float64)
         if again:
             self._speeds.values[0][:] += speed
             return

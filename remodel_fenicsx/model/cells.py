@@ -59,8 +59,8 @@ class UnitCell(NamedTuple):
         """
         if is_array(deformation_gradient):  # by component, three times as fast as np.einsum
             F, n = by_component(deformation_gradient), by_component(self.axes)
-            fibres = (F[:, 0] * n[i, 0] + F[:, 1] * n[i, 1] + F[:, 2] * n[i, 2] for i in range(3))
-            return [(fibre**2).sum(axis=0) for fibre in fibres]
+            along = [F[:, 0] * n[i, 0] + F[:, 1] * n[i, 1] + F[:, 2] * n[i, 2] for i in range(3)]
+            return [(fibre**2).sum(axis=0) for fibre in along]
         fibres = [ufl.dot(deformation_gradient, self.axes[i, :]) for i in range(3)]
         return [ufl.inner(fibre, fibre) for fibre in fibres]
 
