@@ -274,9 +274,8 @@ class Homeostasis:
         if jump > FRONT:
             self._say(
                 NOTICE,
-                "the cells have a front near %.4g, %.4g, %.4g: A differs by %.2g r0^2 between "
-                "neighbouring points. Its position depends on the load path, time.tolerance and "
-                "the mesh (docs/theory.md, Equilibrium at once)",
+                "the cells have a front near %.4g, %.4g, %.4g: A jumps by %.2g r0^2. Its position "
+                "depends on the load path, time.tolerance and the mesh (docs/theory.md)",
                 *place,
                 jump,
             )
@@ -285,7 +284,7 @@ class Homeostasis:
             self._say(
                 NOTICE,
                 "%.3g %% of the body carries no tension in equilibrium; the cells there depend on "
-                "the load path (docs/theory.md, Equilibrium at once)",
+                "the load path (docs/theory.md)",
                 100 * share,
             )
         return 0.0

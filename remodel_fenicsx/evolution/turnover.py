@@ -88,8 +88,8 @@ class Growth:
             # points.
             ratio = ratio - self.quadrature.beyond(self.quadrature.element_degree - 1, ratio[..., None])[..., 0]
         if (least := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
-            text = f"time {self.state.time:g}: tissue volume below {100 * LEAST_VOLUME:g} % of its " "initial value"
-            raise StepFailure(self.state.time, f"{text}: J_g = {least:.3g}", GONE)
+            text = f"time {self.state.time:g}: tissue volume below {100 * LEAST_VOLUME:g} %"
+            raise StepFailure(self.state.time, f"{text} of its initial value: J_g = {least:.3g}", GONE)
         self.set(ratio)
 
     def set(self, ratio: Array) -> None:
@@ -334,9 +334,7 @@ class GrowthWithoutRest(WarnsOnce):
         return (
             "turnover has not reached equilibrium: content or natural length change by up to "
             f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at "
-            f"{self.quadrature.shown_place_of_largest(rates)}, "
-            "and the rates have decayed no faster than 1/t since time "
-            f"{self.held_from + self._numbers['early_time']:g}. Growth is unbounded "
-            "(mechanobiological instability, docs/tissue_that_lives.md) or reaches equilibrium "
-            "much later; try a larger remodeling.turnover.gain"
+            f"{self.quadrature.shown_place_of_largest(rates)}, and the rates have decayed no "
+            f"faster than 1/t since time {self.held_from + self._numbers['early_time']:g} "
+            "(mechanobiological instability, docs/tissue_that_lives.md). Try a larger remodeling.turnover.gain"
         )
