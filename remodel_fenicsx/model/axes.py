@@ -91,8 +91,10 @@ class LocalAxes:
         thickness: Array | None = None,
         undefined: NDArray[np.bool_] | None = None,
     ):
-        self.coordinates, self.thickness, self.undefined = coordinates, thickness, undefined
-        self._axes, self._depth, self._station, self._nodal_depth = axes, depth, station, nodal_depth
+        self.coordinates = coordinates
+        self.thickness, self.undefined = thickness, undefined
+        self._axes, self._depth = axes, depth
+        self._station, self._nodal_depth = station, nodal_depth
 
     @cached_property
     def axes(self) -> Array:
@@ -137,13 +139,13 @@ def moved_axes(axes: Array, deformation_gradient: Array) -> Array:
     )
     radial = _unit(_cross(circumferential, axial))
     circumferential = _unit(circumferential)
-    found = [circumferential, _cross(radial, circumferential), radial]
-    return np.moveaxis(np.array(found), (0, 1), (-2, -1))
+    deformed = [circumferential, _cross(radial, circumferential), radial]
+    return np.moveaxis(np.array(deformed), (0, 1), (-2, -1))
 
 
-def _cross(one: list[Array], other: list[Array]) -> list[Array]:
+def _cross(first: list[Array], second: list[Array]) -> list[Array]:
     """Return the cross product of two vectors by component."""
-    return [one[j] * other[k] - one[k] * other[j] for j, k in ((1, 2), (2, 0), (0, 1))]
+    return [first[j] * second[k] - first[k] * second[j] for j, k in ((1, 2), (2, 0), (0, 1))]
 
 
 def _unit(vector: list[Array]) -> list[Array]:
@@ -172,35 +174,35 @@ def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:
         if values.shape[1] not in MEASURED[name]:
             numbers = " or ".join(map(str, MEASURED[name]))
             return f"{name} has {values.shape[1]} numbers in a row; must be {numbers}"
-        if not (fine := np.isfinite(values).all(axis=1)).all():
-            return _row(name, fine, "is not finite")
+        if not (valid := np.isfinite(values).all(axis=1)).all():
+            return _row(name, valid, "is not finite")
     (source,) = sources
-    for name, of in (("fibre_2", ("fibre",)), ("weight", ("fibre", "angle"))):
-        if name in measured and source not in of:
-            return f"has {name} with {source}; it belongs to {' or '.join(of)}"
+    for name, allowed in (("fibre_2", ("fibre",)), ("weight", ("fibre", "angle"))):
+        if name in measured and source not in allowed:
+            return f"has {name} with {source}; it belongs to {' or '.join(allowed)}"
     for name in ("fibre", "fibre_2"):
-        if name in measured and not (fine := (measured[name] != 0).any(axis=1)).all():
-            return _row(name, fine, "is the zero vector")
+        if name in measured and not (valid := (measured[name] != 0).any(axis=1)).all():
+            return _row(name, valid, "is the zero vector")
     weight = measured.get("weight", np.zeros((1, 1)))[:, 0]
-    if not (fine := (weight >= 0) & (weight <= 1)).all():
-        return _row("weight", fine, "is not from 0 to 1")
+    if not (valid := (weight >= 0) & (weight <= 1)).all():
+        return _row("weight", valid, "is not from 0 to 1")
     for name in ("content", "natural_length", GROWTH):
-        if name in measured and not (fine := measured[name][:, 0] > 0).all():
-            return _row(name, fine, "is not above 0")
+        if name in measured and not (valid := measured[name][:, 0] > 0).all():
+            return _row(name, valid, "is not above 0")
     if NATURAL_GRADIENT in measured:
-        if not (fine := np.linalg.det(measured[NATURAL_GRADIENT].reshape(-1, 3, 3)) > 0).all():
-            return _row(NATURAL_GRADIENT, fine, "has no determinant above 0")
+        if not (valid := np.linalg.det(measured[NATURAL_GRADIENT].reshape(-1, 3, 3)) > 0).all():
+            return _row(NATURAL_GRADIENT, valid, "has no determinant above 0")
     if source == "structure_tensor":
         eigenvalues = np.linalg.eigvalsh(_tensors(measured[source]))
         trace = eigenvalues.sum(axis=1)
-        if not (fine := (trace > 0) & (eigenvalues[:, 0] >= -FILE_ROUNDING * trace)).all():
-            return _row(source, fine, f"has eigenvalues {', '.join(f'{v:.3g}' for v in eigenvalues[~fine][0])}; "
+        if not (valid := (trace > 0) & (eigenvalues[:, 0] >= -FILE_ROUNDING * trace)).all():
+            return _row(source, valid, f"has eigenvalues {', '.join(f'{v:.3g}' for v in eigenvalues[~valid][0])}; "
                         "none may be below 0, nor all be 0")  # fmt: skip
     return None
 
 
-def _row(name: str, fine: NDArray[np.bool_] | np.bool_, what: str) -> str:
-    return f"{name} of row {int(np.argmin(fine)) + 1} {what}"
+def _row(name: str, valid: NDArray[np.bool_] | np.bool_, problem: str) -> str:
+    return f"{name} of row {int(np.argmin(valid)) + 1} {problem}"
 
 
 def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
@@ -212,10 +214,10 @@ def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
         first = np.cos(angle) * axes[..., 0, :] + np.sin(angle) * axes[..., 1, :]
     else:
         first = measured["fibre"]
-    others = _along(measured["fibre_2"]) if "fibre_2" in measured else np.eye(3) / 3
-    usual = np.full((*first.shape[:-1], 1), 0.5 if "fibre_2" in measured else 1.0)
-    weight = measured.get("weight", usual)[..., None]
-    return weight * _along(first) + (1 - weight) * others
+    remainder = _along(measured["fibre_2"]) if "fibre_2" in measured else np.eye(3) / 3
+    default_weight = np.full((*first.shape[:-1], 1), 0.5 if "fibre_2" in measured else 1.0)
+    weight = measured.get("weight", default_weight)[..., None]
+    return weight * _along(first) + (1 - weight) * remainder
 
 
 def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple[Array, Array]:
