@@ -153,17 +153,18 @@ def radial_share(dimensions: Array, axes: Array, local: Array) -> Array:
 
 def _local_components(dimensions: Array, axes: Array, local: Array) -> list[Array]:
     """Return the square roots of A_cc, A_aa and A_rr."""
-    l, n, d = by_component(dimensions, 1), by_component(axes), by_component(local)
+    l = by_component(dimensions, 1)
+    n, d = by_component(axes), by_component(local)
     # Explicit sums of three products give the same numbers with every BLAS.
     along = ([n[i, 0] * d[k, 0] + n[i, 1] * d[k, 1] + n[i, 2] * d[k, 2] for i in range(3)] for k in range(3))
     return [np.sqrt((l[0] * x) ** 2 + (l[1] * y) ** 2 + (l[2] * z) ** 2) for x, y, z in along]
 
 
-def by_component(values: Array, rank: int = 2) -> Array:
+def by_component(values: Array, order: int = 2) -> Array:
     """Move the components of vectors (..., 3) or tensors (..., 3, 3) to the front."""
     # Numpy is twice as fast over all points then.
-    last = tuple(range(-rank, 0))
-    return np.ascontiguousarray(np.moveaxis(values, last, range(rank)))
+    last = tuple(range(-order, 0))
+    return np.ascontiguousarray(np.moveaxis(values, last, range(order)))
 
 
 def angle_between(first: UnitCell, second: UnitCell) -> Array:
@@ -174,13 +175,14 @@ def angle_between(first: UnitCell, second: UnitCell) -> Array:
     # cosine of the angle out of the wall, and includes the change of that angle. To first order in
     # the change it is Bures' angle between A/tr A of both cells, ds^2 = sum_IJ
     # dA_IJ^2 / (a_I + a_J) / 2 in the axes of A with the principal values a.
-    share = first.dimensions / _norm(first.dimensions)[:, None]  # the roots of a_I
+    first_root = first.dimensions / _norm(first.dimensions)[:, None]  # the roots of a_I
     scaled = second.axes * (second.dimensions / _norm(second.dimensions)[:, None])[:, :, None]
-    root = np.swapaxes(second.axes, 1, 2) @ scaled
-    change = first.axes @ root @ np.swapaxes(first.axes, 1, 2) - share[:, :, None] * np.eye(3)
-    squared = share**2
-    both = squared[:, :, None] + squared[:, None, :]
-    weight = np.divide((share[:, :, None] + share[:, None, :]) ** 2, 2 * both, out=np.ones_like(both), where=both > 0)
+    second_root = np.swapaxes(second.axes, 1, 2) @ scaled
+    change = first.axes @ second_root @ np.swapaxes(first.axes, 1, 2) - first_root[:, :, None] * np.eye(3)
+    squared = first_root**2
+    sums = squared[:, :, None] + squared[:, None, :]
+    squares = (first_root[:, :, None] + first_root[:, None, :]) ** 2
+    weight = np.divide(squares, 2 * sums, out=np.ones_like(sums), where=sums > 0)
     chord = np.sqrt((weight * change**2).sum(axis=(1, 2)))
     return np.degrees(2 * np.arcsin(np.minimum(0.5 * chord, np.sqrt(0.5))))
 
