@@ -78,8 +78,8 @@ def rotated_back(F: Array, spatial_tensor: Array) -> Array:
     """Return R^T t R (n, 3, 3), R of F = R U; U S U / J for t = sigma, C for t = b; objective."""
     squared, basis = tensors.eigen(np.swapaxes(F, 1, 2) @ F)
     R = F @ (basis / np.sqrt(squared)[:, None, :]) @ np.swapaxes(basis, 1, 2)  # F U^-1
-    back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
-    return (back + np.swapaxes(back, 1, 2)) / 2
+    rotated: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
+    return (rotated + np.swapaxes(rotated, 1, 2)) / 2
 
 
 @dataclass(frozen=True)
