@@ -91,10 +91,10 @@ class Matrix:
         values
             Numbers, arrays or UFL by the names of `parameters`.
         """
-        found = copy.copy(self)
-        found.values, found.volumetric = values, partial(self.volumetric, **values)
-        found.others = tuple(partial(term, **values) for term in self.others)
-        return found
+        matrix = copy.copy(self)
+        matrix.values, matrix.volumetric = values, partial(self.volumetric, **values)
+        matrix.others = tuple(partial(term, **values) for term in self.others)
+        return matrix
 
     def __call__(self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray) -> UflOrArray:
         """Return the total energy of the matrix."""
@@ -113,8 +113,8 @@ class Matrix:
         lame_lambda, lame_mu
             Lame constants in the unit of stress.
         """
-        first, *rest = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
-        return sum(rest, first)
+        first, *remaining = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
+        return sum(remaining, first)
 
 
 def logarithmic_dilatation(
@@ -135,17 +135,21 @@ neo_hookean = Matrix(
 
 def mixed(matrices: Sequence[Matrix]) -> Matrix:
     """Combine matrices to one sum, weighted by its parameters share_0, share_1, ..."""
-    shares = [f"share_{number}" for number in range(len(matrices))]
+    names = [f"share_{number}" for number in range(len(matrices))]
     numbers = {name: number for matrix in matrices for name, number in matrix.parameters.items()}
-    numbers |= {share: Parameter(0.0, "1 in regions with this matrix, else 0.") for share in shares}
+    numbers |= {name: Parameter(0.0, "1 in regions with this matrix, else 0.") for name in names}
 
-    def parts(values: Mapping[str, UflOrArray]) -> Iterator[tuple[UflOrArray, UflOrArray]]:
-        for share, matrix in zip(shares, matrices, strict=True):
-            yield values[share], matrix.of({name: values[name] for name in matrix.parameters})
+    def weighted_matrices(values: Mapping[str, UflOrArray]) -> Iterator[tuple[UflOrArray, UflOrArray]]:
+        for key, matrix in zip(names, matrices, strict=True):
+            yield values[key], matrix.of({name: values[name] for name in matrix.parameters})
 
     return Matrix(
-        lambda J, lam, mu, **values: sum(share * matrix.volumetric(J, lam, mu) for share, matrix in parts(values)),
-        lambda F, lam, mu, **values: sum(share * matrix.distortional(F, lam, mu) for share, matrix in parts(values)),
+        lambda J, lam, mu, **values: sum(
+            weight * matrix.volumetric(J, lam, mu) for weight, matrix in weighted_matrices(values)
+        ),
+        lambda F, lam, mu, **values: sum(
+            weight * matrix.distortional(F, lam, mu) for weight, matrix in weighted_matrices(values)
+        ),
         parameters=numbers,
     )
 
@@ -238,10 +242,8 @@ def length_sum(
 def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
     """Return M = A : ln C of arrays; for complex F to first order in the imaginary part."""
     C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, whole_structure_tensor(cells)
-    found = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
-    return (
-        found + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2)) if np.iscomplexobj(C) else found
-    )
+    M = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
+    return M + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2)) if np.iscomplexobj(C) else M
 
 
 def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
@@ -253,8 +255,8 @@ def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Arr
     """Return dM/dC (n, 3, 3) and, if `second`, d^2M/dC^2 (n, 6, 6) of M = A : ln C."""
     values, vectors = tensors.eigen(C)
     components = tensors.rotated(A, vectors)
-    back = np.swapaxes(vectors, -1, -2)
-    first = tensors.rotated(tensors.first_divided_differences(values) * components, back)
+    transposed = np.swapaxes(vectors, -1, -2)
+    first = tensors.rotated(tensors.first_divided_differences(values) * components, transposed)
     if not second:
         return first, None
     rotation = tensors.congruence(vectors)
@@ -454,16 +456,16 @@ class Tissue:
     def parameters(self) -> dict[str, UflOrArray]:
         """All parameters by name, with those of turnover and additional ones."""
         turned_over = [name for name in TURNED_OVER if getattr(self, name) is not None]
-        found = {name: getattr(self, name) for name in (*PARAMETERS, *turned_over)}
-        for part in self._own_parameters.values():
-            found |= part
-        return found
+        values = {name: getattr(self, name) for name in (*PARAMETERS, *turned_over)}
+        for additional in self._own_parameters.values():
+            values |= additional
+        return values
 
     @property
     def _own_parameters(self) -> dict[str, Mapping[str, UflOrArray]]:
         """Additional parameters by component: chain, matrix or repulsion."""
         values = {name: getattr(getattr(self, name), "values", None) for name in ("chain", "matrix", "repulsion")}
-        return {name: own for name, own in values.items() if own}
+        return {name: bound for name, bound in values.items() if bound}
 
     def map(self, function: Callable[[str, UflOrArray], UflOrArray]) -> Tissue:
         """Return the tissue with function(name, value) in place of every parameter.
@@ -473,19 +475,20 @@ class Tissue:
         function
             Function of a parameter's name and value that returns the new value.
         """
-        found = {name: function(name, value) for name, value in self.parameters.items()}
-        own = {
-            part: getattr(self, part).of({name: found[name] for name in names})
-            for part, names in self._own_parameters.items()
+        values = {name: function(name, value) for name, value in self.parameters.items()}
+        components = {
+            component: getattr(self, component).of({name: values[name] for name in names})
+            for component, names in self._own_parameters.items()
         }
-        return replace(self, **{name: found[name] for name in found if name in PARAMETERS + TURNED_OVER}, **own)
+        own = {name: values[name] for name in values if name in PARAMETERS + TURNED_OVER}
+        return replace(self, **own, **components)
 
     def is_round(self) -> bool:
         """Return whether a rotation about z before the deformation keeps the matrix energy."""
         pulled, (c, s) = np.diag([1.1, 1.3, 1.2]), (0.8, 0.6)
-        turned = pulled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        found, again = (self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, turned))
-        return bool(np.isclose(found, again, rtol=1e-9))
+        rotated = pulled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        energy, rotated_energy = (self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, rotated))
+        return bool(np.isclose(energy, rotated_energy, rtol=1e-9))
 
     def strain_energy(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
         """Return W per reference volume (eqs. 3 and 4 with errata 1 and 2).
