@@ -334,22 +334,22 @@ def _turn_towards(fibre: Array, goal: Array, relative_step: float) -> Array:
     across = np.cross(fibre, goal)
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.einsum("na,na->n", fibre, goal))
-    turn = angle - angle_left(angle, relative_step)
+    increment = angle - angle_left(angle, relative_step)
     # The sine is zero if fibre and goal are parallel.
-    return across * np.divide(turn, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]
+    return across * np.divide(increment, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]
 
 
 def angle_left(angle: Array, relative_step: float) -> Array:
     """Return the root a of a + (dt/tau) sin a = angle after an implicit step; (n,) in [0, pi/2]."""
     # Newton's method starts from angle / (1 + dt/tau), which is below the root. The left side is
     # increasing and concave, so that the iterates approach the root from below.
-    left = np.asarray(angle / (1.0 + relative_step), dtype=np.float64)
+    remaining = np.asarray(angle / (1.0 + relative_step), dtype=np.float64)
     for _ in range(50):
-        missing = angle - left - relative_step * np.sin(left)
-        correction = missing / (1.0 + relative_step * np.cos(left))
-        left = np.asarray(left + correction, dtype=np.float64)
+        residual = angle - remaining - relative_step * np.sin(remaining)
+        correction = residual / (1.0 + relative_step * np.cos(remaining))
+        remaining = np.asarray(remaining + correction, dtype=np.float64)
         if np.all(correction <= 1e-15 * angle):
-            return left
+            return remaining
     raise FloatingPointError(f"no convergence of a step of {relative_step:g} rotation times")
 
 
@@ -370,8 +370,8 @@ def turned_in_part(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
     across = 0.5 * np.cross(old.axes, new.axes).sum(axis=1)  # sin(angle) times the axis
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, 0.5 * (np.einsum("nia,nia->n", old.axes, new.axes) - 1.0))
-    part = factor * np.divide(angle, sine, out=np.zeros_like(sine), where=sine > 0.0)
-    return UnitCell(new.dimensions, turned(old.axes, part[:, None] * across))
+    scale = factor * np.divide(angle, sine, out=np.zeros_like(sine), where=sine > 0.0)
+    return UnitCell(new.dimensions, turned(old.axes, scale[:, None] * across))
 
 
 def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
@@ -381,10 +381,10 @@ def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> Uni
 
 def tensor_target(drive: Drive) -> tensor_law.Target:
     """Return the target of the structure tensor, with a switch reduced below the threshold."""
-    found = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
+    target = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
-        return found
-    return found._replace(switch=found.switch * tensor_law.awake(drive.tensor, drive.least_tension))
+        return target
+    return target._replace(switch=target.switch * tensor_law.awake(drive.tensor, drive.least_tension))
 
 
 def follow_tensor(
@@ -530,9 +530,14 @@ class TurnoverRule(NamedTuple):
 
     def rates(self, tissue: Tissue, stretch: Array) -> TurnoverRates:
         """Return the rates at the stretch lambda_e (n,) of chains."""
-        chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+        chain = tissue.chain
+        r0, contour = tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
-        return self.followed.rates(self, lambda some: chain.stiffness(some * r0, contour) * some, stretch)
+        return self.followed.rates(
+            self,
+            lambda lambda_e: chain.stiffness(lambda_e * r0, contour) * lambda_e,
+            stretch,
+        )
 
     def at_length(self, tissue: Tissue, length: Array) -> TurnoverRates:
         """Return the rates at the length r (n,) of chains."""
@@ -544,26 +549,27 @@ class TurnoverRule(NamedTuple):
         # ln(g - g0/lambda^2)/d ln lambda at lambda_h, the slope for chains and repulsion together.
         # The parameters of the tissue must be numbers.
         deposited = self.deposition_stretch * (1.0 + 1j * COMPLEX_STEP)
-        chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+        chain = tissue.chain
+        r0, contour = tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
         secant = chain.stiffness(deposited * r0, contour)
-        both = secant - chain.stiffness(r0, contour) / deposited**2
-        what = secant * deposited**self.followed.power
-        steep, stiff = (float(np.log(some).imag) / COMPLEX_STEP for some in (what, both))
-        return self.gain * steep, stiff * self.time / (self.gain * steep - 2)
+        total_force = secant - chain.stiffness(r0, contour) / deposited**2
+        stimulus = secant * deposited**self.followed.power
+        stimulus_slope, force_slope = (float(np.log(value).imag) / COMPLEX_STEP for value in (stimulus, total_force))
+        return self.gain * stimulus_slope, force_slope * self.time / (self.gain * stimulus_slope - 2)
 
 
 def by_stress(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
     """Return the rates `cauchy`, which follow the stress of chains."""
 
-    def steepness(some: Array) -> Array:
-        return 1.0 + np.log(tension(some * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
+    def steepness(lambda_e: Array) -> Array:
+        return 1.0 + np.log(tension(lambda_e * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
 
-    steep = steepness(stretch)
+    slope = steepness(stretch)
     relative = tension(stretch) * stretch / (tension(rule.deposition_stretch) * rule.deposition_stretch)
     produced = 1.0 + rule.gain * (relative - 1.0)
     produced = np.maximum(produced, 0.0)
-    return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (steep * rule.time))
+    return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (slope * rule.time))
 
 
 def by_tension(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
