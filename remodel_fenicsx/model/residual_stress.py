@@ -59,9 +59,9 @@ class Panels:
         self.places[:, -1] = self.edges[1:]
         self._coefficients = np.linalg.inv(chebyshev.chebvander(points, degree))
         ones = np.eye(degree + 1)
-        slopes = np.stack([chebyshev.chebval(points, chebyshev.chebder(one)) for one in ones], axis=-1)
+        slopes = np.stack([chebyshev.chebval(points, chebyshev.chebder(unit)) for unit in ones], axis=-1)
         self._slope: Array = slopes @ self._coefficients
-        areas = np.array([chebyshev.chebval(1.0, chebyshev.chebint(one, lbnd=-1)) for one in ones])
+        areas = np.array([chebyshev.chebval(1.0, chebyshev.chebint(unit, lbnd=-1)) for unit in ones])
         self._weights: Array = areas @ self._coefficients
 
     def derivative(self, values: Array) -> Array:
@@ -83,17 +83,17 @@ class Panels:
     def missing(self, values: Array) -> Array:
         """Return the relative truncation error of values (panels, points), (panels,)."""
         # Estimated by the last two Chebyshev coefficients over the largest coefficient.
-        found: Array = np.abs(values @ self._coefficients.T)
-        return found[:, -2:].max(axis=1) / found.max()
+        coefficients: Array = np.abs(values @ self._coefficients.T)
+        return coefficients[:, -2:].max(axis=1) / coefficients.max()
 
     def at(self, radius: Array, values: Array) -> Array:
         """Interpolate values (panels, points) at radii (...,)."""
         panel = self.of(radius)
-        share = (radius - self.edges[panel]) / (2 * self._half[panel, 0]) * 2 - 1
-        found = np.empty_like(radius, dtype=np.float64)
+        coordinate = (radius - self.edges[panel]) / (2 * self._half[panel, 0]) * 2 - 1
+        interpolated = np.empty_like(radius, dtype=np.float64)
         for number, row in enumerate(values @ self._coefficients.T):
-            found[panel == number] = chebyshev.chebval(share[panel == number], row)
-        return found
+            interpolated[panel == number] = chebyshev.chebval(coordinate[panel == number], row)
+        return interpolated
 
 
 # ---------------------------------------------------------------- natural configuration of a tube
@@ -153,25 +153,25 @@ class Closing(NamedTuple):
 
 def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads()) -> Closing:
     """Compute the sector that closes to a ring in equilibrium, with isotropic cells."""
-    whole = 360.0 / (360.0 - opening_angle)
+    final_k = 360.0 / (360.0 - opening_angle)
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], DEGREE)
-    turns = np.linspace(1.0, whole, 1 + max(1, int(np.ceil((whole - 1.0) / LARGEST_TURN))))[1:]
-    found = Closing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
-    for k in turns:
-        grown = np.mean(found.radius + (k - 1.0) * panels.places * 0.5) / np.mean(found.radius)
-        found = _balanced(found._replace(radius=grown * found.radius, circumferential=float(k)), loads)
-    while (rough := found.panels.missing(found.panels.derivative(found.radius)) > MISSING).any():
-        parts = [
-            part
-            for layer, one in zip(found.layers, rough, strict=True)
-            for part in (_halves(layer) if one else [layer])
+    factors = np.linspace(1.0, final_k, 1 + max(1, int(np.ceil((final_k - 1.0) / LARGEST_TURN))))[1:]
+    ring = Closing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
+    for k in factors:
+        grown = np.mean(ring.radius + (k - 1.0) * panels.places * 0.5) / np.mean(ring.radius)
+        ring = _balanced(ring._replace(radius=grown * ring.radius, circumferential=float(k)), loads)
+    while (rough := ring.panels.missing(ring.panels.derivative(ring.radius)) > MISSING).any():
+        pieces = [
+            piece
+            for layer, is_rough in zip(ring.layers, rough, strict=True)
+            for piece in (_halves(layer) if is_rough else [layer])
         ]
-        if len(parts) > MOST_POLYNOMIALS * len(layers):
-            raise ArithmeticError(f"ring and sector vary too much through the wall for {len(parts)} polynomials")
-        finer = Panels([parts[0].radii[0], *(part.radii[1] for part in parts)], DEGREE)
-        radius = found.natural_radius(finer.places)
-        found = _balanced(found._replace(layers=tuple(parts), panels=finer, radius=radius), loads)
-    return found
+        if len(pieces) > MOST_POLYNOMIALS * len(layers):
+            raise ArithmeticError(f"ring and sector vary too much through the wall for {len(pieces)} polynomials")
+        finer = Panels([pieces[0].radii[0], *(piece.radii[1] for piece in pieces)], DEGREE)
+        radius = ring.natural_radius(finer.places)
+        ring = _balanced(ring._replace(layers=tuple(pieces), panels=finer, radius=radius), loads)
+    return ring
 
 
 def _halves(layer: Layer) -> list[Layer]:
@@ -181,14 +181,14 @@ def _halves(layer: Layer) -> list[Layer]:
     return [layer._replace(radii=(low, middle)), layer._replace(radii=(middle, high))]
 
 
-def _balanced(near: Closing, loads: Loads) -> Closing:
+def _balanced(start: Closing, loads: Loads) -> Closing:
     """Return the neighbouring equilibrium with the loads on both faces and along the axis."""
-    panels, tissues = near.panels, [layer.tissue for layer in near.layers]
+    panels, tissues = start.panels, [layer.tissue for layer in start.layers]
     stiffness, edges = _stiffness(tissues), panels.edges
 
     def stretches(values: Array) -> Array:
-        radius = values[..., :-1].reshape(*values.shape[:-1], *near.radius.shape)
-        return near._replace(radius=radius, axial=values[..., -1:, None]).at_panels()
+        radius = values[..., :-1].reshape(*values.shape[:-1], *start.radius.shape)
+        return start._replace(radius=radius, axial=values[..., -1:, None]).at_panels()
 
     def residual(values: Array, stresses: Array) -> Array:
         through = _through(panels, values[..., :-1], stresses, loads.pressure / stiffness)
@@ -199,8 +199,8 @@ def _balanced(near: Closing, loads: Loads) -> Closing:
             along = (force - loads.force / stiffness) / (np.pi * (edges[-1] ** 2 - edges[0] ** 2))
         return np.concatenate([through, along[..., None]], axis=-1)
 
-    found = solved(tissues, [None] * len(tissues), stretches, residual, np.append(near.radius, near.axial))
-    return near._replace(radius=found[:-1].reshape(near.radius.shape), axial=float(found[-1]))
+    solution = solved(tissues, [None] * len(tissues), stretches, residual, np.append(start.radius, start.axial))
+    return start._replace(radius=solution[:-1].reshape(start.radius.shape), axial=float(solution[-1]))
 
 
 def _stiffness(tissues: Sequence[Tissue]) -> float:
@@ -232,17 +232,17 @@ def solved(
     stiffness = _stiffness(tissues)
 
     def state(trial: Array) -> tuple[Array, Array, Array, Array]:
-        of = stretches(trial)
-        found = [principal_stresses(*layer) for layer in zip(tissues, [*of], dimensions, strict=True)]
-        stresses, tangents = (np.stack(parts) / stiffness for parts in zip(*found, strict=True))
-        return of, stresses, tangents, residual(trial, stresses)
+        stretch = stretches(trial)
+        by_layer = [principal_stresses(*layer) for layer in zip(tissues, [*stretch], dimensions, strict=True)]
+        stresses, tangents = (np.stack(arrays) / stiffness for arrays in zip(*by_layer, strict=True))
+        return stretch, stresses, tangents, residual(trial, stresses)
 
-    of, stresses, tangents, present = state(values)
+    stretch, stresses, tangents, present = state(values)
     for _ in range(ITERATIONS):
         # A stress depends only on the stretches at its point. The derivatives of the formulas are
         # exact by a complex step.
         moved = values + 1j * COMPLEX_STEP * np.eye(len(values))
-        strains = np.log(stretches(moved) / of)
+        strains = np.log(stretches(moved) / stretch)
         columns = residual(moved, stresses + (tangents @ strains[..., None])[..., 0]).imag / COMPLEX_STEP
         if not np.isfinite(columns).all() or not np.isfinite(present).all():
             break
@@ -252,28 +252,28 @@ def solved(
             break
         rounding = ROUNDINGS * np.finfo(np.float64).eps * np.abs(values) @ np.abs(columns)
         if (np.abs(present) < np.maximum(CLOSED, rounding)).all():
-            for tissue, of_layer, cells in zip(tissues, [*of], dimensions, strict=True):
-                _check_complex(tissue, of_layer, cells)
+            for tissue, layer_stretches, cells in zip(tissues, [*stretch], dimensions, strict=True):
+                _check_complex(tissue, layer_stretches, cells)
             # The bending stiffness is small: the accepted residual may be a millionth of the angle,
             # so the step is added.
             return values - step
-        for share in (0.5**power for power in range(12)):
-            of, stresses, tangents, trial = state(values - share * step)
+        for step_length in (0.5**power for power in range(12)):
+            stretch, stresses, tangents, trial = state(values - step_length * step)
             if np.isfinite(trial).all() and np.linalg.norm(trial) < np.linalg.norm(present) * 10:
                 break
-        values, present = values - share * step, trial
+        values, present = values - step_length * step, trial
     raise ArithmeticError(f"no equilibrium of the ring: residual {np.abs(present).max():.2g}")
 
 
 def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> tuple[Array, Array]:
     """Return principal Cauchy stresses (..., 3) and d sigma_i/d ln lambda_j at stretches."""
     # The stretches (..., 3) are along the axes of the cells.
-    one = np.eye(3).reshape(3, *(1,) * (stretches.ndim - 1), 3)
-    near = stretches * np.exp(TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(one[:1]), one]))
-    ways = np.exp(1j * COMPLEX_STEP * one)
-    slopes = np.imag(_energy(tissue, near * ways[:, None], dimensions)) / COMPLEX_STEP
-    stresses, *others = np.moveaxis(slopes, 0, -1) / np.prod(near, axis=-1)[..., None]
-    return stresses, np.stack([(other - stresses) / TANGENT_DIFFERENCE for other in others], axis=-1)
+    units = np.eye(3).reshape(3, *(1,) * (stretches.ndim - 1), 3)
+    perturbed = stretches * np.exp(TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(units[:1]), units]))
+    complex_stretches = np.exp(1j * COMPLEX_STEP * units)
+    slopes = np.imag(_energy(tissue, perturbed * complex_stretches[:, None], dimensions)) / COMPLEX_STEP
+    stresses, *neighbours = np.moveaxis(slopes, 0, -1) / np.prod(perturbed, axis=-1)[..., None]
+    return stresses, np.stack([(neighbour - stresses) / TANGENT_DIFFERENCE for neighbour in neighbours], axis=-1)
 
 
 def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array:
@@ -288,11 +288,12 @@ def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array
 def _check_complex(tissue: Tissue, stretches: Array, dimensions: Array | None) -> None:
     """Reject an energy whose complex-step derivative is wrong, as with |x|."""
     # The direction preserves the volume, because the volumetric stiffness may be large.
-    way = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])
-    of_complex = np.imag(_energy(tissue, stretches * np.exp(1j * COMPLEX_STEP * way), dimensions)) / COMPLEX_STEP
-    ahead, still, behind = (_energy(tissue, stretches * np.exp(side * way), dimensions) for side in (1, 0, -1))
-    slope, bend = (ahead - behind) / 2, np.abs(ahead + behind - 2 * still) + 1e-14 * np.abs(still)
-    if not (np.abs(of_complex - slope) <= CHECKED * np.abs(slope).max() + bend).all():
+    direction = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])
+    complex_stretches = stretches * np.exp(1j * COMPLEX_STEP * direction)
+    complex_slope = np.imag(_energy(tissue, complex_stretches, dimensions)) / COMPLEX_STEP
+    ahead, centre, behind = (_energy(tissue, stretches * np.exp(side * direction), dimensions) for side in (1, 0, -1))
+    slope, bend = (ahead - behind) / 2, np.abs(ahead + behind - 2 * centre) + 1e-14 * np.abs(centre)
+    if not (np.abs(complex_slope - slope) <= CHECKED * np.abs(slope).max() + bend).all():
         rule = "must accept complex numbers for its derivatives: np.maximum(x, 0), not |x|"
         raise SceneError(f"material.matrix, chain or repulsion: {rule}")
 
@@ -325,15 +326,17 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
     spline = BSpline(knots, np.eye(len(knots) - 3), 2)
     # The functions are zero at the lumen.
     functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]
-    depth, steepness, inner = rings.radius - edges[0], np.ones_like(rings.radius), edges[0]
+    inner = edges[0]
+    depth, steepness = rings.radius - edges[0], np.ones_like(rings.radius)
     axial: Array | float = 1.0
     k = 1.0
     if closed is not None:  # start from the sector of the initial cells
-        inner, axial, k = closed.radius[0, 0], 1 / closed.axial, 1 / closed.circumferential
+        inner = closed.radius[0, 0]
+        axial, k = 1 / closed.axial, 1 / closed.circumferential
         depth = closed.natural_radius(rings.radius) - inner
         steepness = closed.panels.at(rings.radius, closed.panels.derivative(closed.radius))
-    shares = rings.volume / rings.volume.sum()
-    thinner = shares @ (1 / (steepness * rings.natural[:, 2]))  # growth across the wall
+    fractions = rings.volume / rings.volume.sum()
+    thinner = fractions @ (1 / (steepness * rings.natural[:, 2]))  # growth across the wall
     depth, steepness = thinner * depth, thinner * steepness
 
     # The unknowns are k rho at the lumen, rho minus rho at the lumen, e and k. In them a thin wall
@@ -346,17 +349,17 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
 
     def residual(values: Array, stresses: Array) -> Array:  # derivatives of the energy
         across, slope, around, stretches = opened(values)
-        work = stresses[..., 0, :, :] * (np.prod(stretches, axis=-1) * shares)[..., None]
+        work = stresses[..., 0, :, :] * (np.prod(stretches, axis=-1) * fractions)[..., None]
         hoop, axial, radial = np.moveaxis(work, -1, 0)
         hoop = edges[-1] * hoop / around
         nodes = (values[..., -1:] * hoop) @ functions + edges[-1] * (radial / slope) @ slopes
-        whole = [part.sum(axis=-1, keepdims=True) for part in (hoop, axial, hoop * across / np.ptp(edges))]
-        return np.concatenate([whole[0], nodes, *whole[1:]], axis=-1)
+        integrals = [density.sum(axis=-1, keepdims=True) for density in (hoop, axial, hoop * across / np.ptp(edges))]
+        return np.concatenate([integrals[0], nodes, *integrals[1:]], axis=-1)
 
     values = np.concatenate([[inner * k], np.zeros(functions.shape[1]), [axial, k / thinner]])
     dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
-    found = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
-    return float(360.0 * (1.0 - found[-1]))
+    solution = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
+    return float(360.0 * (1.0 - solution[-1]))
 
 
 def means_through(radius: Array, volumes: Array, values: Array, edges: Array) -> tuple[Array, Array]:
@@ -368,7 +371,6 @@ def means_through(radius: Array, volumes: Array, values: Array, edges: Array) ->
     inside = np.cumsum(volumes[order]) - volumes[order] / 2
     bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
     ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
-    sums: list[Array] = [
-        np.bincount(ring, volumes[order] * part[order]).astype(np.float64) for part in (np.ones_like(radius), *values.T)
-    ]
+    columns = (np.ones_like(radius), *values.T)
+    sums: list[Array] = [np.bincount(ring, volumes[order] * column[order]).astype(np.float64) for column in columns]
     return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]
