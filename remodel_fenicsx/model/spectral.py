@@ -99,10 +99,10 @@ def continued(
     # not decide. Parameters and errors are those of `principal`.
     values, axes, reference = _decomposed(tensors, previous)
     upper, lower = _agreeing(values, tolerance, threshold)
-    place = _places(axes, reference, upper, lower)
-    axes = _settled(axes, np.take_along_axis(reference, place[:, :, None], axis=1), upper, lower)
-    rank = np.argsort(place, axis=1)
-    return np.take_along_axis(values, rank, axis=1), np.take_along_axis(axes, rank[:, :, None], axis=1)
+    positions = _places(axes, reference, upper, lower)
+    axes = _settled(axes, np.take_along_axis(reference, positions[:, :, None], axis=1), upper, lower)
+    order = np.argsort(positions, axis=1)
+    return np.take_along_axis(values, order, axis=1), np.take_along_axis(axes, order[:, :, None], axis=1)
 
 
 Pairing = Formula[tuple[Array, Array]]
@@ -162,16 +162,16 @@ def _agreeing(values: Array, tolerance: float, threshold: npt.ArrayLike) -> tupl
 def _settled(axes: Array, reference: Array, upper: Flags, lower: Flags) -> Array:
     """Return the axes with signs and undetermined directions taken from `reference`."""
     for cluster, normal_rank, first, second in (upper & ~lower, 2, 0, 1), (lower & ~upper, 0, 1, 2):
-        at = np.flatnonzero(cluster)
-        if at.size:
-            normal = axes[at, normal_rank]
-            axes[at, first] = _project(normal, _candidates(reference[at], first))
-            axes[at, second] = np.cross(normal, axes[at, first])
-    at = np.flatnonzero(upper & lower)
-    if at.size:
-        axes[at, 0] = _project(np.zeros((at.size, 3)), _candidates(reference[at], 0))
-        axes[at, 1] = _project(axes[at, 0], _candidates(reference[at], 1))
-        axes[at, 2] = np.cross(axes[at, 0], axes[at, 1])
+        points = np.flatnonzero(cluster)
+        if points.size:
+            normal = axes[points, normal_rank]
+            axes[points, first] = _project(normal, _candidates(reference[points], first))
+            axes[points, second] = np.cross(normal, axes[points, first])
+    points = np.flatnonzero(upper & lower)
+    if points.size:
+        axes[points, 0] = _project(np.zeros((points.size, 3)), _candidates(reference[points], 0))
+        axes[points, 1] = _project(axes[points, 0], _candidates(reference[points], 1))
+        axes[points, 2] = np.cross(axes[points, 0], axes[points, 1])
     return with_signs_of(reference, axes)
 
 
@@ -180,19 +180,19 @@ def _places(axes: Array, reference: Array, upper: Flags, lower: Flags) -> npt.ND
     overlap = np.einsum("nia,nja->nij", axes, reference) ** 2
     # For an eigenspace only the sum over a basis has a meaning.
     for cluster, ranks in (upper & ~lower, [0, 1]), (lower & ~upper, [1, 2]), (upper & lower, [0, 1, 2]):
-        at = np.flatnonzero(cluster)
-        overlap[at[:, None], ranks] = overlap[at][:, ranks].mean(axis=1, keepdims=True)
-    ways = np.array(list(permutations(range(3))))
-    sums = sum(overlap[:, rank, ways[:, rank]] for rank in range(3))
-    return ways[np.argmax(sums >= sums.max(axis=1, keepdims=True) - DECISIVE, axis=1)]
+        points = np.flatnonzero(cluster)
+        overlap[points[:, None], ranks] = overlap[points][:, ranks].mean(axis=1, keepdims=True)
+    pairings = np.array(list(permutations(range(3))))
+    sums = sum(overlap[:, rank, pairings[:, rank]] for rank in range(3))
+    return pairings[np.argmax(sums >= sums.max(axis=1, keepdims=True) - DECISIVE, axis=1)]
 
 
 def _require_finite(values: Array, noun: str) -> None:
     if not np.isfinite(values).all():
-        bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-        first = int(np.argmax(bad))
+        invalid = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        first = int(np.argmax(invalid))
         raise FloatingPointError(
-            f"{noun} {first} of {len(values)} is not finite ({int(bad.sum())} in all): " f"{values[first].tolist()}"
+            f"{noun} {first} of {len(values)} is not finite ({int(invalid.sum())} in all): " f"{values[first].tolist()}"
         )
 
 
