@@ -43,12 +43,12 @@ class Target(NamedTuple):
         # The rate of A is kappa (r0^2 sE - sA). Therefore sE is interpolated; its trace is s, so
         # that E keeps trace one and a target with s = 0 has no influence. The result s is clipped
         # to [0, 1].
-        ends = (self.switch[:, None, None] * self.direction, other.switch[:, None, None] * other.direction)
-        changed = ends[0] + np.reshape(weight, (-1, 1, 1)) * (ends[1] - ends[0])
+        scaled = (self.switch[:, None, None] * self.direction, other.switch[:, None, None] * other.direction)
+        changed = scaled[0] + np.reshape(weight, (-1, 1, 1)) * (scaled[1] - scaled[0])
         switch = np.einsum("nii->n", changed)
-        some = switch > 0.0
-        direction = changed / np.where(some, switch, 1.0)[:, None, None]
-        return Target(direction, np.where(some, np.minimum(switch, 1.0), 0.0))
+        active = switch > 0.0
+        direction = changed / np.where(active, switch, 1.0)[:, None, None]
+        return Target(direction, np.where(active, np.minimum(switch, 1.0), 0.0))
 
     def where(self, chosen: NDArray[np.bool_], other: Target) -> Target:
         """Return the target, replaced by `other` at the chosen points."""
