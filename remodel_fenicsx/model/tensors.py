@@ -109,9 +109,9 @@ def to_mandel(tensors: Array) -> Array:
 
 def from_mandel(components: Array) -> Array:
     """Return the symmetric tensors (..., 3, 3) of Mandel components (..., 6)."""
-    found = np.empty((*components.shape[:-1], 3, 3))
-    found[..., ROWS, COLUMNS] = found[..., COLUMNS, ROWS] = components / FACTORS
-    return found
+    tensors = np.empty((*components.shape[:-1], 3, 3))
+    tensors[..., ROWS, COLUMNS] = tensors[..., COLUMNS, ROWS] = components / FACTORS
+    return tensors
 
 
 def congruence(X: Array) -> Array:
@@ -153,21 +153,21 @@ def first_divided_difference(a: Array, b: Array) -> Array:
     return 2 / (a + b) * np.where(small, series, quotient)
 
 
-def second_divided_difference(least: Array, middle: Array, largest: Array, first: Array, last: Array) -> Array:
+def second_divided_difference(smallest: Array, middle: Array, largest: Array, first: Array, last: Array) -> Array:
     """Return f[a, b, c] of ascending positive numbers from f[a, b] and f[b, c]."""
     # For equal numbers it is -1/(2 a^2).
-    gap = largest - least
+    gap = largest - smallest
     close = gap < CLOSE_EIGENVALUES * largest
     result: Array = (last - first) / np.where(close, 1.0, gap)
-    at = np.nonzero(close)
-    if at[0].size:
+    points = np.nonzero(close)
+    if points[0].size:
         # Taylor: sum_n f^(n)(mean)/n! h_(n-2)(deviations), f^(n)/n! = (-1)^(n-1)/(n mean^n);
         # h_1 = 0 about the mean
-        three = np.stack([least[at], middle[at], largest[at]])
-        mean = three.mean(axis=0)
-        relative = three / mean - 1
+        values = np.stack([smallest[points], middle[points], largest[points]])
+        mean = values.mean(axis=0)
+        relative = values / mean - 1
         p2, p3, p4 = ((relative**power).sum(axis=0) for power in (2, 3, 4))
-        result[at] = -(1 / 2 + p2 / 8 - p3 / 15 + p2**2 / 48 + p4 / 24) / mean**2
+        result[points] = -(1 / 2 + p2 / 8 - p3 / 15 + p2**2 / 48 + p4 / 24) / mean**2
     return result
 
 
@@ -185,8 +185,8 @@ def second_divided_differences(values: Array) -> Array:
     result, pairs = np.empty((len(values), 3, 3, 3)), first_divided_differences(values)
     for i, j, k in itertools.combinations_with_replacement(range(3), 3):
         number = second_divided_difference(values[:, i], values[:, j], values[:, k], pairs[:, i, j], pairs[:, j, k])
-        for one, two, three in set(itertools.permutations((i, j, k))):
-            result[:, one, two, three] = number
+        for first, second, third in set(itertools.permutations((i, j, k))):
+            result[:, first, second, third] = number
     return result
 
 
@@ -196,8 +196,8 @@ def second_derivative(values: Array, components: Array) -> Array:
     result = np.empty((len(values), 6, 6))
     for row, (i, j) in enumerate(MANDEL):
         for column, (p, q) in enumerate(MANDEL[: row + 1]):  # H = (e_p e_q + e_q e_p) / 2
-            terms = [f[:, i, k, j] * A[:, i, k] for k, other in ((p, q), (q, p)) if other == j]
-            terms += [f[:, i, k, j] * A[:, k, j] for k, other in ((p, q), (q, p)) if other == i]
+            terms = [f[:, i, k, j] * A[:, i, k] for k, partner in ((p, q), (q, p)) if partner == j]
+            terms += [f[:, i, k, j] * A[:, k, j] for k, partner in ((p, q), (q, p)) if partner == i]
             result[:, row, column] = result[:, column, row] = FACTORS[row] * FACTORS[column] / 2 * sum(terms)
     return result
 
@@ -210,16 +210,17 @@ def passes_through_zero(before: Array, after: Array) -> Flags:
     # Both ends may be admissible, because two axes can invert simultaneously. Exact: the
     # determinant is cubic in s.
     change = after - before
-    at = [det(before + s * change) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
-    coefficients = np.linalg.solve(np.vander([0.0, 1 / 3, 2 / 3, 1.0], 4, increasing=True), np.stack(at))
+    determinants = [det(before + s * change) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
+    coefficients = np.linalg.solve(np.vander([0.0, 1 / 3, 2 / 3, 1.0], 4, increasing=True), np.stack(determinants))
     _, linear, quadratic, cubic = coefficients
     with np.errstate(invalid="ignore", divide="ignore"):
         # Extrema: 3 c s^2 + 2 b s + a = 0 by the stable formula. A parabola has one root at
         # infinity.
         root = -(quadratic + np.copysign(np.sqrt(quadratic**2 - 3 * cubic * linear), quadratic))
-        places = [np.where((s > 0) & (s < 1), s, 0.0) for s in (root / (3 * cubic), linear / root)]
-    lowest = np.min([np.polynomial.polynomial.polyval(s, coefficients, tensor=False) for s in places] + at, axis=0)
-    return lowest <= 1e-12 * np.max(at, axis=0)  # a double root may be positive by rounding
+        extrema = [np.where((s > 0) & (s < 1), s, 0.0) for s in (root / (3 * cubic), linear / root)]
+    at_extrema = [np.polynomial.polynomial.polyval(s, coefficients, tensor=False) for s in extrema]
+    lowest = np.min(at_extrema + determinants, axis=0)
+    return lowest <= 1e-12 * np.max(determinants, axis=0)  # a double root may be positive by rounding
 
 
 def cofactor(tensors: Array) -> Array:
