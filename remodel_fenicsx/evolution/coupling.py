@@ -66,20 +66,21 @@ class Predictor:
 
     def expected(self, step: LoadStep) -> Array | None:
         """Return predicted unknowns with boundary values, ghosts included; None if unknown."""
-        speeds = self._speeds.values
+        speeds, state = self._speeds.values, self.state
         if not speeds or not self._goes_on(step):
             return None
         speed = speeds[0]
         if len(speeds) == ORDER + FITTED:
             speed = self._weights(speeds) @ np.array(speeds[:ORDER])
-        values: Array = self.state.unknown.x.array + step.duration * speed
-        for condition in self.state.loading.boundary_conditions:
+        values: Array = state.unknown.x.array + step.duration * speed
+        for condition in state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
         """Record the rate of a solved step from the unknowns before it, or of its first solve."""
-        speed = np.asarray((self.state.unknown.x.array - before) / step.duration, dtype=np.float64)
+        unknown = self.state.unknown
+        speed = np.asarray((unknown.x.array - before) / step.duration, dtype=np.float64)
         if again:
             self._speeds.values[0][:] += speed
             return
@@ -233,7 +234,8 @@ class Staggered:
     traits = Traits(order=1, accumulates=False)
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
-        self.state, self.remodeling, self.settings = state, remodeling, settings
+        self.state, self.settings = state, settings
+        self.remodeling = remodeling
         self.equilibrium = Equilibrium(state, tissue)
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
@@ -241,7 +243,7 @@ class Staggered:
         self._last = Numbers(state, "last_solution", {"extension": 0.0})  # largest r/L
         self.residual = 0.0
         self.tangents = 0  # assembled in the last solve of the state
-        changes = any(part.changes for part in (remodeling, *remodeling.beside))
+        changes = any(process.changes for process in (remodeling, *remodeling.beside))
         self.blend = Blend(state, tissue, settings) if changes else None
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -256,8 +258,8 @@ class Staggered:
         return self.balanced(time, loads)
 
     def _before(self, time: float) -> None:
-        for part in self.remodeling.beside:
-            part.before(time, self.traits.order)
+        for process in self.remodeling.beside:
+            process.before(time, self.traits.order)
 
     def balanced(self, time: float, loads: LoadValues, again: bool = False) -> Work:
         """Solve for equilibrium with remodeled values; call `settle` of remodeling processes.
@@ -274,19 +276,21 @@ class Staggered:
         Work
             Solver work.
         """
-        work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
-        step = LoadStep.between(time - self.state.time, old_loads, loads)
+        work, state = Work(), self.state
+        unknown, old_loads = state.unknown, dict(state.loading.values)
+        before = unknown.x.array.copy()
+        step = LoadStep.between(time - state.time, old_loads, loads)
         self._solve(step, time, old_loads, loads, work, again)
         self._whole(time, old_loads, loads).look_back(before, work, again)
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
-        self.state.settle_cells()
+        state.settle_cells()
         self.residual = work.residual
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
         self.tangents = work.tangents
-        for part in self.remodeling.beside:
-            work.count(part.settle(time, again))
+        for process in self.remodeling.beside:
+            work.count(process.settle(time, again))
         return work
 
     def remodel(self, time: float) -> float:
@@ -297,7 +301,7 @@ class Staggered:
         return power + self._after(time)
 
     def _after(self, time: float) -> float:
-        return sum(part.after(time) for part in self.remodeling.beside)
+        return sum(process.after(time) for process in self.remodeling.beside)
 
     @property
     def better(self) -> UnitCell | None:
@@ -307,8 +311,8 @@ class Staggered:
     def close(self) -> None:
         """Free the PETSc objects of the coupling."""
         self.newton.close()
-        for part in self.remodeling.beside:
-            part.close()
+        for process in self.remodeling.beside:
+            process.close()
         if self.blend is not None:
             self.blend.close()
 
@@ -317,7 +321,8 @@ class Staggered:
         self, step: LoadStep, time: float, old_loads: LoadValues, loads: LoadValues, work: Work, again: bool
     ) -> None:
         """Solve by the attempts `FROM_EXPECTED`, `FROM_LAST` and `IN_PARTS` in this order."""
-        unknown, loading, failure = self.state.unknown.x.array, self.state.loading, None
+        state, failure = self.state, None
+        unknown, loading = state.unknown.x.array, state.loading
         before = unknown.copy()
         loading.set(loads)  # prescribed values are part of the prediction
         if not again and self._starts_as_expected(step):
@@ -341,16 +346,17 @@ class Staggered:
         expected = None if self.predictor is None else self.predictor.expected(step)
         if expected is None:
             return False
-        self.state.unknown.x.array[:] = expected
+        unknown = self.state.unknown
+        unknown.x.array[:] = expected
         return self.newton.may_start(self._last["extension"])
 
     def _tried(self, attempt: Attempt, work: Work, origin: Array | None = None) -> SolveFailure | None:
         """Solve from the present unknowns, and return the failure or None."""
-        found = attempted(lambda: self.newton.solve(origin), SolveFailure)
-        work.add(found)
-        if isinstance(found, SolveFailure):
-            say(attempt, found.reason)
-            return found
+        outcome = attempted(lambda: self.newton.solve(origin), SolveFailure)
+        work.add(outcome)
+        if isinstance(outcome, SolveFailure):
+            say(attempt, outcome.reason)
+            return outcome
         work.substeps = 1
         return None
 
@@ -364,15 +370,15 @@ class Staggered:
         loading.set(old_loads)
         if self.blend is not None and self._has_remodeled():
             blend = self.blend
-            parts = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
-            Change(*parts, halvings, blend.largest_part, roughly=True).advance(work)
+            cell_change = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
+            Change(*cell_change, halvings, blend.largest_part, roughly=True).advance(work)
             failure = None  # the loads were not yet tried from this state
 
         def set_load_fraction(fraction: float) -> None:
             loading.set(between(old_loads, new_loads, fraction))
 
-        whole = time, "the change of the loads", set_load_fraction, self.state, lambda: self.newton
-        Change(*whole, halvings).advance(work, failure)
+        load_change = time, "the change of the loads", set_load_fraction, self.state, lambda: self.newton
+        Change(*load_change, halvings).advance(work, failure)
         loading.set(new_loads)
         log.info("time %g solved in %d substeps", time, work.substeps)
 
@@ -394,14 +400,14 @@ class Staggered:
         """Apply a fraction of the remodeling since the last solved state."""
         assert self.blend is not None
         self.blend.set(fraction)
-        for part in self.remodeling.beside:
-            part.set_part(fraction)
+        for process in self.remodeling.beside:
+            process.set_part(fraction)
 
     def _has_remodeled(self) -> bool:
-        if any(part.changes for part in self.remodeling.beside):
+        if any(process.changes for process in self.remodeling.beside):
             return True
-        same = self.state.equilibrium_cells.equals(self.state.cells)
-        return bool(self.state.comm.allreduce(int(not same)) > 0)
+        are_equal = self.state.equilibrium_cells.equals(self.state.cells)
+        return bool(self.state.comm.allreduce(int(not are_equal)) > 0)
 
 
 def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
@@ -430,7 +436,7 @@ class Extrapolated(Staggered):
         state.remember(targets)
         self._power = 0.0
         self._start: UnitCell  # the cells at the start of the step
-        self._found: Target  # target of the solved state
+        self._solved_target: Target  # target of the solved state
         self._begins: Flags  # points with the first target in this step
         self._duration = 0.0  # duration of the step
 
@@ -438,7 +444,8 @@ class Extrapolated(Staggered):
     def better(self) -> UnitCell:
         """Cells by the targets at both ends of the step, or only by the first target of a point."""
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
-        mean = known(self._older).towards(self._found, weight).where(self._begins, self._found)
+        mean = known(self._older).towards(self._solved_target, weight)
+        mean = mean.where(self._begins, self._solved_target)
         return self.remodeling.followed(mean, self._duration, self._start)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -448,32 +455,33 @@ class Extrapolated(Staggered):
         self._follow(expected, time)
         self._before(time)
         work = self.balanced(time, loads)
-        self._found = self.remodeling.target(self.residual)
-        self._begins = (self._newest["switch"] < COUNTS) & (self._found.switch >= COUNTS)
+        self._solved_target = self.remodeling.target(self.residual)
+        self._begins = (self._newest["switch"] < COUNTS) & (self._solved_target.switch >= COUNTS)
         if not how_many(self.state, self._begins):
             return work
         cells.set(*self._start[:2])
-        self._follow(expected.where(self._begins, self._found), time)
-        again = self.balanced(time, loads, again=True)
-        self._found = self.remodeling.target(self.residual)
-        again.substeps += work.substeps - 1
-        again.count(work)
-        return again
+        self._follow(expected.where(self._begins, self._solved_target), time)
+        repeated = self.balanced(time, loads, again=True)
+        self._solved_target = self.remodeling.target(self.residual)
+        repeated.substeps += work.substeps - 1
+        repeated.count(work)
+        return repeated
 
     def remodel(self, time: float) -> float:
         """Record the target of the solved state; the cells are already those of the row."""
         self._duration = time - self.state.time
         self._older[:] = self._newest
         self._older["time"][self._begins] = NEVER  # this step used the target of its end
-        self._newest["direction"], self._newest["switch"], self._newest["time"] = *self._found, time
+        self._newest["direction"], self._newest["switch"] = self._solved_target
+        self._newest["time"] = time
         return self._power + self._after(time)
 
     def _extrapolated(self, time: float) -> Target:
         """Return the target extrapolated to the middle of the step."""
         last, before = self._newest["time"], self._older["time"]
-        back, apart = np.zeros_like(last), before != NEVER
-        back[apart] = (time - last[apart]) / 2 / (last[apart] - before[apart])
-        return known(self._newest).towards(known(self._older), -back)
+        weight, has_both = np.zeros_like(last), before != NEVER
+        weight[has_both] = (time - last[has_both]) / 2 / (last[has_both] - before[has_both])
+        return known(self._newest).towards(known(self._older), -weight)
 
     def _follow(self, target: Target, time: float) -> None:
         """Compute the cells after the step; use the last target if A would become indefinite."""
@@ -481,14 +489,14 @@ class Extrapolated(Staggered):
         self._power = 0.0
         if not how_many(self.state, target.switch != 0.0):
             return
-        asked = self.remodeling.followed(target, duration)
-        lost = ~np.isfinite(asked.dimensions).all(axis=-1)
+        cells = self.remodeling.followed(target, duration)
+        lost = ~np.isfinite(cells.dimensions).all(axis=-1)
         if lost.any():
-            asked = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
+            cells = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
         points = how_many(self.state, lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not extrapolated", time, points)
-        self._power = self.remodeling.replace(asked, self.state.elastic_gradient(), duration)
+        self._power = self.remodeling.replace(cells, self.state.elastic_gradient(), duration)
 
 
 def how_many(state: State, points: Flags) -> int:
