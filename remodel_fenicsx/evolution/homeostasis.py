@@ -78,9 +78,10 @@ class Homeostasis:
     """Time integration over ramps and constant loads to the steady state, as one step."""
 
     def __init__(self, stepper: Stepper, plan: PathToRest):
-        self.stepper, self.state, self.plan = stepper, stepper.state, plan
+        self.stepper, self.state = stepper, stepper.state
+        self.plan = plan
         self.remodeling = stepper.remodeling
-        self.remodels = [part for part in stepper.remodels if part.components]
+        self.remodels = [process for process in stepper.remodels if process.components]
         self.quadrature = self.state.cells.quadrature
         # No row of the path is a result; fronts report points with abrupt changes.
         self.control = StepControl(stepper, plan.tolerance, plan.first, plan.stops, LONGEST, logging.INFO)
@@ -100,9 +101,11 @@ class Homeostasis:
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Solve for the equilibrium of forces and of cells."""
         state, work = self.state, Work()
-        start, number, self.steps, self._held = state.time, state.number, 0, None
-        remembers = any(part.depends_on_path for part in self.remodels)
-        coarsens = not (self.stepper.coupling.traits.accumulates or self.plan.tolerance >= UNCHECKED or remembers)
+        start, number = state.time, state.number
+        self.steps, self._held = 0, None
+        remembers = any(process.depends_on_path for process in self.remodels)
+        traits = self.stepper.coupling.traits
+        coarsens = not (traits.accumulates or self.plan.tolerance >= UNCHECKED or remembers)
         if self.plan.before_change is not None:
             self._rest_before(*self.plan.before_change, work)
         held = max(start, self.plan.held_from)
@@ -125,8 +128,8 @@ class Homeostasis:
             self._go(control, stops[-1], self.stepper.load_values(held), held, False, work)
         self.state.settle_cells()
         log.info("steady state reached after %d steps, before time %g", self.steps, change)
-        for part in self.remodels:
-            part.rested(change)
+        for process in self.remodels:
+            process.rested(change)
         self.state.reach(change, self.state.number)
 
     def _go(
@@ -135,9 +138,11 @@ class Homeostasis:
         """Integrate from the present state to the steady state."""
         # The error of a lagging row vanishes in the steady state, unless the cells reach another
         # one. The steady state of turnover depends on the path.
-        state, before, waiting, near, longest = self.state, np.inf, 0.0, NEAR_REST, LONGEST
-        for part in self.remodels:
-            part.begin_path()
+        state, waiting = self.state, 0.0
+        before, longest = np.inf, LONGEST
+        try_below = NEAR_REST
+        for process in self.remodels:
+            process.begin_path()
         control.limit(self.plan.tolerance, longest)
         start = held
         for step in control.march():
@@ -154,30 +159,30 @@ class Homeostasis:
             self._held = self._held or ahead
             # The cells of the present stress.
             state.cells.set(solved.dimension_values, solved.axis_values)
-            left, residual = self._left(work.residual), work.residual
+            change, residual = self._left(work.residual), work.residual
             # A step larger than 1/kappa counts as 1/kappa.
             waiting += min(1.0, self.stepper.slowest * (state.time - start))
             start = state.time
-            is_over = self._is_over(left, waiting)
-            if (is_over or left <= near) and (self._add_tail(time, loads, work) or is_over):
+            is_over = self._is_over(change, waiting)
+            if (is_over or change <= try_below) and (self._add_tail(time, loads, work) or is_over):
                 return
-            work.residual, near = residual, min(near, AGAIN * left)
+            work.residual, try_below = residual, min(try_below, AGAIN * change)
             state.restore(ahead)
             if coarsens:
                 longer = min(LENGTHENING_OF_STEPS * longest, LONGEST_AT_END)
-                longest, before = longer if left < before else LONGEST, left
+                longest, before = longer if change < before else LONGEST, change
                 control.limit(UNCHECKED, longest)
 
     def _left(self, residual: float) -> float:
         """Return the largest relative change in a time of 1/kappa."""
         soon = self.state.time + 1 / self.stepper.slowest
-        return max(part.left(soon, residual) for part in self.remodels)
+        return max(process.left(soon, residual) for process in self.remodels)
 
-    def _is_over(self, left: float, waiting: float) -> bool:
+    def _is_over(self, change: float, waiting: float) -> bool:
         """Return whether the path ends, because of equilibrium or because there is none."""
-        if left <= REST:
+        if change <= REST:
             return True
-        if without := [text for part in self.remodels if (text := part.without_rest(waiting))]:
+        if without := [text for process in self.remodels if (text := process.without_rest(waiting))]:
             self._say(logging.WARNING, without[0])
             return True
         if waiting > LONGEST_HOLD:
@@ -185,7 +190,7 @@ class Homeostasis:
                 "the cells have not reached equilibrium: a time of 1/kappa still changes the state "
                 "by %.2g of its size. Set time.end to a late time to follow the history"
             )
-            self._say(logging.WARNING, text, left)
+            self._say(logging.WARNING, text, change)
         return waiting > LONGEST_HOLD
 
     # ------------------------------------------------------------ the tail of the decay
@@ -198,45 +203,45 @@ class Homeostasis:
         assert isinstance(coupling, Staggered)
         changes = self._to_the_limit(time, work.residual)
         for _ in range(TAIL_PASSES):
-            left = self._size(changes)
-            if left <= TAIL:
+            size = self._size(changes)
+            if size <= TAIL:
                 return True
             before, residual = state.snapshot(), work.residual
-            for part, change in zip(self.remodels, changes, strict=True):
-                part.follow(change, factor, time, residual)
+            for process, change in zip(self.remodels, changes, strict=True):
+                process.follow(change, factor, time, residual)
             soon = state.time + 1 / self.stepper.slowest
-            found = attempted(partial(coupling.balanced, soon, loads, again=True), StepFailure)
-            if isinstance(found, StepFailure):
-                log.info("extrapolation of the path stopped: %s", found)
+            outcome = attempted(partial(coupling.balanced, soon, loads, again=True), StepFailure)
+            if isinstance(outcome, StepFailure):
+                log.info("extrapolation of the path stopped: %s", outcome)
                 state.restore(before)
                 return False
-            work.add(found)
-            work.substeps, self.steps = work.substeps + found.substeps, self.steps + 1
-            earlier, changes = changes, self._to_the_limit(time, found.residual)
-            if self._size(changes) >= left:
+            work.add(outcome)
+            work.substeps, self.steps = work.substeps + outcome.substeps, self.steps + 1
+            earlier, changes = changes, self._to_the_limit(time, outcome.residual)
+            if self._size(changes) >= size:
                 state.restore(before)
                 work.residual = residual
                 return False
-            work.residual = found.residual
+            work.residual = outcome.residual
             # If a pass reduces the remaining distance by s, the step f d reduces the change d to r
             # d with r = 1 - f (1 - s). The next factor is 1/(1 - s) with s = 1 - (1 - r)/f.
             pairs = zip(earlier, changes, strict=True)
-            ratios = [self._dot(one, other) / square for one, other in pairs if (square := self._dot(one, one))]
+            ratios = [self._dot(old, new) / square for old, new in pairs if (square := self._dot(old, old))]
             ratio = 1 - (1 - max(ratios)) / factor
             factor = 1 / (1 - min(max(ratio, -1.0), LARGEST_RATIO))
         return False
 
     def _to_the_limit(self, time: float, residual: float) -> list[Array]:
         """Return the changes to the limit of all remodeling processes."""
-        return [part.to_the_limit(time, 1 / self.stepper.slowest, residual) for part in self.remodels]
+        return [process.to_the_limit(time, 1 / self.stepper.slowest, residual) for process in self.remodels]
 
     def _size(self, changes: Sequence[Array]) -> float:
         """Return the largest relative change."""
-        return max(part.size(change) for part, change in zip(self.remodels, changes, strict=True))
+        return max(process.size(change) for process, change in zip(self.remodels, changes, strict=True))
 
-    def _dot(self, one: Array, other: Array) -> float:
+    def _dot(self, first: Array, second: Array) -> float:
         """Return the sum of products over all ranks. Collective."""
-        return float(self.state.comm.allreduce(float(self.quadrature.owned(one * other).sum())))
+        return float(self.state.comm.allreduce(float(self.quadrature.owned(first * second).sum())))
 
     def _largest_jump(self) -> tuple[float, NDArray[np.float64]]:
         """Return the largest jump of A/r0^2 between near points, and its position. Collective."""
@@ -246,17 +251,17 @@ class Homeostasis:
         quadrature = self.quadrature
         r0 = assembly.point_values(self.stepper.tissue.end_to_end_length, quadrature)
         tensors = self.state.cells.structure_tensor() / r0[..., None, None] ** 2
-        found = [quadrature.owned(values) for values in (quadrature.coordinates, tensors)]
-        all_ranks = zip(*assembly.of_all_ranks(quadrature.mesh.comm, found), strict=True)
-        places, structure = (
-            np.concatenate([values.reshape(-1, size) for values in parts])
-            for parts, size in zip(all_ranks, (3, 9), strict=True)
+        fields = [quadrature.owned(values) for values in (quadrature.coordinates, tensors)]
+        all_ranks = zip(*assembly.of_all_ranks(quadrature.mesh.comm, fields), strict=True)
+        positions, structure = (
+            np.concatenate([values.reshape(-1, size) for values in arrays])
+            for arrays, size in zip(all_ranks, (3, 9), strict=True)
         )
-        neighbours = min(1 + 2 * quadrature.mesh.topology.dim, len(places))
-        _, near = cKDTree(places).query(places, np.arange(1, neighbours + 1))
-        jumps = np.linalg.norm(structure[near] - structure[:, None], axis=-1)
-        point, other = np.unravel_index(int(jumps.argmax()), jumps.shape)
-        return float(jumps.max()), (places[point] + places[near[point, other]]) / 2
+        count = min(1 + 2 * quadrature.mesh.topology.dim, len(positions))
+        _, neighbours = cKDTree(positions).query(positions, np.arange(1, count + 1))
+        jumps = np.linalg.norm(structure[neighbours] - structure[:, None], axis=-1)
+        point, neighbour = np.unravel_index(int(jumps.argmax()), jumps.shape)
+        return float(jumps.max()), (positions[point] + positions[neighbours[point, neighbour]]) / 2
 
     def _say(self, level: int, text: str, *values: float) -> None:
         if self.state.comm.rank == 0:
@@ -268,23 +273,23 @@ class Homeostasis:
         quadrature, r0 = self.quadrature, float(
             assembly.largest(self.stepper.tissue.end_to_end_length, self.quadrature.mesh)
         )
-        left = self.remodeling.distance() / r0**2
-        self._say(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", left, self.steps)
-        jump, place = self._largest_jump()
+        distance = self.remodeling.distance() / r0**2
+        self._say(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", distance, self.steps)
+        jump, position = self._largest_jump()
         if jump > FRONT:
             self._say(
                 NOTICE,
                 "the cells have a front near %.4g, %.4g, %.4g: A jumps by %.2g r0^2. Its position "
                 "depends on the load path, time.tolerance and the mesh (docs/theory.md)",
-                *place,
+                *position,
                 jump,
             )
         slack = self.remodeling.without_tension(self._residual).reshape(quadrature.shape)
-        if share := quadrature.mean(slack.astype(float)):
+        if fraction := quadrature.mean(slack.astype(float)):
             self._say(
                 NOTICE,
                 "%.3g %% of the body carries no tension in equilibrium; the cells there depend on "
                 "the load path (docs/theory.md)",
-                100 * share,
+                100 * fraction,
             )
         return 0.0
