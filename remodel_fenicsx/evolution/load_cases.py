@@ -35,7 +35,8 @@ class FurtherCase(LoadCaseSolver):
         solver: Solver,
         kappa: float | Function | None = None,
     ):
-        self.number, self.state, self.load_values = number, state, load_values
+        self.number, self.state = number, state
+        self.load_values = load_values
         state.label = f"load case {number}: "
         self.tissue, self.each_case = stepper.tissue, [self]
         self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
@@ -89,8 +90,8 @@ def join(
     kappa: float | Function | None = None,
 ) -> None:
     """Add further load cases to a stepper; `weights` are of all cases, in their order."""
-    given = enumerate(zip(states, load_values, strict=True), start=2)
-    cases = [FurtherCase(number, state, values, stepper, solver, kappa) for number, (state, values) in given]
+    numbered = enumerate(zip(states, load_values, strict=True), start=2)
+    cases = [FurtherCase(number, state, values, stepper, solver, kappa) for number, (state, values) in numbered]
     stepper.state.join(states, weights)
     stepper.each_case += cases
     stepper.remodeling.further += [case.drive for case in cases]
