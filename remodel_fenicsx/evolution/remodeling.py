@@ -68,14 +68,16 @@ class RemodelingPass(Remodels):
         beside: Sequence[Remodels] = (),
     ):
         # `beside` has the remodeling processes in addition to the cells.
-        self.state, self.settings, self.beside = state, settings, list(beside)
+        self.state, self.settings = state, settings
+        self.beside = list(beside)
         self.quadrature = state.cells.quadrature
         # Drives of further load cases, which have the same cells.
         self.further: list[Callable[[], Drive]] = []
         # Relaxation factor of a pass's change of the cells.
         self.relaxation = settings.relaxation_factor if COUPLINGS[settings.coupling].makes_a_share else 1.0
         self.parameters = state.parameters(tissue)
-        self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
+        self.driver, self.law = DRIVERS[settings.driver], LAWS[settings.law]
+        self.frame = FRAMES[settings.frame]
         self.set_kappa(settings.kappa if kappa is None else kappa)
         if self.fastest == 0.0 and self.law.asks_kappa:  # cells that never change need no pass
             self.law = LAWS["none"]
@@ -89,7 +91,7 @@ class RemodelingPass(Remodels):
         self.stresses = PointStresses(state, tissue)
         tensor = ufl.as_ufl(self.driver.tensor(F, self.stresses.ufl))
         self._expression = jit.expression(tensor, self.quadrature.points)
-        self._known: Remembered[Array] = Remembered(state.comm, tensor)
+        self._cached_tensor: Remembered[Array] = Remembered(state.comm, tensor)
         self._target = self.law.target
         if self._target is tensor_target and not settings.has_set_point and not in_numpy():
             from remodel_fenicsx.kernels.tensor import TensorKernels
@@ -125,7 +127,7 @@ class RemodelingPass(Remodels):
             tensor = self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
             return (tensor + np.swapaxes(tensor, 1, 2)) / 2
 
-        return self.state.elastic_gradient(), self._known(evaluated)
+        return self.state.elastic_gradient(), self._cached_tensor(evaluated)
 
     def drive(self, residual: float = 0.0) -> Drive:
         """Return the drive of the present state, which was accepted with this residual norm."""
@@ -140,8 +142,9 @@ class RemodelingPass(Remodels):
     def _own_drive(self, residual: float) -> Drive:
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
+        cells = self.state.cells
         # Principal axes of the driver for which the cells' axes would stay.
-        steady = self.state.cells.point_cells.axes
+        steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
             steady = carried_axes(F, steady)
         return Drive(
@@ -150,7 +153,7 @@ class RemodelingPass(Remodels):
             self.driver,
             self.frame,
             noise,
-            self.state.cells.initial_dimensions.reshape(-1, 3),
+            cells.initial_dimensions.reshape(-1, 3),
             self.parameters.at_points().end_to_end_length,
             self.kappa,
             pairing=spectral.PAIRINGS[self.settings.pairing],
@@ -170,18 +173,19 @@ class RemodelingPass(Remodels):
         if not self.driver.is_stress:
             return Noise(spectral.ROUNDING, spectral.ROUNDING)
         rounding = STRESS_ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
-        displacement = float(np.abs(self.state.unknown.x.array).max(initial=0.0))
-        displacement = over_ranks(self.state.comm, displacement, MPI.MAX)
+        state = self.state
+        displacement = float(np.abs(state.unknown.x.array).max(initial=0.0))
+        displacement = over_ranks(state.comm, displacement, MPI.MAX)
         rounded = rounding * (1 + self.quadrature.largest_gradient * displacement)
         squares = np.sum(tensor**2, axis=(1, 2)).reshape(self.quadrature.shape)
         typical = float(np.sqrt(self.quadrature.mean(squares)))
         unbalanced = RESIDUAL_SHARE * residual / self._smallest_area
-        most = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
-        if unbalanced > max(WORTH_A_WORD * typical, most) and not self._numbers["said"]:
+        limit = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
+        if unbalanced > max(WORTH_A_WORD * typical, limit) and not self._numbers["said"]:
             self._numbers["said"] = 1
-            if self.state.comm.rank == 0:
-                log.warning(LOOSE_SOLVER, unbalanced, typical, most)
-        noise = Noise(rounded + min(unbalanced, most), rounding)
+            if state.comm.rank == 0:
+                log.warning(LOOSE_SOLVER, unbalanced, typical, limit)
+        noise = Noise(rounded + min(unbalanced, limit), rounding)
         if self.law.target is not None and typical > self._numbers["stress"]:
             self._numbers["stress"], self._numbers["floor"] = typical, float(floor_above(*noise))
         return noise
@@ -254,14 +258,14 @@ class RemodelingPass(Remodels):
         # The power is the stored energy that the pass releases at frozen deformation, per time, to
         # first order (`Tissue.energy_increment`; Remark 6). A principal stress above `noise` counts
         # as tension. The factor `relaxation` applies to the change of the cells (`Law.share`).
-        asked, F = self.updated_cells(time_old, time_new, residual)
-        return self.replace(asked, F, time_new - time_old, self.relaxation)
+        full_pass, F = self.updated_cells(time_old, time_new, residual)
+        return self.replace(full_pass, F, time_new - time_old, self.relaxation)
 
-    def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
+    def replace(self, full_pass: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
         """Replace the cells with a relaxation factor; return the power at frozen F."""
         cells = self.state.cells
-        self._change = cells.point_cells.copy(), asked
-        updated = self.law.share(self._change[0], asked, factor)
+        self._change = cells.point_cells.copy(), full_pass
+        updated = self.law.share(self._change[0], full_pass, factor)
         increment = self.parameters.at_points().energy_increment(F, self._change[0], updated)
         power: float = 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
         cells.set(*updated[:2])
@@ -271,8 +275,9 @@ class RemodelingPass(Remodels):
         """Record the cells of a pass to the limit for `distance`; the state does not change."""
         # The time of the steady state is so late that the start has decayed (`Scene.last_time`). A
         # pass to twice that time leads to the limit.
-        asked, _ = self.updated_cells(time, 2 * time, residual)
-        self._change = self.state.cells.point_cells.copy(), asked
+        full_pass, _ = self.updated_cells(time, 2 * time, residual)
+        cells = self.state.cells
+        self._change = cells.point_cells.copy(), full_pass
 
     def distance(self) -> float:
         """Return max |A_pass - A| of the last pass, in squared link lengths."""
@@ -328,11 +333,12 @@ class RemodelingPass(Remodels):
 
     def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
         """Apply a multiple of the change of a pass up to a time."""
-        asked, _ = self.updated_cells(self.state.time, time, residual)
-        self.set(relaxed(self.state.cells.point_cells.copy(), asked, factor))
+        remodeled, _ = self.updated_cells(self.state.time, time, residual)
+        cells = self.state.cells
+        self.set(relaxed(cells.point_cells.copy(), remodeled, factor))
 
     def _change_by_a_pass(self, time: float, residual: float) -> Array:
         """Return the change of A by a pass up to a time, (elements, points, 3, 3)."""
-        asked, _ = self.updated_cells(self.state.time, time, residual)
+        remodeled, _ = self.updated_cells(self.state.time, time, residual)
         present = self.state.cells.structure_tensor()
-        return np.asarray(structure_tensor(*asked[:2]).reshape(present.shape) - present)
+        return np.asarray(structure_tensor(*remodeled[:2]).reshape(present.shape) - present)
