@@ -337,7 +337,8 @@ class Stepper(LoadCaseSolver):
         coupling: Maker | None = None,
         kappa: float | Function | None = None,
     ):
-        self.state, self.load_values, self._solver = state, load_values, solver
+        self.state, self._solver = state, solver
+        self.load_values = load_values
         beside: list[Remodels] = []
         for kind in remodeling.beside:
             beside.append(kind.make(state, tissue, remodeling))
@@ -351,7 +352,7 @@ class Stepper(LoadCaseSolver):
             log.warning(
                 "kappa is 0: the cells do not change; %s uses the coupling 'staggered' in place of "
                 "%r, with an error of first order in the step size",
-                ", ".join(part.name for part in beside),
+                ", ".join(process.name for process in beside),
                 remodeling.coupling,
             )
         make = coupling or COUPLINGS[name].make
@@ -371,17 +372,18 @@ class Stepper(LoadCaseSolver):
         name
             Name of the process, such as "turnover" (`Remodels.name`).
         """
-        return next((part for part in self.remodels if part.name == name), None)
+        return next((process for process in self.remodels if process.name == name), None)
 
     @property
     def slowest(self) -> float:
         """Smallest positive rate, 1/time; 0 if nothing remodels."""
-        return min((part.slowest for part in self.remodels if part.changes and part.slowest), default=0.0)
+        rates = (process.slowest for process in self.remodels if process.changes)
+        return min(filter(None, rates), default=0.0)
 
     @property
     def fastest(self) -> float:
         """Largest rate, 1/time; 0 if nothing remodels."""
-        return max((part.fastest for part in self.remodels if part.changes), default=0.0)
+        return max((process.fastest for process in self.remodels if process.changes), default=0.0)
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
         """Pass the present state to watchers as a step; at first solve for unloaded equilibrium.
@@ -450,7 +452,8 @@ class Stepper(LoadCaseSolver):
         BaseException
             Any exception, also from a watcher; the state is then that of the last committed step.
         """
-        state, start, processor_start = self.state, clock.perf_counter(), clock.process_time()
+        state = self.state
+        start, processor_start = clock.perf_counter(), clock.process_time()
         if self._closed:
             raise RuntimeError("the stepper or its simulation has been closed; create a new one")
         if time <= state.time:
@@ -529,12 +532,12 @@ class Stepper(LoadCaseSolver):
         held
             The time.
         """
-        given = self.load_values
-        self.load_values = lambda time: given(min(time, held))
+        load_values = self.load_values
+        self.load_values = lambda time: load_values(min(time, held))
         try:
             yield
         finally:
-            self.load_values = given
+            self.load_values = load_values
 
     def close(self) -> None:
         """Free PETSc's objects and options; the state stays, but no further step is possible."""
@@ -556,7 +559,8 @@ class FixedSteps:
     """Time stepping with a constant step size."""
 
     def __init__(self, stepper: Stepper, end: float, step: float, judge: Callable[[Step], object] = lambda step: None):
-        self.stepper, self.end, self.step, self.judge = stepper, end, step, judge
+        self.stepper, self.judge = stepper, judge
+        self.end, self.step = end, step
 
     def remaining(self) -> list[float]:
         """Return the times of the remaining steps."""
@@ -569,20 +573,20 @@ class FixedSteps:
 
 def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work) -> None:
     """Equilibrate a body with prestretch, in substeps as needed. Collective."""
-    G, one = state.natural_gradient, np.eye(3)
-    if G is None or state.kinematics.closing is not None or not state.cells.quadrature.maximum(np.abs(G - one)):
+    G, identity = state.natural_gradient, np.eye(3)
+    if G is None or state.kinematics.closing is not None or not state.cells.quadrature.maximum(np.abs(G - identity)):
         return
-    whole = G.copy()
+    prestretch = G.copy()
 
     def set_fraction(fraction: float) -> None:
-        G[:] = whole if fraction == 1.0 else one + fraction * (whole - one)
+        G[:] = prestretch if fraction == 1.0 else identity + fraction * (prestretch - identity)
 
     with state.transaction(), closing(GuardedNewton(equilibrium, settings)) as newton:
         change = Change(state.time, "the prestretch", set_fraction, state, lambda: newton, settings.maximum_halvings)
         try:
             change.advance(work)
         finally:
-            G[:] = whole
+            G[:] = prestretch
     log.info("prestretched body equilibrated in %d substeps", work.substeps)
 
 
@@ -636,8 +640,9 @@ REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall
 class Pause(Watcher):
     """Watcher that raises `Paused` on all ranks on request, or before a time limit."""
 
-    def __init__(self, comm: MPI.Comm, folder: Path, asked: Callable[[], bool], deadline: float | None = None):
-        self.comm, self.folder, self.asked, self.deadline = comm, folder, asked, deadline
+    def __init__(self, comm: MPI.Comm, folder: Path, is_requested: Callable[[], bool], deadline: float | None = None):
+        self.comm, self.folder = comm, folder
+        self.is_requested, self.deadline = is_requested, deadline
         self._last = clock.monotonic()
         self._seconds = 0.0  # wall time of a step with its output
 
@@ -658,10 +663,10 @@ class Pause(Watcher):
             self._check(step)
 
     def _check(self, step: Step) -> None:
-        reason = BY_SIGNAL if self.asked() else NOT_ASKED
+        reason = BY_SIGNAL if self.is_requested() else NOT_ASKED
         if self.deadline is not None and self.comm.rank == 0 and not reason:
             late = clock.monotonic() + MARGIN * self._seconds > self.deadline
             reason = BY_CLOCK if late else NOT_ASKED
-        asked = [one for one in self.comm.allgather(reason) if one]
-        if asked:
-            raise Paused(REASONS[asked[0]], step.time, self.folder)
+        reasons = [code for code in self.comm.allgather(reason) if code]
+        if reasons:
+            raise Paused(REASONS[reasons[0]], step.time, self.folder)
