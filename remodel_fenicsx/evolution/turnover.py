@@ -44,7 +44,8 @@ class Growth:
     """Volumetric growth by deposited collagen: G at all points, thickening across the wall."""
 
     def __init__(self, state: State, settings: Turnover):
-        self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
+        self.state, self.settings = state, settings
+        self.quadrature = state.cells.quadrature
         self.start = settings.start  # a path to the steady state may set it later
         kinematics = state.kinematics
         assert isinstance(kinematics, NaturalConfiguration)
@@ -87,9 +88,9 @@ class Growth:
             # The strain of an element cannot follow a higher degree, which would alternate between
             # points.
             ratio = ratio - self.quadrature.beyond(self.quadrature.element_degree - 1, ratio[..., None])[..., 0]
-        if (least := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
+        if (smallest := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
             text = f"time {self.state.time:g}: tissue volume below {100 * LEAST_VOLUME:g} %"
-            raise StepFailure(self.state.time, f"{text} of its initial value: J_g = {least:.3g}", GONE)
+            raise StepFailure(self.state.time, f"{text} of its initial value: J_g = {smallest:.3g}", GONE)
         self.set(ratio)
 
     def set(self, ratio: Array) -> None:
@@ -119,12 +120,14 @@ class TurnoverPass(Remodels):
 
     # The values are ln m and ln rho, (2, n).
 
-    name, components, changes, depends_on_path = "turnover", len(TURNED_OVER), True, True
+    name, components = "turnover", len(TURNED_OVER)
+    changes, depends_on_path = True, True
 
     def __init__(self, state: State, tissue: Tissue, remodeling: Remodeling):
         settings = remodeling.turnover
         assert settings.time is not None
-        self.state, self.settings, self.quadrature = state, settings, state.cells.quadrature
+        self.state, self.settings = state, settings
+        self.quadrature = state.cells.quadrature
         turned_over = {name: self.quadrature.function(name, ()) for name in TURNED_OVER}
         for function in turned_over.values():
             function.x.array[:] = 1.0
@@ -152,7 +155,8 @@ class TurnoverPass(Remodels):
     # ------------------------------------------------------------ over a step
     def before(self, time: float, order: int) -> None:
         """Change m and rho by the rates of the last row, or for order 2 by mid-step rates."""
-        duration, last, rates = time - self.state.time, self._numbers["duration"], self.rates()
+        duration, last = time - self.state.time, self._numbers["duration"]
+        rates = self.rates()
         self._numbers["duration"], self._start_rates = duration, None
         if order == 1:
             self.change(rates, last)
@@ -263,8 +267,10 @@ class TurnoverPass(Remodels):
     def rates(self, present: bool = False) -> Array:
         """Return d ln m / dt and d ln rho / dt of the row, (2, n); mean over load cases."""
         states = (self.state, *self.state.others)
-        parts = [np.array(self._rates(state, present)) for state in states]
-        return np.asarray(sum(weight * part for weight, part in zip(self.state.weights, parts, strict=True)))
+        rates = [np.array(self._rates(state, present)) for state in states]
+        return np.asarray(
+            sum(weight * case_rates for weight, case_rates in zip(self.state.weights, rates, strict=True))
+        )
 
     def _rates(self, state: State, present: bool) -> TurnoverRates:
         """Return the rates in one load case, with present cells or those of the row."""
