@@ -76,8 +76,8 @@ class CellField:
 
     def equals(self, other: CellField) -> bool:
         """Return whether all values of this rank are equal."""
-        mine, others = (self.dimensions, self.axes), (other.dimensions, other.axes)
-        return all(np.array_equal(a.x.array, b.x.array) for a, b in zip(mine, others, strict=True))
+        pairs = (self.dimensions, other.dimensions), (self.axes, other.axes)
+        return all(np.array_equal(a.x.array, b.x.array) for a, b in pairs)
 
     @cached_property
     def kernels(self) -> PointKernels:
@@ -244,15 +244,17 @@ class State:
         loading: Loading,
         formulation: Formulation = FORMULATIONS["displacement"],
     ):
-        self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
+        self.unknown, self.kinematics = unknown, kinematics
+        self.cells, self.loading = cells, loading
         self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
         F = kinematics.deformation_gradient(unknown)
         # G, if the mesh is not stress-free, and its initial value, if the body grows.
         self._natural = getattr(kinematics, "gradient", None)
         self._initial = getattr(kinematics, "initial", None)
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
-        self._known: Remembered[Array] = Remembered(None, F)
-        self._known_elastic: Remembered[Array] = Remembered(None, kinematics.elastic_gradient(unknown))
+        self._cached_gradient: Remembered[Array] = Remembered(None, F)
+        F_e = kinematics.elastic_gradient(unknown)
+        self._cached_elastic_gradient: Remembered[Array] = Remembered(None, F_e)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.others: Sequence[State] = ()
         self.weights: Sequence[float] = (1.0,)
@@ -276,7 +278,8 @@ class State:
     @property
     def comm(self) -> MPI.Intracomm:
         """Communicator of the mesh."""
-        return self.cells.quadrature.mesh.comm
+        quadrature = self.cells.quadrature
+        return quadrature.mesh.comm
 
     @property
     def number_of_owned_unknowns(self) -> int:
@@ -307,7 +310,8 @@ class State:
             F with ghost elements; read-only.
         """
         quadrature = self.cells.quadrature
-        return self._known(lambda: quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3))
+        expression = self._deformation_gradient
+        return self._cached_gradient(lambda: quadrature.evaluate(expression, (3, 3)).reshape(-1, 3, 3))
 
     @property
     def natural_gradient(self) -> NDArray[np.float64] | None:
@@ -345,7 +349,9 @@ class State:
         if self._natural is None:
             return self.deformation_gradient()
         shape = (*self.cells.quadrature.shape, 3, 3)
-        return self._known_elastic(lambda: self.elastic(self.deformation_gradient().reshape(shape)).reshape(-1, 3, 3))
+        return self._cached_elastic_gradient(
+            lambda: self.elastic(self.deformation_gradient().reshape(shape)).reshape(-1, 3, 3)
+        )
 
     def parameters(self, tissue: Tissue) -> Parameters:
         """Return the parameters of a tissue on this mesh, cached. Collective on first call.
@@ -355,11 +361,12 @@ class State:
         tissue
             Tissue with numbers, or as in `Parameters.tissue`.
         """
-        known = next((one for one in self.cells.prepared if tissue is one.given or tissue is one.tissue), None)
-        if known is None:
-            known = Parameters(tissue, self.cells.quadrature)
-            self.cells.prepared.append(known)
-        return known
+        for prepared in self.cells.prepared:
+            if tissue is prepared.given or tissue is prepared.tissue:
+                return prepared
+        prepared = Parameters(tissue, self.cells.quadrature)
+        self.cells.prepared.append(prepared)
+        return prepared
 
     def per_mesh_volume(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert values per initial stress-free volume to values per mesh volume.
@@ -381,10 +388,10 @@ class State:
     def functions(self) -> dict[str, dolfinx.fem.Function]:
         """Return all dolfinx functions of the state by name; further load cases add "@2", ..."""
         shared = {self.cells.dimensions.name, self.cells.axes.name}
-        found = dict(self._functions)
+        functions = dict(self._functions)
         for mark, case in list(self.each_case().items())[1:]:
-            found |= {f"{name}{mark}": function for name, function in case._functions.items() if name not in shared}
-        return found
+            functions |= {f"{name}{mark}": function for name, function in case._functions.items() if name not in shared}
+        return functions
 
     def join(self, others: Sequence[State], weights: Sequence[float]) -> None:
         """Add states of further load cases with the same cells.
@@ -497,7 +504,8 @@ class Numbers:
     """Numbers of the state with a prefix; transactions restore them, checkpoints contain them."""
 
     def __init__(self, state: State, name: str, initial: Mapping[str, float]):
-        self.state, self.name, self.initial = state, name, dict(initial)
+        self.state, self.name = state, name
+        self.initial = dict(initial)
         # Computed once, because steps read numbers often.
         self._keys = {key: f"{name}_{key}" for key in self.initial}
 
@@ -552,9 +560,9 @@ class Earlier:
 
     def push_owned(self, values: Array) -> None:
         """Add a value without ghosts. Collective."""
-        whole = np.zeros_like(self._arrays[0])
-        whole[: len(values)] = values
-        self.push(whole)
+        padded = np.zeros_like(self._arrays[0])
+        padded[: len(values)] = values
+        self.push(padded)
         self._functions[0].x.scatter_forward()
 
     def forget(self) -> None:
@@ -581,11 +589,12 @@ def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
 
 def by_region(domain: Domain, values: Mapping[str, float]) -> dolfinx.fem.Function:
     """Return a DG0 Function with values by region name; "" is the value of all other regions."""
-    found = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
-    places = found.function_space.dofmap.list.reshape(-1)
+    function = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
+    dofmap = function.function_space.dofmap
+    dofs = dofmap.list.reshape(-1)
     for name, number in domain.regions.items():
-        found.x.array[places[domain.element_region == number]] = values[name if name in values else ""]
-    return found
+        function.x.array[dofs[domain.element_region == number]] = values[name if name in values else ""]
+    return function
 
 
 class Parameters:
@@ -601,7 +610,8 @@ class Parameters:
     """
 
     def __init__(self, tissue: Tissue, quadrature: Quadrature):
-        self.given, self.quadrature, mesh = tissue, quadrature, quadrature.mesh
+        self.given, self.quadrature = tissue, quadrature
+        mesh = quadrature.mesh
         self.tissue = tissue.map(
             lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value)
         )
@@ -613,15 +623,15 @@ class Parameters:
     def largest(self) -> Tissue:
         """Return the tissue with the largest value of each parameter in the body. Collective."""
 
-        def found() -> Tissue:
-            whole = self.compiled.map(lambda name, value: assembly.largest(value, self.quadrature.mesh))
+        def largest_values() -> Tissue:
+            maxima = self.compiled.map(lambda name, value: assembly.largest(value, self.quadrature.mesh))
             if not isinstance(self.tissue.contour_length, dolfinx.fem.Function):
-                return whole
+                return maxima
             lengths = self.at_points().contour_length.reshape(self.quadrature.shape)
             of_chains = self.quadrature.maximum(np.where(self.has_chains(), lengths, 0.0))
-            return replace(whole, contour_length=of_chains or whole.contour_length)
+            return replace(maxima, contour_length=of_chains or maxima.contour_length)
 
-        return self._largest(found)
+        return self._largest(largest_values)
 
     def at_points(self) -> Tissue:
         """Return the tissue with parameters at points, (elements * points,), cached; read-only."""
@@ -654,9 +664,9 @@ def parameters_of(
     domain: Domain,
 ) -> tuple[Tissue, float | dolfinx.fem.Function]:
     """Return tissue and kappa of a scene's regions: numbers if equal, else DG0 Functions."""
-    tissues, kappas = _tissues(properties), {name: one.kappa for name, one in properties.items()}
+    tissues, kappas = _tissues(properties), {name: region.kappa for name, region in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
-    if any(other != tissue for other in tissues.values()):
+    if any(region_tissue != tissue for region_tissue in tissues.values()):
         tissue = tissue.map(lambda key, _: by_region(domain, {name: t.parameters[key] for name, t in tissues.items()}))
     return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
 
@@ -664,14 +674,14 @@ def parameters_of(
 def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
     """Return tissues of all regions with one chain law and one matrix energy."""
     # Regions without chains get a contour length that never locks.
-    found = {name: one.tissue for name, one in properties.items()}
-    chain = next((tissue.chain for tissue in found.values() if tissue.chain is not None), None)
-    matrices = list(dict.fromkeys(one.material.matrix for one in properties.values()))
-    for name, tissue in found.items():
+    tissues = {name: region.tissue for name, region in properties.items()}
+    chain = next((tissue.chain for tissue in tissues.values() if tissue.chain is not None), None)
+    matrices = list(dict.fromkeys(region.material.matrix for region in properties.values()))
+    for name, tissue in tissues.items():
         if chain is not None and tissue.chain is None:
             length = NEVER_LOCKED if chain.locks else tissue.contour_length
-            found[name] = replace(tissue, chain=chain, contour_length=length)
-    return found if len(matrices) == 1 else _with_one_matrix(found, properties, matrices)
+            tissues[name] = replace(tissue, chain=chain, contour_length=length)
+    return tissues if len(matrices) == 1 else _with_one_matrix(tissues, properties, matrices)
 
 
 def _with_one_matrix(
@@ -679,9 +689,9 @@ def _with_one_matrix(
 ) -> dict[str, Tissue]:
     mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # see rules.tissue_of_regions
     defaults = {name: number.default for name, number in mixture.parameters.items()}
-    found = {}
+    mixtures = {}
     for name, tissue in tissues.items():
-        share = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
+        weight = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
         own = getattr(tissue.matrix, "values", {})
-        found[name] = replace(tissue, matrix=mixture.of({**defaults, **own, **share}))
-    return found
+        mixtures[name] = replace(tissue, matrix=mixture.of({**defaults, **own, **weight}))
+    return mixtures
