@@ -89,9 +89,11 @@ class Simulation:
             )
         take_back_signals()
         parts = build(scene, comm, domain, coupling)
-        self.scene, self.domain, self.stepper, self.observer = parts.scene, parts.domain, parts.stepper, parts.observer
-        self.state, self.way = parts.stepper.state, parts.way
-        self.unknown, self.cells, self.loading = self.state.unknown, self.state.cells, self.state.loading
+        self.scene, self.domain = parts.scene, parts.domain
+        self.stepper, self.observer = parts.stepper, parts.observer
+        self.state, self.way = self.stepper.state, parts.way
+        self.unknown, self.cells = self.state.unknown, self.state.cells
+        self.loading = self.state.loading
         self.quadrature, self.tissue = self.cells.quadrature, self.stepper.tissue
         self.watchers = watchers(self.scene, parts)
 
@@ -158,8 +160,8 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
     tissue, kappa = parameters_of(scene.properties(), domain)
     solver, (first, *more) = _solver(scene), (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, first, coupling, kappa)
-    for part in stepper.remodels:
-        part.begin_with(partial(in_files, fibres, quadrature=state.cells.quadrature, domain=domain))
+    for process in stepper.remodels:
+        process.begin_with(partial(in_files, fibres, quadrature=state.cells.quadrature, domain=domain))
     if others:
         from remodel_fenicsx.evolution import load_cases
 
@@ -214,29 +216,30 @@ def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
     """Return the watchers in order: eigenvalues before the row, warnings after the row."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
-    found: list[Watcher | None] = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
-    found += [kind.make(scene, stepper) for kind in WATCHERS.values()]
-    found += [make(scene, stepper) for part in stepper.remodels for make in part.watchers]
+    candidates: list[Watcher | None] = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
+    candidates += [kind.make(scene, stepper) for kind in WATCHERS.values()]
+    candidates += [make(scene, stepper) for process in stepper.remodels for make in process.watchers]
     for case in stepper.each_case[1:]:
-        own: list[Watcher | None] = [EquilibriumStability(case, unstable)]
-        own += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
-        found += [case.watched(watcher) for watcher in own if watcher is not None]
-    return [watcher for watcher in found if watcher is not None]
+        case_watchers: list[Watcher | None] = [EquilibriumStability(case, unstable)]
+        case_watchers += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
+        candidates += [case.watched(watcher) for watcher in case_watchers if watcher is not None]
+    return [watcher for watcher in candidates if watcher is not None]
 
 
 def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
     """Reset a simulation with new numbers of its scene; return False if it must be rebuilt."""
     # The numbers are those of tissue, kappa, loads and opening angle.
     tissue, kappa = parameters_of(scene.properties(), simulation.domain)
-    known, stepper, kinematics = simulation.stepper.tissue.parameters, simulation.stepper, simulation.state.kinematics
+    stepper, kinematics = simulation.stepper, simulation.state.kinematics
+    parameters = stepper.tissue.parameters
     varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
     # Adaptive time stepping, growth and the stability check hold numbers of the scene.
     chosen = not isinstance(simulation.way, FixedSteps)
     watched = chosen or kinematics.grows or scene.solver.unstable == "stop"
-    if watched or any(varies[name] and not isinstance(known[name], Function) for name in varies):
+    if watched or any(varies[name] and not isinstance(parameters[name], Function) for name in varies):
         return False
     for name, value in tissue.parameters.items():
-        numbers = known[name].x.array if isinstance(known[name], Function) else known[name].value
+        numbers = parameters[name].x.array if isinstance(parameters[name], Function) else parameters[name].value
         numbers[...] = value.x.array if varies[name] else value
     stepper.take(partial(values_of_loads, scene.loads), kappa)
     simulation.state.restore(start)
