@@ -1,4 +1,4 @@
-"""A scene brought to life: builds the parts in their order and steps them through time."""
+"""Simulation of a scene: construction of its components, and time stepping."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TIME_ERROR = "time_error"  # the column
 
 
 class Simulation:
-    """Everything that a scene needs, built and ready to step.
+    """Simulation of a scene, ready for time stepping.
 
     Parameters
     ----------
@@ -39,26 +39,27 @@ class Simulation:
     comm
         MPI communicator of the mesh.
     domain
-        A mesh of the scene's body to take in place of the one that the scene asks for.
+        Mesh of the scene's body in place of the mesh that the scene specifies.
     coupling
-        Makes a coupling in place of the one that the scene names.
+        Factory of a coupling in place of the coupling that the scene names.
 
     Attributes
     ----------
     domain, unknown, quadrature, cells, loading, state, tissue, stepper, observer
-        The parts, each usable by itself (see demos/).
+        Components of the simulation, each usable alone (see demos/).
     way
-        Goes through time: in steps of one length, in chosen ones where the scene has a tolerance, or until all rests.
+        Time stepping strategy: constant steps, adaptive steps if the scene has a tolerance, or
+        steps to the steady state.
     watchers
-        Who follows its steps, in their order: the stability of equilibria, the observer, and those of
-        `extend.WATCHERS`; what they remember is part of the state.
+        Watchers of the steps, in order: stability of equilibria, the observer, and those of
+        `extend.WATCHERS`. Their records belong to the state.
 
     Raises
     ------
     SceneError
         If `domain` is not a mesh of the scene's body and elements.
     TypeError
-        If `scene` is none.
+        If `scene` is not a `Scene`.
 
     Examples
     --------
@@ -69,7 +70,7 @@ class Simulation:
     ...     print(step.time, round(step.row["mean_stretch"], 3))
     1.0 1.081
     2.0 1.172
-    >>> simulation.cells.dimension_values.shape  # l_I of this rank, (elements, points, 3), in link lengths
+    >>> simulation.cells.dimension_values.shape  # l_I of this rank, (elements, points, 3)
     (1, 8, 3)
     >>> simulation.close()
     """
@@ -87,26 +88,41 @@ class Simulation:
             )
         take_back_signals()
         parts = build(scene, comm, domain, coupling)
-        self.scene, self.domain, self.stepper, self.observer = parts.scene, parts.domain, parts.stepper, parts.observer
-        self.state, self.way = parts.stepper.state, parts.way
-        self.unknown, self.cells, self.loading = self.state.unknown, self.state.cells, self.state.loading
+        self.scene, self.domain = parts.scene, parts.domain
+        self.stepper, self.observer = parts.stepper, parts.observer
+        self.state, self.way = self.stepper.state, parts.way
+        self.unknown, self.cells = self.state.unknown, self.state.cells
+        self.loading = self.state.loading
         self.quadrature, self.tissue = self.cells.quadrature, self.stepper.tissue
         self.watchers = watchers(self.scene, parts)
 
     def load_values(self, time: float, case: int = 0) -> LoadValues:
-        """Magnitude of every load at a time, in a load case; the first is 0."""
+        """Return the magnitudes of all loads at a time.
+
+        Parameters
+        ----------
+        time
+            The time.
+        case
+            Index of the load case; 0 is the first.
+        """
         return values_of_loads(list(self.scene.each_case())[case].loads, time)
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """Solve and remodel step by step, from where the state is; what is yielded has been accepted.
+        """Solve and remodel from the present state, and yield each accepted step.
 
-        The row and the fields belong to the solved state. With the couplings "staggered" and "relaxed" the cells seen
-        at a yield are one pass ahead of them (docs/theory.md, Couplings).
+        The row and the fields belong to the solved state. With the couplings "staggered" and
+        "relaxed" the cells at a yield are one pass ahead of them (docs/theory.md, Couplings).
 
         Parameters
         ----------
         watchers
-            Who else follows the steps; those who watch the stability and fill each step's row come first.
+            Additional watchers; those of the simulation come first.
+
+        Yields
+        ------
+        Step
+            The accepted steps.
 
         Raises
         ------
@@ -124,7 +140,7 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Parts:
-    """What a scene needs: its choices made, the mesh, and who goes through time; the state is the stepper's."""
+    """Components of a simulation: resolved scene, mesh, stepper, observer and time stepping."""
 
     scene: Scene
     domain: Domain
@@ -134,17 +150,17 @@ class Parts:
 
 
 def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: Maker | None = None) -> Parts:
-    """The parts of a scene in their order. Collective."""
+    """Build the components of a scene in their order. Collective."""
     scene, domain = meshed(scene, comm, domain)
     fibres = measured_fibres(scene, domain)
     state, *others = initial_states(scene, domain, fibres)
     if others and coupling is not None:
-        raise SceneError("cases: a coupling of your own solves one load case; leave out [[cases]]")
+        raise SceneError("cases: a custom coupling solves one load case; remove [[cases]]")
     tissue, kappa = parameters_of(scene.properties(), domain)
     solver, (first, *more) = _solver(scene), (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, first, coupling, kappa)
-    for part in stepper.remodels:
-        part.begin_with(partial(in_files, fibres, quadrature=state.cells.quadrature, domain=domain))
+    for process in stepper.remodels:
+        process.begin_with(partial(in_files, fibres, quadrature=state.cells.quadrature, domain=domain))
     if others:
         from remodel_fenicsx.evolution import load_cases
 
@@ -155,7 +171,8 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
 
 
 def _solver(scene: Scene) -> Solver:
-    """Its settings; a prediction costs more than it gives where neither a tolerance nor rest asks for exact rows."""
+    """Return the solver settings, without a predictor if it costs more time than it saves."""
+    # A predictor helps only if a tolerance or the steady state requires accurate rows.
     solver, time = scene.solver, scene.time
     if solver.predictor == "with-tolerance" and time.tolerance is None and not time.is_equilibrium:
         return solver.model_copy(update={"predictor": "none"})
@@ -163,16 +180,17 @@ def _solver(scene: Scene) -> Solver:
 
 
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
-    """Its settings; on a path to rest through random cells no step is short enough, and passes swing."""
+    """Return the remodeling settings; the path to a steady state with random cells is relaxed."""
+    # No step is small enough to resolve changes of order of random cells, and passes oscillate.
     if not (scene.time.is_equilibrium and scene.has_random_cells and scene.jumps_by_rank):
         return scene.remodeling
     if comm.rank == 0:
-        log.info("the path to the equilibrium takes the coupling 'relaxed': random cells swing from rank to rank")
+        log.info("the path to the equilibrium takes the coupling 'relaxed': random cells oscillate")
     return scene.remodeling.model_copy(update={"coupling": "relaxed"})
 
 
 def _way(scene: Scene, stepper: Stepper) -> Way:
-    """Who goes through time: in steps of one length, in chosen ones, or until all rests."""
+    """Return the time stepping: constant steps, adaptive steps, or steps to the steady state."""
     time, stops = scene.time, scene.stops()
     if not (time.is_equilibrium or time.chooses or TIME_ERROR in scene.output.columns):
         return FixedSteps(stepper, time.end, time.step)
@@ -194,31 +212,33 @@ def _way(scene: Scene, stepper: Stepper) -> Way:
 
 
 def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
-    """Who follows the steps, in their order: a row has the eigenvalues, and warnings come after it."""
+    """Return the watchers in order: eigenvalues before the row, warnings after the row."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
-    found: list[Watcher | None] = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
-    found += [kind.make(scene, stepper) for kind in WATCHERS.values()]
-    found += [make(scene, stepper) for part in stepper.remodels for make in part.watchers]
+    candidates: list[Watcher | None] = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
+    candidates += [kind.make(scene, stepper) for kind in WATCHERS.values()]
+    candidates += [make(scene, stepper) for process in stepper.remodels for make in process.watchers]
     for case in stepper.each_case[1:]:
-        own: list[Watcher | None] = [EquilibriumStability(case, unstable)]
-        own += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
-        found += [case.watched(watcher) for watcher in own if watcher is not None]
-    return [watcher for watcher in found if watcher is not None]
+        case_watchers: list[Watcher | None] = [EquilibriumStability(case, unstable)]
+        case_watchers += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
+        candidates += [case.watched(watcher) for watcher in case_watchers if watcher is not None]
+    return [watcher for watcher in candidates if watcher is not None]
 
 
 def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
-    """From its start, with other numbers of tissue, kappa, loads and opening angle of its scene; whether it can."""
+    """Reset a simulation with new numbers of its scene; return False if it must be rebuilt."""
+    # The numbers are those of tissue, kappa, loads and opening angle.
     tissue, kappa = parameters_of(scene.properties(), simulation.domain)
-    known, stepper, kinematics = simulation.stepper.tissue.parameters, simulation.stepper, simulation.state.kinematics
+    stepper, kinematics = simulation.stepper, simulation.state.kinematics
+    parameters = stepper.tissue.parameters
     varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
-    # by who knows numbers
+    # Adaptive time stepping, growth and the stability check hold numbers of the scene.
     chosen = not isinstance(simulation.way, FixedSteps)
     watched = chosen or kinematics.grows or scene.solver.unstable == "stop"
-    if watched or any(varies[name] and not isinstance(known[name], Function) for name in varies):
+    if watched or any(varies[name] and not isinstance(parameters[name], Function) for name in varies):
         return False
     for name, value in tissue.parameters.items():
-        numbers = known[name].x.array if isinstance(known[name], Function) else known[name].value
+        numbers = parameters[name].x.array if isinstance(parameters[name], Function) else parameters[name].value
         numbers[...] = value.x.array if varies[name] else value
     stepper.take(partial(values_of_loads, scene.loads), kappa)
     simulation.state.restore(start)

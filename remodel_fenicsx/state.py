@@ -1,4 +1,4 @@
-"""The state of a simulation: what a step changes, a transaction restores and a checkpoint holds."""
+"""State of a simulation: unknowns, unit cells, loads, time, and the parameters of the tissue."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# ---------------------------------------------------------------- the unit cells at the quadrature points
+# ---------------------------------------------------------------- unit cells at quadrature points
 
 
 class CellField:
@@ -42,9 +42,11 @@ class CellField:
     dimensions, axes
         dolfinx quadrature functions of shape (3,) and (3, 3); row I of `axes` is n_I.
     dimension_values, axis_values
-        l_I (elements, points, 3), and n_I as rows (elements, points, 3, 3): the functions' own memory.
+        l_I (elements, points, 3), and n_I as rows (elements, points, 3, 3); views of the functions'
+        arrays.
     point_cells
-        The cells of all points in one row, (elements * points, ...): the functions' own memory.
+        Cells flattened over the quadrature points, (elements * points, ...); views of the
+        functions' arrays.
     """
 
     def __init__(self, quadrature: Quadrature, name: str):
@@ -57,26 +59,39 @@ class CellField:
 
     @property
     def ufl_cell(self) -> UnitCell:
-        """The cell as the energy takes it."""
+        """Unit cell of the functions, for UFL forms."""
         return UnitCell(self.dimensions, self.axes)
 
     def set(self, dimensions: Array, axes: Array) -> None:
-        """Replace all dimensions and axes: by element and point, or of all points in one row."""
+        """Replace all dimensions and axes, by element and point or flattened.
+
+        Parameters
+        ----------
+        dimensions, axes
+            l_I (elements, points, 3) or (n, 3), and n_I as rows (elements, points, 3, 3) or
+            (n, 3, 3).
+        """
         self.point_cells.dimensions[:] = dimensions.reshape(-1, 3)
         self.point_cells.axes[:] = axes.reshape(-1, 3, 3)
 
     def equals(self, other: CellField) -> bool:
-        """Whether all values of this rank are the same numbers."""
-        mine, others = (self.dimensions, self.axes), (other.dimensions, other.axes)
-        return all(np.array_equal(a.x.array, b.x.array) for a, b in zip(mine, others, strict=True))
+        """Return whether all values of this rank are equal."""
+        pairs = (self.dimensions, other.dimensions), (self.axes, other.axes)
+        return all(np.array_equal(a.x.array, b.x.array) for a, b in pairs)
 
     @cached_property
     def kernels(self) -> PointKernels:
-        """What a pass computes at points. Collective, the first time."""
+        """Kernels of the pass at points. Collective on first access."""
         return point_kernels(self.quadrature.mesh.comm)
 
     def structure_tensor(self) -> Array:
-        """A = sum_I l_I^2 n_I (x) n_I, shape (elements, points, 3, 3), in squared link lengths. Collective at first."""
+        """Return A = sum_I l_I^2 n_I (x) n_I in squared link lengths. Collective on first call.
+
+        Returns
+        -------
+        array (elements, points, 3, 3)
+            The structure tensors.
+        """
         return self.kernels.structure_tensor(self.dimension_values, self.axis_values)
 
 
@@ -86,24 +101,24 @@ class UnitCells(CellField):
     Parameters
     ----------
     quadrature
-        The points.
+        Quadrature points.
     domain
-        With the numbers of its elements in the mesh file's order, which are the seed's index: random cells do not
-        depend on the number of ranks.
+        Mesh with the numbers of its elements in the file's order. These index the random numbers,
+        so that random cells do not depend on the number of ranks.
     settings
         Initial dimensions, axes, seed, r0.
     local_axes
-        Of the body at the points (`Shape.local_axes`).
+        Local axes of the body at the points (`Shape.local_axes`).
     regions
-        Initial dimensions and r0 of regions where they are others, by name.
+        Settings by name of regions whose initial dimensions or r0 differ.
     fibres
-        Measured fibres of all elements, (number_of_elements, columns) by name of `model.axes.MEASURED`, by region;
-        "" is the whole body.
+        Measured fibres of all elements, (number_of_elements, columns) by name of
+        `model.axes.MEASURED`, by region; "" is the whole body.
 
     Attributes
     ----------
     local_axes
-        As given.
+        Local axes of the body at the points.
     initial_dimensions
         l0_I by rank (not by direction), shape (elements, points, 3), in link lengths.
 
@@ -112,7 +127,7 @@ class UnitCells(CellField):
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
     >>> cells = simulation.cells
-    >>> cells.dimension_values.shape, cells.axis_values.shape  # (elements, points, 3) and (elements, points, 3, 3)
+    >>> cells.dimension_values.shape, cells.axis_values.shape
     ((1, 8, 3), (1, 8, 3, 3))
     >>> cells.structure_tensor()[0, 0].round(4)
     array([[0.3333, 0.    , 0.    ],
@@ -146,13 +161,13 @@ class UnitCells(CellField):
         self.initial_dimensions: Array = self.dimension_values.copy()
 
     def _take(self, measured: Mapping[str, Array], chosen: NDArray[np.bool_], axes: Array, length: float) -> None:
-        """Cells of measured fibres in the chosen elements; `axes` where these leave some open."""
+        """Set cells of chosen elements from measured fibres; `axes` replace undetermined axes."""
         at_points = {name: values[:, None, :] for name, values in measured.items()}
         tensors = np.broadcast_to(structure_tensors(at_points, self.local_axes.axes[chosen]), axes.shape)
         self.dimension_values[chosen], self.axis_values[chosen] = cells_of(tensors, length, axes)
 
     def initial_axes(self) -> Array:
-        """n_I before the first pass, rows, (elements, points, 3, 3)."""
+        """Return the initial axes n_I as rows, (elements, points, 3, 3)."""
         return AXES[self.settings.axes](self.local_axes)
 
 
@@ -161,7 +176,7 @@ class UnitCells(CellField):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Values of a state: arrays by the names of its functions, loads, time, number of steps, further numbers."""
+    """Values of a state: arrays by function name, loads, time, number of steps, other numbers."""
 
     arrays: dict[str, NDArray[np.float64]]
     loads: dict[str, float]
@@ -172,37 +187,39 @@ class Snapshot:
 
 
 class State:
-    """Unknowns, unit cells, loads and time.
+    """State of a simulation: unknowns, unit cells, loads and time.
 
     Parameters
     ----------
     unknown
         dolfinx function of the unknowns (for full kinematics the displacement).
     kinematics
-        What the unknowns mean.
+        Kinematics that map the unknowns to the deformation gradient.
     cells
         The unit cells.
     loading
-        Supports and loads; its magnitudes are part of the state.
+        Supports and loads; the magnitudes belong to the state.
     formulation
-        Where the elements take the change of volume; default: "displacement".
+        Formulation of the volumetric energy in the elements; default: "displacement".
 
     Attributes
     ----------
     dilatation
         The formulation for these unknowns.
     equilibrium_cells
-        The cells with which the unknowns are in equilibrium. After a staggered step the cells themselves are one pass
-        ahead of them.
+        Cells with which the unknowns are in equilibrium. After a staggered step `cells` are one
+        pass ahead.
     time, number
-        Time of the last committed step, and how many there were.
+        Time and number of the last committed step.
     numbers
-        What else is remembered from step to step, by name: a coupling puts its own here, its functions by `remember`.
+        Other numbers that carry over from step to step, by name. A coupling stores its numbers
+        here, and its functions by `remember`.
     counts
-        Functions that a checkpoint may lack, each with the name of the number that is 0 then: how many are known.
+        Names of functions that a checkpoint may lack, each with the name of a number that counts
+        the known functions and is then 0.
     others, weights
-        States of further load cases, with the same cells: snapshots and checkpoints hold them too. Weights of all, this
-        one first.
+        States of further load cases with the same cells, which snapshots and checkpoints contain
+        too; and weights of all load cases, this state's first.
 
     Examples
     --------
@@ -212,7 +229,7 @@ class State:
     >>> start = state.snapshot()
     >>> for _, step in zip(range(3), simulation.steps()):
     ...     pass
-    >>> state.time, state.number, state.deformation_gradient().shape  # F at all points in one row
+    >>> state.time, state.number, state.deformation_gradient().shape  # F, flattened over the points
     (3.0, 3, (8, 3, 3))
     >>> state.restore(start)
     >>> state.time, float(abs(simulation.unknown.x.array).max())
@@ -227,21 +244,25 @@ class State:
         loading: Loading,
         formulation: Formulation = FORMULATIONS["displacement"],
     ):
-        self.unknown, self.kinematics, self.cells, self.loading = unknown, kinematics, cells, loading
+        self.unknown, self.kinematics = unknown, kinematics
+        self.cells, self.loading = cells, loading
         self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
         F = kinematics.deformation_gradient(unknown)
-        self._natural = getattr(kinematics, "gradient", None)  # G, of a body that is free of stress elsewhere
-        self._initial = getattr(kinematics, "initial", None)  # that of the start, where it grows
+        # G, if the mesh is not stress-free, and its initial value, if the body grows.
+        self._natural = getattr(kinematics, "gradient", None)
+        self._initial = getattr(kinematics, "initial", None)
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
-        self._known: Remembered[Array] = Remembered(None, F)
-        self._known_elastic: Remembered[Array] = Remembered(None, kinematics.elastic_gradient(unknown))
+        self._cached_gradient: Remembered[Array] = Remembered(None, F)
+        F_e = kinematics.elastic_gradient(unknown)
+        self._cached_elastic_gradient: Remembered[Array] = Remembered(None, F_e)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
         self.others: Sequence[State] = ()
         self.weights: Sequence[float] = (1.0,)
-        self.label = ""  # before what is said of it, where there are others
-        # asked on each rank in every solve: the signal (SIGINT, SIGTERM) that should end it, or 0
+        self.label = ""  # prefix of log lines with several load cases
+        # Called on each rank in every solve: returns the signal (SIGINT, SIGTERM) that should end
+        # it, or 0.
         self.stop_signal: Callable[[], int] = lambda: 0
-        self.tell: Callable[[str], object] = lambda words: None  # of a step that is solved in parts
+        self.tell: Callable[[str], object] = lambda words: None  # shows the progress of substeps
         self.settle_cells()
         solved = self.equilibrium_cells
         self._functions: dict[str, dolfinx.fem.Function] = {}
@@ -251,17 +272,18 @@ class State:
         self.time, self.number = 0.0, 0
         self.numbers: dict[str, float] = {}
         self.counts: dict[str, str] = {}
-        # the body starts unloaded; a load that is there from t = 0 on comes with the first step
+        # The body starts unloaded. A load with a value at t = 0 acts from the first step on.
         loading.set(dict.fromkeys(loading.values, 0.0))
 
     @property
     def comm(self) -> MPI.Intracomm:
         """Communicator of the mesh."""
-        return self.cells.quadrature.mesh.comm
+        quadrature = self.cells.quadrature
+        return quadrature.mesh.comm
 
     @property
     def number_of_owned_unknowns(self) -> int:
-        """How many of this rank's unknowns are its own: they come first, ghosts follow."""
+        """Number of unknowns that this rank owns; in arrays ghosts follow them."""
         space = self.unknown.function_space.dofmap
         return int(space.index_map.size_local * space.index_map_bs)
 
@@ -270,77 +292,132 @@ class State:
         return dof_of_node(self.loading.domain.mesh, self.kinematics.nodal_space(self.unknown))
 
     def gathered_displacement(self) -> NDArray[np.float64] | None:
-        """Of the mesh nodes, (n, 3), in the mesh file's order, on rank 0; None on others. Collective."""
+        """Return the displacement of mesh nodes in the mesh file's order on rank 0. Collective.
+
+        Returns
+        -------
+        array (n, 3) or None
+            None on other ranks.
+        """
         return self.loading.domain.gather_nodes(self.kinematics.nodal_displacement(self.unknown)[self._dof_of_node])
 
     def deformation_gradient(self) -> NDArray[np.float64]:
-        """F of the present unknowns at all points of this rank in one row, ghosts included, (n, 3, 3); only to read."""
+        """Return F of the present unknowns, flattened over the quadrature points of this rank.
+
+        Returns
+        -------
+        array (elements * points, 3, 3)
+            F with ghost elements; read-only.
+        """
         quadrature = self.cells.quadrature
-        return self._known(lambda: quadrature.evaluate(self._deformation_gradient, (3, 3)).reshape(-1, 3, 3))
+        expression = self._deformation_gradient
+        return self._cached_gradient(lambda: quadrature.evaluate(expression, (3, 3)).reshape(-1, 3, 3))
 
     @property
     def natural_gradient(self) -> NDArray[np.float64] | None:
-        """G at all points, (elements, points, 3, 3); None where the mesh is free of stress."""
+        """G at all points, (elements, points, 3, 3); None if the mesh is stress-free."""
         return None if self._natural is None else self.cells.quadrature.values(self._natural, (3, 3))
 
     def elastic(self, deformation_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
-        """F_e of F at all points, (elements, points, 3, 3): F itself where the mesh is free of stress."""
+        """Return F_e = F G, or F if the mesh is stress-free.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, (elements, points, 3, 3).
+        """
         G = self.natural_gradient
         return deformation_gradient if G is None else deformation_gradient @ G
 
     def elastic_axes(
         self, axes: NDArray[np.float64], deformation_gradient: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Where F_e carries axes, rows (elements, points, 3, 3); without an F where G does, to the unloaded body."""
+        """Return axes convected by F_e, or without an F by G to the unloaded configuration.
+
+        Parameters
+        ----------
+        axes
+            Rows, (elements, points, 3, 3).
+        deformation_gradient
+            F, (elements, points, 3, 3), or None.
+        """
         gradient = self.natural_gradient if deformation_gradient is None else self.elastic(deformation_gradient)
         return axes if gradient is None else axes @ np.swapaxes(gradient, -1, -2)
 
     def elastic_gradient(self) -> NDArray[np.float64]:
-        """F_e of the present unknowns at all points in one row, (elements * points, 3, 3); only to read."""
+        """Return F_e of the present unknowns, flattened, (elements * points, 3, 3); read-only."""
         if self._natural is None:
             return self.deformation_gradient()
         shape = (*self.cells.quadrature.shape, 3, 3)
-        return self._known_elastic(lambda: self.elastic(self.deformation_gradient().reshape(shape)).reshape(-1, 3, 3))
+        return self._cached_elastic_gradient(
+            lambda: self.elastic(self.deformation_gradient().reshape(shape)).reshape(-1, 3, 3)
+        )
 
     def parameters(self, tissue: Tissue) -> Parameters:
-        """The parameters of a tissue on this mesh, made once for all who ask. Collective, the first time."""
-        known = next((one for one in self.cells.prepared if tissue is one.given or tissue is one.tissue), None)
-        if known is None:
-            known = Parameters(tissue, self.cells.quadrature)
-            self.cells.prepared.append(known)
-        return known
+        """Return the parameters of a tissue on this mesh, cached. Collective on first call.
+
+        Parameters
+        ----------
+        tissue
+            Tissue with numbers, or as in `Parameters.tissue`.
+        """
+        for prepared in self.cells.prepared:
+            if tissue is prepared.given or tissue is prepared.tissue:
+                return prepared
+        prepared = Parameters(tissue, self.cells.quadrature)
+        self.cells.prepared.append(prepared)
+        return prepared
 
     def per_mesh_volume(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values per volume of the start's stress-free tissue as values per volume of the mesh, (elements, points)."""
+        """Convert values per initial stress-free volume to values per mesh volume.
+
+        Parameters
+        ----------
+        values
+            Values at points, (elements, points) or flattened.
+
+        Returns
+        -------
+        array (elements, points)
+            The converted values.
+        """
         quadrature = self.cells.quadrature
         values = values.reshape(quadrature.shape)
         return values if self._initial is None else values / np.linalg.det(quadrature.values(self._initial, (3, 3)))
 
     def functions(self) -> dict[str, dolfinx.fem.Function]:
-        """Every dolfinx function of the state by its name, those of further load cases with their mark ("@2")."""
+        """Return all dolfinx functions of the state by name; further load cases add "@2", ..."""
         shared = {self.cells.dimensions.name, self.cells.axes.name}
-        found = dict(self._functions)
+        functions = dict(self._functions)
         for mark, case in list(self.each_case().items())[1:]:
-            found |= {f"{name}{mark}": function for name, function in case._functions.items() if name not in shared}
-        return found
+            functions |= {f"{name}{mark}": function for name, function in case._functions.items() if name not in shared}
+        return functions
 
     def join(self, others: Sequence[State], weights: Sequence[float]) -> None:
-        """Hold other states with the same cells too; weights of all, this one first."""
+        """Add states of further load cases with the same cells.
+
+        Parameters
+        ----------
+        others
+            The states.
+        weights
+            Weights of all load cases, this state's first.
+        """
         self.others, self.weights = list(others), tuple(weights)
 
     def each_case(self) -> dict[str, State]:
-        """The states of all load cases by the mark that their names have: this one has none, then "@2", "@3"."""
+        """Return the states of all load cases by suffix: "" for this state, then "@2", ..."""
         return {"": self} | {f"@{number}": case for number, case in enumerate(self.others, start=2)}
 
     def reach(self, time: float, number: int) -> None:
-        """A step is done: its time, and how many there have been, in all load cases.
+        """Set time and number of a completed step in all load cases.
 
         Parameters
         ----------
         time
-            Of the step that is done.
+            Time of the step.
         number
-            How many steps there have been.
+            Number of steps so far.
         """
         for case in self.each_case().values():
             case.time, case.number = time, number
@@ -349,21 +426,23 @@ class State:
         self._functions[function.name], self._arrays[function.name] = function, function.x.array
 
     def remember(self, function: dolfinx.fem.Function, count: str | None = None) -> None:
-        """From now on a dolfinx function (with a name of its own) is part of the state.
+        """Add a dolfinx function with a unique name to the state.
 
-        For what a coupling carries from step to step: transactions restore it, checkpoints hold it.
+        Transactions restore the function, and checkpoints contain it. A coupling stores in it what
+        carries over from step to step.
 
         Parameters
         ----------
         function
             The function.
         count
-            Name of the number that says how many of its kind are known; with it a checkpoint may lack the function.
+            Name of a number that counts the known functions of this kind; with it a checkpoint may
+            lack the function.
 
         Raises
         ------
         ValueError
-            If the state has a function of this name.
+            If the state already has a function of this name.
         """
         if function.name in self._functions:
             raise ValueError(f"the state has a function {function.name!r} already")
@@ -372,17 +451,23 @@ class State:
             self.counts[function.name] = count
 
     def settle_cells(self) -> None:
-        """The present cells are those with which the unknowns are in equilibrium."""
+        """Mark the present cells as those with which the unknowns are in equilibrium."""
         self.equilibrium_cells.set(self.cells.dimension_values, self.cells.axis_values)
 
     def snapshot(self) -> Snapshot:
-        """A copy of all values."""
+        """Return a copy of all values."""
         arrays = {name: array.copy() for name, array in self._arrays.items()}
         others = tuple(case.snapshot() for case in self.others)
         return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers), others)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Take all values from a snapshot."""
+        """Restore all values from a snapshot.
+
+        Parameters
+        ----------
+        snapshot
+            Values of this state.
+        """
         for name, array in self._arrays.items():
             array[:] = snapshot.arrays[name]
         self.loading.set(snapshot.loads)
@@ -393,7 +478,7 @@ class State:
 
     @contextmanager
     def tentative(self) -> Iterator[None]:
-        """Whatever happens in the block, the state is afterwards what it was before."""
+        """Restore the state after the block."""
         before = self.snapshot()
         try:
             yield
@@ -402,7 +487,7 @@ class State:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """All that happens in the block, or nothing: whatever is raised in it, the state is what it was before."""
+        """Restore the state if the block raises."""
         before = self.snapshot()
         try:
             yield
@@ -411,32 +496,34 @@ class State:
             raise
 
 
-# ---------------------------------------------------------------- what somebody remembers of earlier steps
-# Functions and numbers of the state, so that resumed runs have them too.
+# ---------------------------------------------------------------- values of earlier steps
+# They are functions and numbers of the state, so that resumed runs have them too.
 
 
 class Numbers:
-    """Numbers of the state under a name of their own: transactions restore them, checkpoints hold them."""
+    """Numbers of the state with a prefix; transactions restore them, checkpoints contain them."""
 
     def __init__(self, state: State, name: str, initial: Mapping[str, float]):
-        self.state, self.name, self.initial = state, name, dict(initial)
-        self._keys = {key: f"{name}_{key}" for key in self.initial}  # steps ask often
+        self.state, self.name = state, name
+        self.initial = dict(initial)
+        # Computed once, because steps read numbers often.
+        self._keys = {key: f"{name}_{key}" for key in self.initial}
 
     def __getitem__(self, key: str) -> float:
         return self.state.numbers.get(self._keys[key], self.initial[key])
 
     def __setitem__(self, key: str, value: float) -> None:
-        """The same value on all ranks."""
+        """Set a number, which must be equal on all ranks."""
         self.state.numbers[self._keys[key]] = float(value)
 
     def forget(self) -> None:
-        """As at the start."""
+        """Reset all numbers to their initial values."""
         for key, value in self.initial.items():
             self[key] = value
 
 
 class Earlier:
-    """The last values of a field, as functions of the state."""
+    """Last values of a field, stored as functions of the state."""
 
     def __init__(
         self,
@@ -456,44 +543,44 @@ class Earlier:
 
     @property
     def known(self) -> int:
-        """How many values there are."""
+        """Number of stored values."""
         return int(self._numbers["known"])
 
     @property
     def values(self) -> list[Array]:
-        """The newest first, the functions' own memory, ghosts included."""
+        """Stored values, newest first, with ghosts; the functions' arrays."""
         return self._arrays[: self.known]
 
     def push(self, values: Array) -> None:
-        """One value more, for owned unknowns and ghosts; the oldest goes."""
+        """Add a value with ghosts, and drop the oldest."""
         for age in range(len(self._arrays) - 1, 0, -1):
             self._arrays[age][:] = self._arrays[age - 1]
         self._arrays[0][:] = values
         self._numbers["known"] = min(self.known + 1, len(self._arrays))
 
     def push_owned(self, values: Array) -> None:
-        """The same without ghosts; collective."""
-        whole = np.zeros_like(self._arrays[0])
-        whole[: len(values)] = values
-        self.push(whole)
+        """Add a value without ghosts. Collective."""
+        padded = np.zeros_like(self._arrays[0])
+        padded[: len(values)] = values
+        self.push(padded)
         self._functions[0].x.scatter_forward()
 
     def forget(self) -> None:
-        """There have been none."""
+        """Reset the number of values to 0."""
         self._numbers.forget()
 
 
-# ---------------------------------------------------------------- the parameters of a tissue on a mesh as numbers
-# Numbers and arrays are made again only where a parameter has changed.
+# ---------------------------------------------------------------- tissue parameters on a mesh
+# Numbers and arrays are recomputed only if a parameter has changed.
 
 
 def at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
-    """A tissue on a mesh with its parameters as arrays over the points in one row, (elements * points,)."""
+    """Return a tissue with parameters as arrays over the points, (elements * points,)."""
     return tissue.map(lambda name, value: assembly.point_values(value, quadrature).reshape(-1))
 
 
 def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
-    """Rounding error of a stress in a body, from the stiffness of matrix and network at the largest r/L."""
+    """Return the rounding error of a stress, from the tissue's stiffness at the largest r/L."""
     length = numbers.end_to_end_length
     if numbers.locking_length is not None:
         length = max(length, max_chain_extension * numbers.locking_length)
@@ -501,27 +588,30 @@ def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
 
 
 def by_region(domain: Domain, values: Mapping[str, float]) -> dolfinx.fem.Function:
-    """A DG0 Function with the value of each region of a domain by its name; "" is for those that have none."""
-    found = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
-    places = found.function_space.dofmap.list.reshape(-1)
+    """Return a DG0 Function with values by region name; "" is the value of all other regions."""
+    function = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
+    dofmap = function.function_space.dofmap
+    dofs = dofmap.list.reshape(-1)
     for name, number in domain.regions.items():
-        found.x.array[places[domain.element_region == number]] = values[name if name in values else ""]
-    return found
+        function.x.array[dofs[domain.element_region == number]] = values[name if name in values else ""]
+    return function
 
 
 class Parameters:
-    """A tissue on a mesh, and what its live parameters are at present.
+    """Tissue on a mesh, and present values of its parameters.
 
     Attributes
     ----------
     given, tissue
-        The tissue, and the same with Constants in place of numbers, so that other numbers compile nothing.
+        The tissue, and the tissue with Constants in place of numbers, so that a new number needs no
+        compilation.
     compiled
-        The same with its repulsion in C.
+        The tissue with its repulsion in C.
     """
 
     def __init__(self, tissue: Tissue, quadrature: Quadrature):
-        self.given, self.quadrature, mesh = tissue, quadrature, quadrature.mesh
+        self.given, self.quadrature = tissue, quadrature
+        mesh = quadrature.mesh
         self.tissue = tissue.map(
             lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value)
         )
@@ -531,76 +621,79 @@ class Parameters:
         self._at_points: Remembered[Tissue] = Remembered(None, *values)
 
     def largest(self) -> Tissue:
-        """The largest value of each in the body, numbers. Collective."""
+        """Return the tissue with the largest value of each parameter in the body. Collective."""
 
-        def found() -> Tissue:
-            whole = self.compiled.map(
+        def largest_values() -> Tissue:
+            maxima = self.compiled.map(
                 lambda name, value: self.quadrature.maximum(assembly.point_values(value, self.quadrature))
             )
             if not isinstance(self.tissue.contour_length, dolfinx.fem.Function):
-                return whole
+                return maxima
             lengths = self.at_points().contour_length.reshape(self.quadrature.shape)
             of_chains = self.quadrature.maximum(np.where(self.has_chains(), lengths, 0.0))
-            return replace(whole, contour_length=of_chains or whole.contour_length)
+            return replace(maxima, contour_length=of_chains or maxima.contour_length)
 
-        return self._largest(found)
+        return self._largest(largest_values)
 
     def at_points(self) -> Tissue:
-        """`at_points`; not to be written into."""
+        """Return the tissue with parameters at points, (elements * points,), cached; read-only."""
         return self._at_points(lambda: at_points(self.compiled, self.quadrature))
 
     def locking_length(self) -> Array:
-        """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""
+        """Return the length at which chains lock, (elements, points); infinite without locking."""
         length = self.at_points().locking_length
         if length is None:
             return np.full(self.quadrature.shape, np.inf)
         return np.where(self.has_chains(), length.reshape(self.quadrature.shape), np.inf)
 
     def has_chains(self) -> NDArray[np.bool_]:
-        """Whether there are any at a point, (elements, points)."""
+        """Return whether points have chains, (elements, points)."""
         return np.asarray(self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
 
     def where_chains(self, values: Array) -> Array:
-        """Values at all points (elements, points), NaN where there are no chains of which they would be."""
+        """Return values (elements, points) with NaN at points without chains."""
         return np.where(self.has_chains(), values, np.nan)
 
 
 # ---------------------------------------------------------------- the tissue of regions
-NEVER_LOCKED = 1e12  # link lengths: contour length of chains that are not there; infinity times zero is no number
+# Contour length at points without chains, in link lengths; infinity would give NaN as a factor of
+# zero.
+NEVER_LOCKED = 1e12
 
 
 def parameters_of(
     properties: Mapping[str, Properties],
     domain: Domain,
 ) -> tuple[Tissue, float | dolfinx.fem.Function]:
-    """Tissue and kappa of a scene's regions: numbers where these agree, DG0 Functions where they differ."""
-    tissues, kappas = _tissues(properties), {name: one.kappa for name, one in properties.items()}
+    """Return tissue and kappa of a scene's regions: numbers if equal, else DG0 Functions."""
+    tissues, kappas = _tissues(properties), {name: region.kappa for name, region in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
-    if any(other != tissue for other in tissues.values()):
+    if any(region_tissue != tissue for region_tissue in tissues.values()):
         tissue = tissue.map(lambda key, _: by_region(domain, {name: t.parameters[key] for name, t in tissues.items()}))
     return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
 
 
 def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
-    """Of the regions, all of one chain law and one matrix: where there are no chains, none locks."""
-    found = {name: one.tissue for name, one in properties.items()}
-    chain = next((tissue.chain for tissue in found.values() if tissue.chain is not None), None)
-    matrices = list(dict.fromkeys(one.material.matrix for one in properties.values()))
-    for name, tissue in found.items():
+    """Return tissues of all regions with one chain law and one matrix energy."""
+    # Regions without chains get a contour length that never locks.
+    tissues = {name: region.tissue for name, region in properties.items()}
+    chain = next((tissue.chain for tissue in tissues.values() if tissue.chain is not None), None)
+    matrices = list(dict.fromkeys(region.material.matrix for region in properties.values()))
+    for name, tissue in tissues.items():
         if chain is not None and tissue.chain is None:
             length = NEVER_LOCKED if chain.locks else tissue.contour_length
-            found[name] = replace(tissue, chain=chain, contour_length=length)
-    return found if len(matrices) == 1 else _with_one_matrix(found, properties, matrices)
+            tissues[name] = replace(tissue, chain=chain, contour_length=length)
+    return tissues if len(matrices) == 1 else _with_one_matrix(tissues, properties, matrices)
 
 
 def _with_one_matrix(
     tissues: Mapping[str, Tissue], properties: Mapping[str, Properties], matrices: Sequence[str]
 ) -> dict[str, Tissue]:
-    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # `rules.tissue_of_regions` asks
+    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # see rules.tissue_of_regions
     defaults = {name: number.default for name, number in mixture.parameters.items()}
-    found = {}
+    mixtures = {}
     for name, tissue in tissues.items():
-        share = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
+        weight = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
         own = getattr(tissue.matrix, "values", {})
-        found[name] = replace(tissue, matrix=mixture.of({**defaults, **own, **share}))
-    return found
+        mixtures[name] = replace(tissue, matrix=mixture.of({**defaults, **own, **weight}))
+    return mixtures

@@ -1,1 +1,1 @@
-"""The way through time: steps, remodeling passes, and how equilibrium and cells are coupled."""
+"""Time integration: steps, remodeling passes, and the coupling of equilibrium and cells."""

@@ -1,4 +1,4 @@
-"""How equilibrium and remodeling of one step are coupled: strategies over the same state."""
+"""Couplings of equilibrium and remodeling in one step: strategies on the same state."""
 
 from __future__ import annotations
 
@@ -28,54 +28,59 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
-TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])  # what is kept of one
-NEVER = -1.0  # time of a target that there has not been
-COUNTS = 0.01  # share of a target from which on it is one: what is less moves the cells less than a step is off
-ORDER, FITTED = 3, 2  # increments that predict the next one; increments to which the weights are fitted
-SAME_RATE = 1e-9  # relative difference of two rates of a load that are the same
-INDEPENDENT = 1e-12  # of increments: what is less is rounding
+# Record of a target at one point.
+TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])
+NEVER = -1.0  # time of a target before the first one
+# Smallest switch of a target that counts. The cells change less by a smaller one than by a step's
+# error.
+COUNTS = 0.01
+# Number of rates that predict the next one, and number of rates to which the weights are fitted.
+ORDER, FITTED = 3, 2
+SAME_RATE = 1e-9  # relative tolerance of equal load rates
+INDEPENDENT = 1e-12  # relative singular value below which rates depend on each other up to rounding
 
 
-# ---------------------------------------------------------------- where Newton's method starts a step
+# ---------------------------------------------------------------- starting values of Newton
 
 
 class LoadStep(NamedTuple):
-    """A step as it is asked for: its length, and the rates of the loads over it."""
+    """Duration of a step, and the rates of the loads over the step."""
 
     duration: float
     rates: dict[str, float]
 
     @classmethod
     def between(cls, duration: float, old: Mapping[str, float], new: Mapping[str, float]) -> LoadStep:
-        """From the loads at its start and its end."""
+        """Return a step with the rates that lead from the old to the new loads."""
         return cls(duration, {name: (new.get(name, old[name]) - old[name]) / duration for name in old})
 
 
 class Predictor:
-    """Expects the increment of a step by those of the last ones, d_n = sum_j a_j d_(n-j), while load rates stay."""
+    """Linear prediction of rates, v_n = sum_j a_j v_(n-j), if the load rates stay."""
 
     def __init__(self, state: State):
         self.state = state
-        # increments over the lengths of their steps: steps of any length take part
+        # Rates are increments over the duration of their steps, so that the step size may change.
         self._speeds = Earlier(state, "predictor_speed", state.unknown.copy, ORDER + FITTED)
         self._numbers = Numbers(state, "predictor", {f"rate_{name}": 0.0 for name in state.loading.values})
 
     def expected(self, step: LoadStep) -> Array | None:
-        """The unknowns at its end, ghosts included, with what supports and loads prescribe; None at first."""
-        speeds = self._speeds.values
+        """Return predicted unknowns with boundary values, ghosts included; None if unknown."""
+        speeds, state = self._speeds.values, self.state
         if not speeds or not self._goes_on(step):
             return None
         speed = speeds[0]
         if len(speeds) == ORDER + FITTED:
             speed = self._weights(speeds) @ np.array(speeds[:ORDER])
-        values: Array = self.state.unknown.x.array + step.duration * speed
-        for condition in self.state.loading.boundary_conditions:
+        values: Array = state.unknown.x.array + step.duration * speed
+        for condition in state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
-        """The state is the solution of the step; `before`: the unknowns of the step before, or of its first solve."""
-        speed = np.asarray((self.state.unknown.x.array - before) / step.duration, dtype=np.float64)
+        """Record the rate of a solved step from the unknowns before it, or of its first solve."""
+        unknown = self.state.unknown
+        speed = np.asarray((unknown.x.array - before) / step.duration, dtype=np.float64)
         if again:
             self._speeds.values[0][:] += speed
             return
@@ -86,12 +91,12 @@ class Predictor:
             self._numbers[f"rate_{name}"] = rate
 
     def _goes_on(self, step: LoadStep) -> bool:
-        """Whether the rates are those of the last step."""
+        """Return whether the load rates are those of the last step."""
         rates = [(rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items()]
         return all([abs(rate - last) <= SAME_RATE * max(abs(rate), abs(last)) for rate, last in rates])
 
     def _weights(self, speeds: list[Array]) -> Array:
-        """Fit the newest increments by those before them, in the sense of least squares."""
+        """Fit the newest rates by the rates before them, by least squares. Collective."""
         rows = np.array([speed[: self.state.number_of_owned_unknowns] for speed in speeds])
         products = over_ranks(self.state.comm, rows @ rows.T, MPI.SUM)
         matrix, right = np.zeros((ORDER, ORDER)), np.zeros(ORDER)
@@ -102,16 +107,16 @@ class Predictor:
 
 
 class Traits(NamedTuple):
-    """Of a coupling's errors in time: how steps are chosen for a tolerance.
+    """Properties of a coupling's time discretisation error, for adaptive time stepping.
 
     Attributes
     ----------
     order
-        Power of the step with which they fall.
+        Order of the error in the step size.
     accumulates
-        Whether those of steps add up; where not, a row lags behind.
+        Whether the errors of steps accumulate; otherwise the row lags behind by a step.
     longest
-        kappa times the longest step that may be chosen for its error: longer ones of an explicit rule swing.
+        Largest adaptive step times kappa; an explicit rule oscillates with larger steps.
 
     Examples
     --------
@@ -126,26 +131,28 @@ class Traits(NamedTuple):
 
 
 class Coupling(Protocol):
-    """One step in two halves, inside the stepper's transaction. What is between them is the step's row.
+    """Protocol of a step in two halves, in the stepper's transaction; the row is in between.
 
-    Cells are changed by `RemodelingPass.apply` or `replace`, which know the power. What goes on from step to step is
-    remembered in the state (`State.remember`, `state.Numbers`). The coupling tells what remodels beside the cells
-    (`RemodelingPass.beside`) where a step is: `before`, `settle` in equilibrium, `after`.
+    `RemodelingPass.apply` and `replace` change the cells and compute the power. Values that carry
+    over from step to step belong to the state (`State.remember`, `state.Numbers`). The coupling
+    calls `before`, `settle` in equilibrium, and `after` of the remodeling processes in addition to
+    the cells (`RemodelingPass.beside`).
 
     Attributes
     ----------
     equilibrium
-        The forms of the solved state, with its cells.
+        Forms of the solved state, with its cells.
     newton
-        What solved it; with forms of its own where cells belong to the unknowns.
+        Newton's method for the state.
     traits
-        What is known of its errors in time.
+        Properties of the time discretisation error.
     tangents
-        How many were assembled in the last solve of the state itself.
+        Number of tangents assembled in the last solve of the state.
 
     Examples
     --------
-    What a script writes is most often a `Staggered` with another second half; a simulation has one:
+    A custom coupling is usually a `Staggered` with another second half. The coupling of a
+    simulation:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> coupling = Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.coupling
@@ -160,52 +167,62 @@ class Coupling(Protocol):
 
     @property
     def better(self) -> UnitCell | None:
-        """After `remodel`: cells (n, 3) and (n, 3, 3) that a better rule gives; None if the row has no error."""
+        """Cells of a higher-order rule, (n, 3) and (n, 3, 3), after `remodel`; or None."""
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """Bring the state to equilibrium with the loads of `time`; `state.equilibrium_cells` are those of the row.
+        """Solve for equilibrium; `state.equilibrium_cells` are those of the row.
 
         Parameters
         ----------
         time
-            Of the step.
+            End of the step.
         loads
             Magnitudes of all loads at this time, by name.
+
+        Returns
+        -------
+        Work
+            Solver work of the step.
         """
 
     def remodel(self, time: float) -> float:
-        """Make the cells that the next step starts with, where `solve` has not; returns the power of remodeling.
+        """Compute the next step's cells, unless `solve` did; return the power of remodeling.
 
         Parameters
         ----------
         time
-            Of the step.
+            End of the step.
+
+        Returns
+        -------
+        float
+            Stored energy released per time.
         """
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free the PETSc objects of the coupling."""
 
 
 class Staggered:
-    """The paper's coupling: solve with the cells of the step before, then one remodeling pass.
+    """Paper's coupling: equilibrium with the previous cells, then one remodeling pass.
 
-    Where Newton's method cannot go to the new state in one piece, the change of the cells and then the change of the
-    loads are applied in parts (docs/theory.md, "Steps that are too large").
+    If Newton's method does not converge in one increment, the change of the cells and then the
+    change of the loads are applied in substeps (docs/theory.md, "Steps that are too large").
 
     Parameters
     ----------
     state
-        What is advanced.
+        State to advance.
     tissue
-        Its constitutive parameters, on the mesh.
+        Constitutive parameters on the mesh.
     remodeling
-        The pass that changes the cells.
+        Pass that changes the cells.
     settings
-        Of the solver.
+        Solver settings.
 
     Examples
     --------
-    A coupling of one's own overrides one of its halves, see `CouplingKind`. A simulation makes it:
+    A custom coupling overrides one of the halves, see `CouplingKind`. A simulation makes it:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> from remodel_fenicsx.extend import Staggered
@@ -217,19 +234,20 @@ class Staggered:
     traits = Traits(order=1, accumulates=False)
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
-        self.state, self.remodeling, self.settings = state, remodeling, settings
+        self.state, self.settings = state, settings
+        self.remodeling = remodeling
         self.equilibrium = Equilibrium(state, tissue)
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = None if settings.predictor == "none" else Predictor(state)
-        self._last = Numbers(state, "last_solution", {"extension": 0.0})  # its largest r/L
+        self._last = Numbers(state, "last_solution", {"extension": 0.0})  # largest r/L
         self.residual = 0.0
-        self.tangents = 0  # that were assembled in the last solve of the state itself
-        changes = any(part.changes for part in (remodeling, *remodeling.beside))
+        self.tangents = 0  # assembled in the last solve of the state
+        changes = any(process.changes for process in (remodeling, *remodeling.beside))
         self.blend = Blend(state, tissue, settings) if changes else None
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """Equilibrium at `time` with the present cells.
+        """Solve for equilibrium at `time` with the present cells.
 
         Raises
         ------
@@ -240,65 +258,73 @@ class Staggered:
         return self.balanced(time, loads)
 
     def _before(self, time: float) -> None:
-        for part in self.remodeling.beside:
-            part.before(time, self.traits.order)
+        for process in self.remodeling.beside:
+            process.before(time, self.traits.order)
 
     def balanced(self, time: float, loads: LoadValues, again: bool = False) -> Work:
-        """Equilibrium with what has remodeled.
+        """Solve for equilibrium with remodeled values; call `settle` of remodeling processes.
 
         Parameters
         ----------
         time, loads
-            As of `solve`.
+            See `solve`.
         again
-            The step has been solved already, with other cells.
+            Whether the step was already solved with other cells.
+
+        Returns
+        -------
+        Work
+            Solver work.
         """
-        work, before, old_loads = Work(), self.state.unknown.x.array.copy(), dict(self.state.loading.values)
-        step = LoadStep.between(time - self.state.time, old_loads, loads)
+        work, state = Work(), self.state
+        unknown, old_loads = state.unknown, dict(state.loading.values)
+        before = unknown.x.array.copy()
+        step = LoadStep.between(time - state.time, old_loads, loads)
         self._solve(step, time, old_loads, loads, work, again)
         self._whole(time, old_loads, loads).look_back(before, work, again)
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
-        self.state.settle_cells()
+        state.settle_cells()
         self.residual = work.residual
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
         self.tangents = work.tangents
-        for part in self.remodeling.beside:
-            work.count(part.settle(time, again))
+        for process in self.remodeling.beside:
+            work.count(process.settle(time, again))
         return work
 
     def remodel(self, time: float) -> float:
-        """The pass with the solved state."""
+        """Remodel with the stress of the solved state, and return the power."""
         power = 0.0
         if self.remodeling.law.remodels:
             power = self.remodeling.apply(self.state.time, time, self.residual)
         return power + self._after(time)
 
     def _after(self, time: float) -> float:
-        return sum(part.after(time) for part in self.remodeling.beside)
+        return sum(process.after(time) for process in self.remodeling.beside)
 
     @property
     def better(self) -> UnitCell | None:
-        """The cells that the whole pass with the row's own stress asks for: those of the row are a step behind."""
+        """Cells after a full pass with the row's stress; the row's cells lag behind by a step."""
         return self.remodeling.asked
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free the PETSc objects of the coupling."""
         self.newton.close()
-        for part in self.remodeling.beside:
-            part.close()
+        for process in self.remodeling.beside:
+            process.close()
         if self.blend is not None:
             self.blend.close()
 
-    # ------------------------------------------------------------ in one piece: the paper's step
+    # ------------------------------------------------------------ one increment: the paper's step
     def _solve(
         self, step: LoadStep, time: float, old_loads: LoadValues, loads: LoadValues, work: Work, again: bool
     ) -> None:
-        """Try `attempts.FROM_EXPECTED`, `FROM_LAST` and `IN_PARTS`."""
-        unknown, loading, failure = self.state.unknown.x.array, self.state.loading, None
+        """Solve by the attempts `FROM_EXPECTED`, `FROM_LAST` and `IN_PARTS` in this order."""
+        state, failure = self.state, None
+        unknown, loading = state.unknown.x.array, state.loading
         before = unknown.copy()
-        loading.set(loads)  # what they prescribe is part of what is expected
+        loading.set(loads)  # prescribed values are part of the prediction
         if not again and self._starts_as_expected(step):
             if self._tried(FROM_EXPECTED, work, before) is None:
                 return
@@ -310,53 +336,54 @@ class Staggered:
             if failure is None:
                 return
         else:
-            say(FROM_LAST, "the remodeled cells have r >= L at the old displacement")
+            say(FROM_LAST, "the remodeled cells exceed r = L at the previous displacement")
         self._solve_in_parts(time, old_loads, loads, work, failure)
 
     def _starts_as_expected(self, step: LoadStep) -> bool:
-        """Take the unknowns that are expected, where there are any that are admissible."""
-        # Where chains would be almost straight the forces are huge, and Newton's method comes back slowly: from the
-        # last displacement it takes fewer iterations.
+        """Set the unknowns to the prediction, and return whether it exists and is admissible."""
+        # If chains are almost straight in the prediction, the forces are huge, and Newton's method
+        # returns slowly. From the last displacement it then takes fewer iterations.
         expected = None if self.predictor is None else self.predictor.expected(step)
         if expected is None:
             return False
-        self.state.unknown.x.array[:] = expected
+        unknown = self.state.unknown
+        unknown.x.array[:] = expected
         return self.newton.may_start(self._last["extension"])
 
     def _tried(self, attempt: Attempt, work: Work, origin: Array | None = None) -> SolveFailure | None:
-        """Solve from the present unknowns; return the failure, if it is one."""
-        found = attempted(lambda: self.newton.solve(origin), SolveFailure)
-        work.add(found)
-        if isinstance(found, SolveFailure):
-            say(attempt, found.reason)
-            return found
+        """Solve from the present unknowns, and return the failure or None."""
+        outcome = attempted(lambda: self.newton.solve(origin), SolveFailure)
+        work.add(outcome)
+        if isinstance(outcome, SolveFailure):
+            say(attempt, outcome.reason)
+            return outcome
         work.substeps = 1
         return None
 
-    # ------------------------------------------------------------ in parts
+    # ------------------------------------------------------------ substeps
     def _solve_in_parts(
         self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work, failure: SolveFailure | None
     ) -> None:
-        """First the change of what remodels, then that of the loads."""
-        # `failure`: that of the whole step, if it was tried.
+        """Apply the change of the cells and then that of the loads in substeps."""
+        # `failure` is that of the full step, if it was tried.
         loading, halvings = self.state.loading, self.settings.maximum_halvings
         loading.set(old_loads)
         if self.blend is not None and self._has_remodeled():
             blend = self.blend
-            parts = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
-            Change(*parts, halvings, blend.largest_part, roughly=True).advance(work)
-            failure = None  # the loads have not been tried from here
+            cell_change = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
+            Change(*cell_change, halvings, blend.largest_part, roughly=True).advance(work)
+            failure = None  # the loads were not yet tried from this state
 
         def set_load_fraction(fraction: float) -> None:
             loading.set(between(old_loads, new_loads, fraction))
 
-        whole = time, "the change of the loads", set_load_fraction, self.state, lambda: self.newton
-        Change(*whole, halvings).advance(work, failure)
+        load_change = time, "the change of the loads", set_load_fraction, self.state, lambda: self.newton
+        Change(*load_change, halvings).advance(work, failure)
         loading.set(new_loads)
-        log.info("time %g solved in %d parts", time, work.substeps)
+        log.info("time %g solved in %d substeps", time, work.substeps)
 
     def _whole(self, time: float, old_loads: LoadValues, new_loads: LoadValues) -> Change:
-        """The change of the cells and of the loads together."""
+        """Return the change of cells and loads together."""
         blend = self.blend if self.blend is not None and self._has_remodeled() else None
 
         def set_fraction(fraction: float) -> None:
@@ -370,26 +397,28 @@ class Staggered:
         return Change(time, "the step", set_fraction, self.state, lambda: blend.newton, halvings, blend.largest_part)
 
     def _set_part(self, fraction: float) -> None:
-        """Take a part of what has remodeled since the last solved state."""
+        """Apply a fraction of the remodeling since the last solved state."""
         assert self.blend is not None
         self.blend.set(fraction)
-        for part in self.remodeling.beside:
-            part.set_part(fraction)
+        for process in self.remodeling.beside:
+            process.set_part(fraction)
 
     def _has_remodeled(self) -> bool:
-        if any(part.changes for part in self.remodeling.beside):
+        if any(process.changes for process in self.remodeling.beside):
             return True
-        same = self.state.equilibrium_cells.equals(self.state.cells)
-        return bool(self.state.comm.allreduce(int(not same)) > 0)
+        are_equal = self.state.equilibrium_cells.equals(self.state.cells)
+        return bool(self.state.comm.allreduce(int(not are_equal)) > 0)
 
 
 def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
-    """Loads after a fraction of their change."""
+    """Return the loads after a fraction of their change."""
     return new if fraction == 1.0 else {name: old[name] + fraction * (new[name] - old[name]) for name in new}
 
 
 class Extrapolated(Staggered):
-    """Remodel, then solve: sE + h/2 d(sE)/dt from the last two targets (docs/theory.md, Extrapolated coupling)."""
+    """Second-order coupling: remodel with sE + h/2 d(sE)/dt from two targets, then solve."""
+
+    # See docs/theory.md, Extrapolated coupling.
 
     traits = Traits(order=2, accumulates=True, longest=0.5)
 
@@ -398,7 +427,8 @@ class Extrapolated(Staggered):
         size = TARGET.itemsize // 8
         targets = state.cells.quadrature.function("targets", (2, size))
         memory = state.cells.quadrature.values(targets, (2, size)).reshape(-1, 2, size)
-        # of all points in one row, the function's own memory: the last target, and the one before
+        # Last target and the one before, flattened over the quadrature points, in the function's
+        # memory.
         self._newest: NDArray[np.void]
         self._older: NDArray[np.void]
         self._newest, self._older = np.moveaxis(memory.view(TARGET)[..., 0], 1, 0)
@@ -406,75 +436,77 @@ class Extrapolated(Staggered):
         state.remember(targets)
         self._power = 0.0
         self._start: UnitCell  # the cells at the start of the step
-        self._found: Target  # of the solved state
-        self._begins: Flags  # points whose first step with a target this is
-        self._duration = 0.0  # of the step
+        self._solved_target: Target  # target of the solved state
+        self._begins: Flags  # points with the first target in this step
+        self._duration = 0.0  # duration of the step
 
     @property
     def better(self) -> UnitCell:
-        """The cells that the targets at both ends give together; where a point begins, the target of its end."""
+        """Cells by the targets at both ends of the step, or only by the first target of a point."""
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
-        mean = known(self._older).towards(self._found, weight).where(self._begins, self._found)
+        mean = known(self._older).towards(self._solved_target, weight)
+        mean = mean.where(self._begins, self._solved_target)
         return self.remodeling.followed(mean, self._duration, self._start)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """New cells, and equilibrium at `time` with them."""
+        """Compute the new cells, and solve for equilibrium at `time` with them."""
         cells = self.state.cells
         self._start, expected = cells.point_cells.copy(), self._extrapolated(time)
         self._follow(expected, time)
         self._before(time)
         work = self.balanced(time, loads)
-        self._found = self.remodeling.target(self.residual)
-        self._begins = (self._newest["switch"] < COUNTS) & (self._found.switch >= COUNTS)
+        self._solved_target = self.remodeling.target(self.residual)
+        self._begins = (self._newest["switch"] < COUNTS) & (self._solved_target.switch >= COUNTS)
         if not how_many(self.state, self._begins):
             return work
         cells.set(*self._start[:2])
-        self._follow(expected.where(self._begins, self._found), time)
-        again = self.balanced(time, loads, again=True)
-        self._found = self.remodeling.target(self.residual)
-        again.substeps += work.substeps - 1
-        again.count(work)
-        return again
+        self._follow(expected.where(self._begins, self._solved_target), time)
+        repeated = self.balanced(time, loads, again=True)
+        self._solved_target = self.remodeling.target(self.residual)
+        repeated.substeps += work.substeps - 1
+        repeated.count(work)
+        return repeated
 
     def remodel(self, time: float) -> float:
-        """Remember the target of the solved state; the cells are those of the row."""
+        """Record the target of the solved state; the cells are already those of the row."""
         self._duration = time - self.state.time
         self._older[:] = self._newest
-        self._older["time"][self._begins] = NEVER  # its step had the target of its end
-        self._newest["direction"], self._newest["switch"], self._newest["time"] = *self._found, time
+        self._older["time"][self._begins] = NEVER  # this step used the target of its end
+        self._newest["direction"], self._newest["switch"] = self._solved_target
+        self._newest["time"] = time
         return self._power + self._after(time)
 
     def _extrapolated(self, time: float) -> Target:
-        """The target at the middle of the step."""
+        """Return the target extrapolated to the middle of the step."""
         last, before = self._newest["time"], self._older["time"]
-        back, apart = np.zeros_like(last), before != NEVER
-        back[apart] = (time - last[apart]) / 2 / (last[apart] - before[apart])
-        return known(self._newest).towards(known(self._older), -back)
+        weight, has_both = np.zeros_like(last), before != NEVER
+        weight[has_both] = (time - last[has_both]) / 2 / (last[has_both] - before[has_both])
+        return known(self._newest).towards(known(self._older), -weight)
 
     def _follow(self, target: Target, time: float) -> None:
-        """Cells after the step; where an extrapolated target would make A indefinite, the last target itself counts."""
+        """Compute the cells after the step; use the last target if A would become indefinite."""
         duration = time - self.state.time
         self._power = 0.0
         if not how_many(self.state, target.switch != 0.0):
             return
-        asked = self.remodeling.followed(target, duration)
-        lost = ~np.isfinite(asked.dimensions).all(axis=-1)
+        cells = self.remodeling.followed(target, duration)
+        lost = ~np.isfinite(cells.dimensions).all(axis=-1)
         if lost.any():
-            asked = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
+            cells = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
         points = how_many(self.state, lost)
         if points and self.state.comm.rank == 0:
-            log.info("time %g: %d points follow the last stress, not the extrapolated one", time, points)
-        self._power = self.remodeling.replace(asked, self.state.elastic_gradient(), duration)
+            log.info("time %g: %d points follow the last stress, not extrapolated", time, points)
+        self._power = self.remodeling.replace(cells, self.state.elastic_gradient(), duration)
 
 
 def how_many(state: State, points: Flags) -> int:
-    """Of all points in one row that are chosen, on all ranks."""
+    """Count selected points (n,) over all ranks. Collective."""
     quadrature = state.cells.quadrature
     return int(over_ranks(state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM))
 
 
 def known(records: NDArray[np.void]) -> Target:
-    """The target that records of `TARGET` hold; zero where there was none."""
+    """Return the target stored in records of `TARGET`; zero before the first target."""
     return Target(records["direction"], records["switch"])
 
 

@@ -1,4 +1,4 @@
-"""Cells, collagen content and further load cases share one life cycle in a step: `Remodels`."""
+"""Life cycle in a step that cells, turnover and further load cases share: `Remodels`."""
 
 from __future__ import annotations
 
@@ -18,35 +18,36 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 Values: TypeAlias = Any  # type: ignore[explicit-any]
-"""Values of something that remodels, at all points, in the form that its class chooses."""
+"""Values of a remodeling process at all points; its class defines the type."""
 
 
 class Remodels:
-    """Take part in a step as something that remodels; a subclass overrides what it needs.
+    """Base class of a remodeling process; a subclass overrides the methods that it needs.
 
-    Values are flattened over the quadrature points, in a form that the subclass chooses. As
-    components they are an array (n, components), whose differences have a meaning.
+    Values are flattened over the quadrature points, with a type that the subclass defines. As
+    components they are an array (n, components) whose differences are meaningful.
 
     Attributes
     ----------
     name
-        Of what is remembered of it in the state.
+        Prefix of names in the state.
     components
-        How many numbers it has at a point; 0 of what has no values of its own.
+        Number of components at a point; 0 without values.
     changes
-        Whether its values change in time.
+        Whether the values change in time.
     slowest, fastest
-        Smallest rate above 0, and largest one, 1/time.
+        Smallest positive rate and largest rate, 1/time.
     depends_on_path
         Whether the steady state depends on the load path.
     tissue
-        The tissue with what it brings.
+        The tissue with additional parameters; None if it stays.
     watchers
-        Make watchers of its own, or None, of a scene and a stepper.
+        Functions of a scene and a stepper that return a watcher or None.
 
     Examples
     --------
-    demos/extensions/decaying_collagen.py has a whole one. Of a simulation:
+    demos/extensions/decaying_collagen.py has a complete example. The remodeling processes of a
+    simulation:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> [part.name for part in Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.remodels]
@@ -63,38 +64,38 @@ class Remodels:
     watchers: Sequence[Callable[[Scene, Stepper], Watcher | None]] = ()
 
     def begin_with(self, values: Callable[[str], Array]) -> None:
-        """Take what files of an earlier run have, by name, (elements, points, ...)."""
+        """Set the initial values from fields of an earlier run by name, (elements, points, ...)."""
 
     # ------------------------------------------------------------ a step
     def before(self, time: float, order: int) -> None:
-        """Take the values for the equilibrium at a time, by the last rates or extrapolated."""
+        """Set the values for the equilibrium at a time, by the last rates or extrapolated."""
 
     def settle(self, time: float, again: bool) -> Work:
-        """Follow a solved equilibrium; `again`: a second one of this step."""
+        """Update after a solved equilibrium; `again` if it is the second one of this step."""
         return Work()
 
     def after(self, time: float) -> float:
-        """Remodel after a solved step, and return the power."""
+        """Remodel after a solved step, and return the released power."""
         return 0.0
 
     def set_part(self, fraction: float) -> None:
-        """Take a part of what has changed since the last equilibrium."""
+        """Apply a fraction of the change since the last equilibrium."""
 
     def close(self) -> None:
-        """Free the objects that PETSc has made."""
+        """Free the PETSc objects of the values."""
 
     # ------------------------------------------------------------ time discretisation error
     def row(self) -> Values:
         """Return the values of the solved state."""
 
     def better(self) -> Values:
-        """Return, after a step, values by a better rule; None where there are none."""
+        """Return the values of a higher-order rule after a step, or None."""
 
     def set(self, values: Values) -> None:
         """Replace the values at all points."""
 
     def as_components(self, values: Values) -> Array:
-        """Return values as components."""
+        """Return values as components, (n, components)."""
         return np.asarray(values)
 
     def moved(self, values: Values, change: Array) -> Values:
@@ -102,11 +103,11 @@ class Remodels:
         return values
 
     def passed(self, values: Values, time: float, residual: float) -> Values:
-        """Return what the present state makes of values up to a time."""
+        """Return the values after a pass with the present state up to a time."""
         return values
 
     def apart(self, values: Values, other: Values) -> float:
-        """Return a distance of two values over the body, degrees."""
+        """Return the distance of two values over the body, in degrees."""
         return 0.0
 
     # ------------------------------------------------------------ steady state
@@ -115,22 +116,22 @@ class Remodels:
         return 0.0
 
     def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
-        """Return the change to its limit, or over a duration, (elements, points, ...)."""
+        """Return the change to the limit, or over a duration, (elements, points, ...)."""
         return np.zeros((0, 0))
 
     def size(self, change: Array) -> float:
-        """Return the largest relative size of such a change."""
+        """Return the largest relative size of a change (elements, points, ...)."""
         return 0.0
 
     def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Take a multiple of such a change."""
+        """Apply a multiple of the change of `to_the_limit`."""
 
     def begin_path(self) -> None:
-        """Begin a path to the steady state."""
+        """Reset the monitors for a new path to the steady state."""
 
     def without_rest(self, waiting: float) -> str:
-        """Return why it reaches no steady state, or nothing; `waiting`: under constant loads."""
+        """Return why a time under constant loads reaches no steady state, or an empty string."""
         return ""
 
     def rested(self, time: float) -> None:
-        """Begin at a time what waits for the steady state that is reached."""
+        """Start at a time, if the process waits for the steady state."""

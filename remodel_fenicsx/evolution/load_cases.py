@@ -1,4 +1,4 @@
-"""Solve further load cases: states with the same cells, whose stresses drive the cells too."""
+"""Further load cases: states with the same cells, whose stresses drive the cells too."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class FurtherCase(LoadCaseSolver):
-    """Hold a further load case: it is solved after the first one, and drives the same cells."""
+    """Further load case, which is solved after the first one and drives the same cells."""
 
     coupling: Staggered
 
@@ -35,7 +35,8 @@ class FurtherCase(LoadCaseSolver):
         solver: Solver,
         kappa: float | Function | None = None,
     ):
-        self.number, self.state, self.load_values = number, state, load_values
+        self.number, self.state = number, state
+        self.load_values = load_values
         state.label = f"load case {number}: "
         self.tissue, self.each_case = stepper.tissue, [self]
         self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
@@ -43,7 +44,7 @@ class FurtherCase(LoadCaseSolver):
         state.stop_signal = lambda: stepper.state.stop_signal()
 
     def solve(self, time: float, again: bool) -> Work:
-        """Solve for equilibrium at `time` with the present cells; `again` as of `Staggered.balanced`."""
+        """Solve for equilibrium at `time` with the present cells; see `Staggered.balanced`."""
         return self.coupling.balanced(time, self.load_values(time), again)
 
     def drive(self) -> Drive:
@@ -54,13 +55,13 @@ class FurtherCase(LoadCaseSolver):
         return FurtherCaseWatcher(self, watcher)
 
     def seen(self, step: Step) -> Step:
-        """Return a step as it is in this case."""
+        """Return a copy of a step with the loads and limits of this load case."""
         extension = self.coupling.equilibrium.extension()
         return replace(step, loads=dict(self.state.loading.values), extension=extension, case=self.number)
 
 
 class LoadCases(Remodels):
-    """Solve all further load cases of a step; they have no values of their own."""
+    """All further load cases of a step; they have no values of their own."""
 
     name = "cases"
 
@@ -75,7 +76,7 @@ class LoadCases(Remodels):
         return work
 
     def close(self) -> None:
-        """Free the objects that PETSc has made for each."""
+        """Free PETSc's objects of all load cases."""
         for case in self.cases:
             case.coupling.close()
 
@@ -88,9 +89,9 @@ def join(
     solver: Solver,
     kappa: float | Function | None = None,
 ) -> None:
-    """Let further load cases drive the cells of a stepper too; weights are of all, the first one's first."""
-    given = enumerate(zip(states, load_values, strict=True), start=2)
-    cases = [FurtherCase(number, state, values, stepper, solver, kappa) for number, (state, values) in given]
+    """Add further load cases to a stepper; `weights` are of all cases, in their order."""
+    numbered = enumerate(zip(states, load_values, strict=True), start=2)
+    cases = [FurtherCase(number, state, values, stepper, solver, kappa) for number, (state, values) in numbered]
     stepper.state.join(states, weights)
     stepper.each_case += cases
     stepper.remodeling.further += [case.drive for case in cases]
@@ -98,7 +99,7 @@ def join(
 
 
 class FurtherCaseWatcher(Watcher):
-    """A watcher of the states of another load case: it sees each step as it is there."""
+    """Watcher that gets each step with the values of another load case."""
 
     def __init__(self, case: FurtherCase, watcher: Watcher):
         def as_there(hook: Callable[[Step], None], step: Step) -> None:

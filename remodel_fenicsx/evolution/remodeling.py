@@ -1,4 +1,4 @@
-"""The remodeling pass: driving tensor of the solved state, evolution law, new cells (paper, eqs. 8 to 11)."""
+"""Remodeling pass: driving tensor of the solved state, evolution law, new cells (eqs. 8 to 11)."""
 
 from __future__ import annotations
 
@@ -29,28 +29,33 @@ from remodel_fenicsx.state import Numbers, State, stress_rounding
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-RESIDUAL_SHARE = 20.0  # an eighth of an element's nodes share a face's force; a pulled-back stress is larger still
-TYPICAL_SHARE = 1e-2  # of the body's stress: the most that the residual counts as; tension below it is none of weight
-# Of the body's stress, from which on the residual is said. The artery on one radius, law "tensor": at 0.02 to 0.05
-# radii are within 0.1 %, at 0.4 they are 2 % off
+# Stress over the residual per area of the smallest face. An eighth of an element's nodes carry the
+# force of a face, and a pulled-back stress is larger still.
+RESIDUAL_SHARE = 20.0
+# Largest noise from the residual, over the body's stress. Tension below it has no mechanical
+# weight.
+TYPICAL_SHARE = 1e-2
+# Stress of the residual over the body's stress above which a warning is logged. For the artery on
+# one radius with the law "tensor", radii are within 0.1 % at 0.02 to 0.05; at 0.4 their error is 2
+# %.
 WORTH_A_WORD = 0.1
-STRESS_ROUNDINGS = 64.0  # how many times the rounding of a stress its principal values may be off
-AWAKE = 0.5  # of the speed of remodeling under tension alone
+STRESS_ROUNDINGS = 64.0  # error of a principal value over the rounding of a stress
+AWAKE = 0.5  # switch below which a point counts as a point without tension
 LOOSE_SOLVER = (
-    "solver tolerance: the out-of-balance forces may be stresses of up to %.2g, the stresses of the body are %.2g. "
-    "Stresses up to %.2g do not count as tension; lower solver.relative_tolerance or solver.absolute_tolerance"
+    "the residual may correspond to stresses of up to %.2g (stress in the body: %.2g); stresses "
+    "below %.2g are treated as zero. Lower solver.relative_tolerance or solver.absolute_tolerance"
 )
 
 
 class Noise(NamedTuple):
-    """Size up to which a principal value of the driving tensor may be an error, in its unit."""
+    """Error bound of a principal value, and a stress's rounding, in the tensor's unit."""
 
     size: float
     rounding: float
 
 
 class RemodelingPass(Remodels):
-    """Updates the unit cells of a solved state."""
+    """Remodeling pass, which updates the unit cells of a solved state."""
 
     name, components = "cells", len(tensors.MANDEL)
 
@@ -62,16 +67,19 @@ class RemodelingPass(Remodels):
         kappa: float | Function | None = None,
         beside: Sequence[Remodels] = (),
     ):
-        self.state, self.settings, self.beside = state, settings, list(beside)  # beside: what else remodels
+        # `beside` has the remodeling processes in addition to the cells.
+        self.state, self.settings = state, settings
+        self.beside = list(beside)
         self.quadrature = state.cells.quadrature
-        # drives of states beside this one, which have the same cells
+        # Drives of further load cases, which have the same cells.
         self.further: list[Callable[[], Drive]] = []
-        # of a pass's change of the cells that is made
+        # Relaxation factor of a pass's change of the cells.
         self.relaxation = settings.relaxation_factor if COUPLINGS[settings.coupling].makes_a_share else 1.0
         self.parameters = state.parameters(tissue)
-        self.driver, self.law, self.frame = DRIVERS[settings.driver], LAWS[settings.law], FRAMES[settings.frame]
+        self.driver, self.law = DRIVERS[settings.driver], LAWS[settings.law]
+        self.frame = FRAMES[settings.frame]
         self.set_kappa(settings.kappa if kappa is None else kappa)
-        if self.fastest == 0.0 and self.law.asks_kappa:  # cells that never move need no pass
+        if self.fastest == 0.0 and self.law.asks_kappa:  # cells that never change need no pass
             self.law = LAWS["none"]
         if not self.law.remodels:
             return
@@ -83,23 +91,23 @@ class RemodelingPass(Remodels):
         self.stresses = PointStresses(state, tissue)
         tensor = ufl.as_ufl(self.driver.tensor(F, self.stresses.ufl))
         self._expression = jit.expression(tensor, self.quadrature.points)
-        self._known: Remembered[Array] = Remembered(state.comm, tensor)
+        self._cached_tensor: Remembered[Array] = Remembered(state.comm, tensor)
         self._target = self.law.target
         if self._target is tensor_target and not settings.has_set_point and not in_numpy():
-            self._target = TensorKernels(state.comm).target  # with the exponent 2 and no threshold
+            self._target = TensorKernels(state.comm).target  # exponent 2, no threshold
 
     @property
     def changes(self) -> bool:  # type: ignore[override]
-        """Whether cells change at all."""
+        """Whether the cells change in time."""
         return self.law.remodels
 
     @property
     def depends_on_path(self) -> bool:  # type: ignore[override]
-        """Whether cells stay where tension is below a threshold."""
+        """Whether cells with a tension below a threshold stay unchanged."""
         return self.settings.threshold > 0.0
 
     def set_kappa(self, kappa: float | Function) -> None:
-        """A number, or a DG0 Function."""
+        """Set the rate kappa to a number or a DG0 Function. Collective."""
         if not isinstance(kappa, Function):
             self.kappa: Array | float = kappa
             self.slowest = self.fastest = kappa
@@ -110,18 +118,18 @@ class RemodelingPass(Remodels):
         self.slowest, self.kappa = slowest if np.isfinite(slowest) else 0.0, at_points.reshape(-1)
 
     def driving_tensor(self) -> tuple[Array, Array]:
-        """F_e and the symmetric driving tensor at all points, each (elements * points, 3, 3)."""
+        """Return F_e and the symmetric driving tensor, each (elements * points, 3, 3)."""
 
         def evaluated() -> Array:
             self.stresses.refresh()
             tensor = self.quadrature.evaluate(self._expression, (3, 3)).reshape(-1, 3, 3)
             return (tensor + np.swapaxes(tensor, 1, 2)) / 2
 
-        return self.state.elastic_gradient(), self._known(evaluated)
+        return self.state.elastic_gradient(), self._cached_tensor(evaluated)
 
     def drive(self, residual: float = 0.0) -> Drive:
-        """What acts on the cells in the present state, which was accepted with this norm of out-of-balance forces."""
-        # Of several states with the same cells: their mean.
+        """Return the drive of the present state, which was accepted with this residual norm."""
+        # With further load cases it is the mean over all cases.
         if not self.further:
             return self._own_drive(residual)
         return MEANS_OF_CASES[self.settings.mean].drive(self._drives(residual), self.state.weights)
@@ -132,8 +140,9 @@ class RemodelingPass(Remodels):
     def _own_drive(self, residual: float) -> Drive:
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
-        # the driver's principal axes if the cells' axes are to stay
-        steady = self.state.cells.point_cells.axes
+        cells = self.state.cells
+        # Principal axes of the driver for which the cells' axes would stay.
+        steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
             steady = carried_axes(F, steady)
         return Drive(
@@ -142,7 +151,7 @@ class RemodelingPass(Remodels):
             self.driver,
             self.frame,
             noise,
-            self.state.cells.initial_dimensions.reshape(-1, 3),
+            cells.initial_dimensions.reshape(-1, 3),
             self.parameters.at_points().end_to_end_length,
             self.kappa,
             pairing=spectral.PAIRINGS[self.settings.pairing],
@@ -155,31 +164,33 @@ class RemodelingPass(Remodels):
         )
 
     def noise(self, F: Array, tensor: Array, residual: float) -> Noise:
-        """Up to which size a principal value may be an error: of rounding, or of the equilibrium as it was accepted."""
-        # The residual is one number for the whole body, of which nobody knows what stress it means at a point. However
-        # loose the tolerance is, it must not decide that nothing remodels: it counts as a small share of the stress.
+        """Return the error bound of principal values from rounding and the accepted residual."""
+        # The residual is one number for the whole body, and its stress at a point is unknown. A
+        # loose tolerance must not stop all remodeling. Therefore the residual counts as a small
+        # fraction of the stress at most.
         if not self.driver.is_stress:
             return Noise(spectral.ROUNDING, spectral.ROUNDING)
         rounding = STRESS_ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
-        displacement = float(np.abs(self.state.unknown.x.array).max(initial=0.0))
-        displacement = over_ranks(self.state.comm, displacement, MPI.MAX)
+        state = self.state
+        displacement = float(np.abs(state.unknown.x.array).max(initial=0.0))
+        displacement = over_ranks(state.comm, displacement, MPI.MAX)
         rounded = rounding * (1 + self.quadrature.largest_gradient * displacement)
         squares = np.sum(tensor**2, axis=(1, 2)).reshape(self.quadrature.shape)
         typical = float(np.sqrt(self.quadrature.mean(squares)))
         unbalanced = RESIDUAL_SHARE * residual / self._smallest_area
-        most = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
-        if unbalanced > max(WORTH_A_WORD * typical, most) and not self._numbers["said"]:
+        limit = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
+        if unbalanced > max(WORTH_A_WORD * typical, limit) and not self._numbers["said"]:
             self._numbers["said"] = 1
-            if self.state.comm.rank == 0:
-                log.warning(LOOSE_SOLVER, unbalanced, typical, most)
-        noise = Noise(rounded + min(unbalanced, most), rounding)
+            if state.comm.rank == 0:
+                log.warning(LOOSE_SOLVER, unbalanced, typical, limit)
+        noise = Noise(rounded + min(unbalanced, limit), rounding)
         if self.law.target is not None and typical > self._numbers["stress"]:
             self._numbers["stress"], self._numbers["floor"] = typical, float(floor_above(*noise))
         return noise
 
     def weakness(self) -> float:
-        """Tension of which half counts, over the stress of the body when that was largest; 0 of what nothing loads."""
-        # Laws that follow a target by its share are slower there (`tensor_law.floor_above`).
+        """Return the half-weight tension over the body's largest stress so far; 0 without loads."""
+        # Laws with a target remodel more slowly below this tension (`tensor_law.floor_above`).
         if not self.law.remodels or self.law.target is None or not self.driver.is_stress:
             return 0.0
         stress, floor = self._numbers["stress"], self._numbers["floor"]
@@ -195,8 +206,8 @@ class RemodelingPass(Remodels):
     def updated_cells(
         self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
     ) -> tuple[UnitCell, Array]:
-        """What the present stress makes of the present cells, or of others, in one row, and F (n, 3, 3)."""
-        # Changes nothing.
+        """Return cells after a pass of the present or other cells, and F (n, 3, 3)."""
+        # Cells are flattened over the quadrature points. The state does not change.
         cells = self.state.cells.point_cells if cells is None else cells
         if self._averages_targets:
             followed = self.followed(self.target(residual), time_new - time_old, cells)
@@ -205,7 +216,7 @@ class RemodelingPass(Remodels):
         return self.law.update(cells, drive, time_old, time_new), drive.deformation_gradient
 
     def target(self, residual: float = 0.0) -> Target:
-        """What the structure tensor tends to in the present state; of laws that have one."""
+        """Return the target of the structure tensor in the present state, if the law has one."""
         assert self._target is not None
         if self._averages_targets:
             return mean_target([self._target(drive) for drive in self._drives(residual)], self.state.weights)
@@ -216,7 +227,7 @@ class RemodelingPass(Remodels):
         return bool(self.further) and MEANS_OF_CASES[self.settings.mean].of_targets
 
     def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
-        """Of all points in one row: those without tension, or with hardly any beside compression. Cells there stay."""
+        """Return flags (n,) of points with no or hardly any tension, whose cells stay."""
         drive = self.drive(residual)
         if self.law.target is not None:
             return np.asarray(self.target(residual).switch < AWAKE)
@@ -224,58 +235,61 @@ class RemodelingPass(Remodels):
         return ~spectral.positive_direction(values, threshold=drive.noise)[1]
 
     def asleep_share(self) -> float:
-        """Share of the body's volume in which no principal value is above `remodeling.threshold`."""
+        """Return the volume fraction without a principal value above `remodeling.threshold`."""
         tensor = self.drive().tensor if self.further else self.driving_tensor()[1]
         asleep = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
         return float(self.quadrature.mean(asleep.reshape(self.quadrature.shape).astype(float)))
 
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
-        """Cells of all points in one row, the present or others, after a time with this target. Changes nothing."""
+        """Return the present or other cells after a time with a constant target; n points."""
         assert self.law.follow is not None
         r0 = self.parameters.at_points().end_to_end_length
         return self.law.follow(cells or self.state.cells.point_cells, target, r0, self.kappa * duration)
 
     @property
     def asked(self) -> UnitCell | None:
-        """What the last pass has asked for, whatever share of it was made; None before it."""
+        """Cells of the last pass before relaxation; None before the first pass."""
         return self._change[1] if self.law.remodels and self._change is not None else None
 
     def apply(self, time_old: float, time_new: float, residual: float = 0.0) -> float:
-        """Remodel over a step with the stress of the solved state at time_new; returns the power of remodeling."""
-        # The power is the stored energy that the pass releases at frozen deformation, per time, to first order
-        # (`Tissue.energy_increment`; Remark 6). A principal stress counts as tension beyond `noise`. Of the change of
-        # the cells the share `relaxation` is made (`Law.share`).
-        asked, F = self.updated_cells(time_old, time_new, residual)
-        return self.replace(asked, F, time_new - time_old, self.relaxation)
+        """Remodel over a step with the stress of the solved state at time_new; return the power."""
+        # The power is the stored energy that the pass releases at frozen deformation, per time, to
+        # first order (`Tissue.energy_increment`; Remark 6). A principal stress above `noise` counts
+        # as tension. The factor `relaxation` applies to the change of the cells (`Law.share`).
+        full_pass, F = self.updated_cells(time_old, time_new, residual)
+        return self.replace(full_pass, F, time_new - time_old, self.relaxation)
 
-    def replace(self, asked: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
-        """Give the state other cells, or a share of the change; returns the power of remodeling at frozen F."""
+    def replace(self, full_pass: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
+        """Replace the cells with a relaxation factor; return the power at frozen F."""
         cells = self.state.cells
-        self._change = cells.point_cells.copy(), asked
-        updated = self.law.share(self._change[0], asked, factor)
+        self._change = cells.point_cells.copy(), full_pass
+        updated = self.law.share(self._change[0], full_pass, factor)
         increment = self.parameters.at_points().energy_increment(F, self._change[0], updated)
         power: float = 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
         cells.set(*updated[:2])
         return power
 
     def look_ahead(self, time: float, residual: float = 0.0) -> None:
-        """What a pass to the limit would make of the present cells, for `residual`; nothing changes."""
-        # at rest the time is so long that nothing is left of a start (`Scene.last_time`): as much again is the limit
-        asked, _ = self.updated_cells(time, 2 * time, residual)
-        self._change = self.state.cells.point_cells.copy(), asked
+        """Record the cells of a pass to the limit for `distance`; the state does not change."""
+        # The time of the steady state is so late that the start has decayed (`Scene.last_time`). A
+        # pass to twice that time leads to the limit.
+        full_pass, _ = self.updated_cells(time, 2 * time, residual)
+        cells = self.state.cells
+        self._change = cells.point_cells.copy(), full_pass
 
     def distance(self) -> float:
-        """max |A_pass - A| of the last pass over all points, A those of the solved state, in squared link lengths."""
-        # How far the solved state is from one whose cells belong to its own stress; NaN before the first pass.
+        """Return max |A_pass - A| of the last pass, in squared link lengths."""
+        # A belongs to the solved state. It is the distance to a state whose cells belong to their
+        # own stress. NaN before the first pass.
         if not self.law.remodels or self._change is None:
             return float("nan")
         before, after = (structure_tensor(*cells[:2]) for cells in self._change)
         distance = np.linalg.norm(after - before, axis=(-1, -2))
         return self.quadrature.maximum(distance.reshape(self.quadrature.shape))
 
-    # ------------------------------------------------------------ as one of those that remodel
+    # ------------------------------------------------------------ life cycle, see `Remodels`
     def row(self) -> UnitCell:
-        """Return the cells of the solved state."""
+        """Return cells of the solved state."""
         return UnitCell(*self.state.equilibrium_cells.point_cells[:2])
 
     def set(self, values: UnitCell) -> None:
@@ -283,20 +297,20 @@ class RemodelingPass(Remodels):
         self.state.cells.set(*values[:2])
 
     def as_components(self, values: UnitCell) -> Array:
-        """Return Mandel components of A."""
+        """Return the Mandel components of A, (n, 6)."""
         return tensors.to_mandel(structure_tensor(*values[:2]))
 
     def moved(self, values: UnitCell, change: Array) -> UnitCell:
-        """Return cells whose A has changed."""
+        """Return cells after a change of A, in Mandel components."""
         squared, axes = spectral.continued(structure_tensor(*values[:2]) + tensors.from_mandel(change), values.axes)
         return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
     def passed(self, values: UnitCell, time: float, residual: float) -> UnitCell:
-        """Return the cells after a pass."""
+        """Return cells after a pass up to a time."""
         return self.updated_cells(self.state.time, time, residual, values)[0] if self.law.remodels else values
 
     def apart(self, values: UnitCell, other: UnitCell) -> float:
-        """Return the angle between the directions of the chains, root mean square over the body."""
+        """Return the RMS of the angle between chain directions over the body, in degrees."""
         angles = angle_between(values, other).reshape(self.quadrature.shape)
         return float(np.sqrt(self.quadrature.mean(angles**2)))
 
@@ -305,7 +319,7 @@ class RemodelingPass(Remodels):
         return self.size(self._change_by_a_pass(time, residual))
 
     def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
-        """Return the change of A by a pass to a time, at points that have tension."""
+        """Return the change of A by a pass up to a time, zero at points without tension."""
         change = self._change_by_a_pass(time, residual)
         change[self.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
         return change
@@ -316,12 +330,13 @@ class RemodelingPass(Remodels):
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Make a multiple of the change of a pass to a time."""
-        asked, _ = self.updated_cells(self.state.time, time, residual)
-        self.set(relaxed(self.state.cells.point_cells.copy(), asked, factor))
+        """Apply a multiple of the change of a pass up to a time."""
+        remodeled, _ = self.updated_cells(self.state.time, time, residual)
+        cells = self.state.cells
+        self.set(relaxed(cells.point_cells.copy(), remodeled, factor))
 
     def _change_by_a_pass(self, time: float, residual: float) -> Array:
-        """Return that of A, (elements, points, 3, 3)."""
-        asked, _ = self.updated_cells(self.state.time, time, residual)
+        """Return the change of A by a pass up to a time, (elements, points, 3, 3)."""
+        remodeled, _ = self.updated_cells(self.state.time, time, residual)
         present = self.state.cells.structure_tensor()
-        return np.asarray(structure_tensor(*asked[:2]).reshape(present.shape) - present)
+        return np.asarray(structure_tensor(*remodeled[:2]).reshape(present.shape) - present)

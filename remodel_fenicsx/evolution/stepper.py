@@ -1,4 +1,4 @@
-"""The way through time: one step as one transaction, and the loop over all of them, which watchers follow."""
+"""Time stepping: one step as one transaction, the loop over all steps, and their watchers."""
 
 from __future__ import annotations
 
@@ -35,39 +35,42 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SLOWNESS = 5  # steps between two looks of warnings, each of which costs up to a third of a step
+SLOWNESS = 5  # steps between two checks of slow changes; a check costs up to a third of a step
 
 
 @dataclass
 class Step:
-    """A step, from its solution to its end.
+    """Step, from its solution to its end.
 
     Attributes
     ----------
     time, number
-        Its time, and how many steps there have been with it (0: the unloaded body at the start).
+        Time of the step, and its number; 0 is the unloaded body at the start.
     loads
-        Magnitudes of the loads.
+        Magnitudes of the loads by name.
     extension
-        How far the solved state is from its limits.
+        Largest r/L and smallest J of the solved state.
     work
         Solver work.
     remodeling_power
-        Stored energy per time that the remodeling pass released; known once it is complete.
+        Stored energy per time that the remodeling pass released; known after the pass.
     seconds, processor_seconds
-        Wall time, and time of this rank's processor; known once it is complete.
+        Wall time and CPU time of this rank; known after the pass.
     is_last
-        Whether it is the last one of the way.
+        Whether it is the last step of the run.
     time_error
-        Estimated error in time of the solved state, degrees; NaN where nobody estimates it (`time_steps.TimeError`).
+        Estimated time discretisation error of the solved state, in degrees; NaN without an estimate
+        (`time_steps.TimeError`).
     negative_eigenvalues
-        Of the tangent at the solved state; NaN where nobody counts them (`watch.stability`).
+        Number of negative eigenvalues of the tangent at the solved state; NaN if not counted
+        (`watch.stability`).
     row
-        Its columns by name, where somebody measures (`results.columns.Observer`).
+        Values of the columns by name; empty without an observer (`results.columns.Observer`).
     case
-        Number of the load case that is looked at.
+        Number of the load case that the step describes.
     findings
-        What watchers say of the step, each a level of logging and a line: it is logged where the step is accepted.
+        Messages of watchers about the step, each a logging level and a line. They are logged when
+        the step is accepted.
 
     Examples
     --------
@@ -98,19 +101,20 @@ class Step:
 
     @property
     def is_due(self) -> bool:
-        """Whether it is time to look at what changes slowly: the first step, the last, and one in five between."""
+        """Whether slow changes are checked: in the first, the last, and every fifth step."""
         return self.is_last or self.number % SLOWNESS == 1
 
     @property
     def moment(self) -> str:
-        """Its time in words, and which load case it is, if not the first."""
+        """Label with the time, and the number of the load case if it is not the first."""
         return f"time {self.time:g}" + (f", load case {self.case}" if self.case > 1 else "")
 
 
 class Watcher:
-    """Follows the steps; whoever wants to know less overrides less.
+    """Base class of step observers; a subclass overrides the methods that it needs.
 
-    `solved` and `completed` happen inside the step's transaction: an exception there undoes the step for all watchers.
+    `solved` and `completed` run inside the step's transaction: an exception there undoes the step
+    for all watchers.
 
     Examples
     --------
@@ -129,43 +133,43 @@ class Watcher:
     """
 
     def started(self, step: Step) -> None:
-        """Before the first step: the unloaded body, as a step of its own."""
+        """Process the unloaded body before the first step, as a step of its own."""
 
     def resumed(self, step: Step) -> None:
-        """In place of `started` where a run goes on: the last step that was committed, its cells already remodeled."""
+        """Process the last committed step of a resumed run; its cells have already remodeled."""
 
     def solved(self, step: Step) -> None:
-        """The state is the solved one, which the step's row describes."""
+        """Process the solved state, which the step's row describes."""
 
     def completed(self, step: Step) -> None:
-        """The cells have remodeled; all of the step is known."""
+        """Process the complete step, whose cells have remodeled."""
 
     def undone(self, step: Step) -> None:
-        """Somebody has failed after the state was solved, here or elsewhere: what is kept of the step must go."""
+        """Discard all records of a step that failed after its solution, here or on other ranks."""
 
     def committed(self, step: Step) -> None:
-        """The step is accepted."""
+        """Process the accepted step."""
 
     def close(self) -> None:
-        """Free what PETSc has made for it."""
+        """Free PETSc's objects of the watcher."""
 
 
 class WarnsOnce(Watcher):
-    """Says one thing about a run, once; resumed runs know whether it was said.
+    """Watcher that logs one warning at most once in a run, also if the run is resumed.
 
     Parameters
     ----------
     stepper
-        Whose solved states are looked at.
+        Stepper or load case whose solved states are checked.
 
     Attributes
     ----------
     name
-        Of what is remembered of it in the state.
+        Prefix of names in the state.
     initial
-        Numbers of its own that are remembered from step to step, by name.
+        Initial values of numbers that carry over from step to step, by name.
     level
-        Of logging.
+        Logging level.
 
     Examples
     --------
@@ -196,72 +200,87 @@ class WarnsOnce(Watcher):
 
     @classmethod
     def of(cls, scene: Scene, stepper: Stepper) -> WarnsOnce | None:
-        """For a scene's stepper, or another load case (`WATCHERS`); None where there is nothing to watch.
+        """Make the watcher of a scene's stepper or load case (`WATCHERS`), or return None.
 
         Parameters
         ----------
         scene
             The scene.
         stepper
-            Its stepper, or the load case.
+            Stepper of the scene, or one of its load cases.
+
+        Returns
+        -------
+        WarnsOnce or None
+            None if there is nothing to watch.
         """
         return cls(stepper)
 
     @property
     def said(self) -> bool:
-        """Whether it was."""
+        """Whether the warning was issued."""
         return bool(self._numbers["said"])
 
     def due(self, step: Step) -> bool:
-        """Whether it is time to look.
+        """Return whether to check a step.
 
         Parameters
         ----------
         step
-            The step that is solved.
+            The solved step.
+
+        Returns
+        -------
+        bool
+            By default `Step.is_due`.
         """
         return step.is_due
 
     def look(self, step: Step) -> str:
-        """What is to be said of the solved state; nothing where all is well.
+        """Check the solved state, and return the warning or an empty string.
 
         Parameters
         ----------
         step
-            The step that is solved.
+            The solved step.
+
+        Returns
+        -------
+        str
+            One line without the time.
         """
         return ""
 
     def solved(self, step: Step) -> None:
-        """Look, until it was said."""
+        """Check the state until the warning is issued."""
         if self.due(step) and not self.said and (text := self.look(step)):
             self.find(step, text)
 
     def find(self, step: Step, text: str) -> None:
-        """It is said where the step is accepted, and else forgotten.
+        """Issue the warning; it is logged when the step is accepted, and discarded otherwise.
 
         Parameters
         ----------
         step
-            The step that is solved.
+            The solved step.
         text
-            One line, without the time.
+            One line without the time.
         """
         self._numbers["said"] = True
         step.findings.append((self.level, f"{step.moment}: {text}"))
 
 
 class LoadCaseSolver:
-    """A state with what solves it: that of a stepper, or of a further load case, which has the same cells.
+    """State with its solver: that of a stepper, or of a further load case with the same cells.
 
     Attributes
     ----------
     state, tissue, remodeling, coupling
-        The state, its tissue, what makes its drive, and what solves it.
+        The state, its tissue, the pass that computes its drive, and its coupling.
     load_values
-        Function of time: magnitudes of all loads.
+        Function of time that returns the magnitudes of all loads by name.
     each_case
-        This one and further load cases.
+        This load case and further load cases.
     """
 
     state: State
@@ -272,17 +291,17 @@ class LoadCaseSolver:
     each_case: list[LoadCaseSolver]
 
     def watched(self, watcher: Watcher) -> Watcher:
-        """Return a watcher of the stepper that sees each step as it is here."""
+        """Return a watcher of the stepper that gets each step with the values of this load case."""
         return watcher
 
 
 class Stepper(LoadCaseSolver):
-    """Advances a state in time; a step is all or nothing.
+    """Time stepper of a state; each step is a transaction.
 
     Parameters
     ----------
     state
-        What is advanced.
+        State to advance.
     tissue
         Parameters of matrix and chains.
     remodeling
@@ -290,11 +309,11 @@ class Stepper(LoadCaseSolver):
     solver
         Solver settings.
     load_values
-        Function of time: magnitudes of all loads.
+        Function of time that returns the magnitudes of all loads by name.
     coupling
-        Makes a coupling in place of the one that `remodeling` names.
+        Factory of a coupling in place of the coupling that `remodeling` names.
     kappa
-        A number, or a DG0 Function, in place of that of `remodeling`.
+        Number or DG0 Function in place of the kappa of `remodeling`.
 
     Examples
     --------
@@ -318,7 +337,8 @@ class Stepper(LoadCaseSolver):
         coupling: Maker | None = None,
         kappa: float | Function | None = None,
     ):
-        self.state, self.load_values, self._solver = state, load_values, solver
+        self.state, self._solver = state, solver
+        self.load_values = load_values
         beside: list[Remodels] = []
         for kind in remodeling.beside:
             beside.append(kind.make(state, tissue, remodeling))
@@ -326,13 +346,13 @@ class Stepper(LoadCaseSolver):
         self.tissue = state.parameters(tissue).tissue
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, beside)
         self.each_case = [self]
-        # cells that never change are coupled to nothing
+        # Cells that never change need no coupling.
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         if beside and name != remodeling.coupling and state.comm.rank == 0:
             log.warning(
-                "kappa is 0: the cells do not change, and %s follows with the coupling 'staggered' in place of %r, "
-                "whose errors fall with the step",
-                ", ".join(part.name for part in beside),
+                "kappa is 0: the cells do not change; %s uses the coupling 'staggered' in place of "
+                "%r, with an error of first order in the step size",
+                ", ".join(process.name for process in beside),
                 remodeling.coupling,
             )
         make = coupling or COUPLINGS[name].make
@@ -341,25 +361,43 @@ class Stepper(LoadCaseSolver):
 
     @property
     def remodels(self) -> list[Remodels]:
-        """What remodels: the cells, and what is beside them."""
+        """Remodeling processes: the cells first, then `RemodelingPass.beside`."""
         return [self.remodeling, *self.remodeling.beside]
 
     def part(self, name: str) -> Any:  # type: ignore[explicit-any]  # the name tells the class
-        """Return what remodels under this name; None where nothing has it."""
-        return next((part for part in self.remodels if part.name == name), None)
+        """Return the remodeling process of this name, or None.
+
+        Parameters
+        ----------
+        name
+            Name of the process, such as "turnover" (`Remodels.name`).
+        """
+        return next((process for process in self.remodels if process.name == name), None)
 
     @property
     def slowest(self) -> float:
-        """The smallest rate above 0, 1/time; 0 where nothing remodels."""
-        return min((part.slowest for part in self.remodels if part.changes and part.slowest), default=0.0)
+        """Smallest positive rate, 1/time; 0 if nothing remodels."""
+        rates = (process.slowest for process in self.remodels if process.changes)
+        return min(filter(None, rates), default=0.0)
 
     @property
     def fastest(self) -> float:
-        """The largest one."""
-        return max((part.fastest for part in self.remodels if part.changes), default=0.0)
+        """Largest rate, 1/time; 0 if nothing remodels."""
+        return max((process.fastest for process in self.remodels if process.changes), default=0.0)
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
-        """The present state as the step that watchers see before all others; at first in equilibrium without loads."""
+        """Pass the present state to watchers as a step; at first solve for unloaded equilibrium.
+
+        Parameters
+        ----------
+        watchers
+            Watchers of the steps.
+
+        Returns
+        -------
+        Step
+            The present state as a step.
+        """
         state, work = self.state, Work()
         if not state.number:
             for case in self.each_case:
@@ -381,36 +419,43 @@ class Stepper(LoadCaseSolver):
         way: Homeostasis | None = None,
         judge: Callable[[Step], object] = lambda step: None,
     ) -> Step:
-        """One step: equilibrium with the loads of `time`, and remodeling.
+        """Advance by one step: equilibrium with the loads of `time`, and remodeling.
 
         Parameters
         ----------
         time
-            Its end.
+            End of the step.
         watchers, is_last
-            Who follows it, and whether it is the last one.
+            Watchers of the step, and whether it is the last step.
         rejected
-            The last attempt at it that was taken back: its work and seconds, which have those of the attempts before
-            it, belong to the step.
+            Last rejected attempt at the step. Its work and seconds, which contain those of earlier
+            attempts, are added to the step's.
         way
-            Solves and remodels in place of the coupling (`homeostasis.Homeostasis`).
+            Strategy that solves and remodels in place of the coupling (`homeostasis.Homeostasis`).
         judge
-            Asked when the step's pass is done; what it raises takes the step back (`time_steps`).
+            Function that is called after the pass; if it raises, the step is rejected
+            (`time_steps`).
+
+        Returns
+        -------
+        Step
+            The committed step.
 
         Raises
         ------
         StepFailure
             If no admissible equilibrium is found.
         ValueError
-            If `time` does not come after the state's.
+            If `time` is not later than the state's time.
         RuntimeError
-            After `close`.
+            If the stepper was closed.
         BaseException
-            Whatever is raised, by a watcher too: the state is then that of the last committed step.
+            Any exception, also from a watcher; the state is then that of the last committed step.
         """
-        state, start, processor_start = self.state, clock.perf_counter(), clock.process_time()
+        state = self.state
+        start, processor_start = clock.perf_counter(), clock.process_time()
         if self._closed:
-            raise RuntimeError("this stepper (or its simulation) has been closed; make another one to go on")
+            raise RuntimeError("the stepper or its simulation has been closed; create a new one")
         if time <= state.time:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
@@ -418,7 +463,7 @@ class Stepper(LoadCaseSolver):
             extension = work.extension or self.coupling.equilibrium.extension()
             if rejected is not None:
                 work.add(rejected.work)
-            loads = dict(state.loading.values)  # those that nobody has named too
+            loads = dict(state.loading.values)  # also loads without a specified value
             step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
             with undone_by_all(watchers, step):
                 for watcher in watchers:
@@ -446,16 +491,21 @@ class Stepper(LoadCaseSolver):
         watchers: Sequence[Watcher] = (),
         judge: Callable[[Step], object] = lambda step: None,
     ) -> Iterator[Step]:
-        """The loop through time: start, and every step to the end of `times`; what is yielded is committed.
+        """Start, and yield each committed step up to the end of `times`.
 
         Parameters
         ----------
         times
-            Of the steps, ascending.
+            Times of the steps, ascending.
         watchers
-            Who follows them.
+            Watchers of the steps.
         judge
-            As of `advance`.
+            See `advance`.
+
+        Yields
+        ------
+        Step
+            The committed steps.
         """
         remaining = list(times)
         self.start(watchers)
@@ -463,44 +513,57 @@ class Stepper(LoadCaseSolver):
             yield self.advance(time, watchers, is_last=number == len(remaining), judge=judge)
 
     def take(self, load_values: Callable[[float], LoadValues], kappa: float | Function) -> None:
-        """Replace loads and rates."""
+        """Replace the loads and the rate kappa.
+
+        Parameters
+        ----------
+        load_values, kappa
+            See `Stepper`.
+        """
         self.load_values = load_values
         self.remodeling.set_kappa(kappa)
 
     @contextmanager
     def holding(self, held: float) -> Iterator[None]:
-        """Keep all loads constant from a time on, within the block."""
-        given = self.load_values
-        self.load_values = lambda time: given(min(time, held))
+        """Keep all loads constant from a time on while the block runs.
+
+        Parameters
+        ----------
+        held
+            The time.
+        """
+        load_values = self.load_values
+        self.load_values = lambda time: load_values(min(time, held))
         try:
             yield
         finally:
-            self.load_values = given
+            self.load_values = load_values
 
     def close(self) -> None:
-        """Free PETSc's objects and options; the state stays, and takes no further step."""
+        """Free PETSc's objects and options; the state stays, but no further step is possible."""
         self._closed = True
         self.coupling.close()
 
 
 class Way(Protocol):
-    """A way through time."""
+    """Protocol of a time stepping strategy."""
 
     def remaining(self) -> list[float]:
-        """Return the times of the steps that are left, as far as they are known."""
+        """Return the times of the remaining steps, as far as they are known."""
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Yield the committed steps from the present state to the end."""
 
 
 class FixedSteps:
-    """March in steps of one length."""
+    """Time stepping with a constant step size."""
 
     def __init__(self, stepper: Stepper, end: float, step: float, judge: Callable[[Step], object] = lambda step: None):
-        self.stepper, self.end, self.step, self.judge = stepper, end, step, judge
+        self.stepper, self.judge = stepper, judge
+        self.end, self.step = end, step
 
     def remaining(self) -> list[float]:
-        """Return the times of the steps that are left."""
+        """Return the times of the remaining steps."""
         return list(times(self.end, self.step))[self.stepper.state.number :]
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
@@ -509,27 +572,27 @@ class FixedSteps:
 
 
 def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work) -> None:
-    """Let a body go that its prestretch leaves out of balance, in as many parts as it needs. Collective."""
-    G, one = state.natural_gradient, np.eye(3)
-    if G is None or state.kinematics.closing is not None or not state.cells.quadrature.maximum(np.abs(G - one)):
+    """Equilibrate a body with prestretch, in substeps as needed. Collective."""
+    G, identity = state.natural_gradient, np.eye(3)
+    if G is None or state.kinematics.closing is not None or not state.cells.quadrature.maximum(np.abs(G - identity)):
         return
-    whole = G.copy()
+    prestretch = G.copy()
 
     def set_fraction(fraction: float) -> None:
-        G[:] = whole if fraction == 1.0 else one + fraction * (whole - one)
+        G[:] = prestretch if fraction == 1.0 else identity + fraction * (prestretch - identity)
 
     with state.transaction(), closing(GuardedNewton(equilibrium, settings)) as newton:
         change = Change(state.time, "the prestretch", set_fraction, state, lambda: newton, settings.maximum_halvings)
         try:
             change.advance(work)
         finally:
-            G[:] = whole
-    log.info("the body is let go with its prestretch: %d parts", work.substeps)
+            G[:] = prestretch
+    log.info("prestretched body equilibrated in %d substeps", work.substeps)
 
 
 @contextmanager
 def undone_by_all(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
-    """Whatever is raised in the block, every watcher forgets the step, the last one first."""
+    """Call `undone` of all watchers, the last first, if the block raises."""
     try:
         yield
     except BaseException:
@@ -539,19 +602,19 @@ def undone_by_all(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
 
 
 def times(end: float, step: float) -> Iterator[float]:
-    """Times of steps after t = 0: multiples of the step as decimal numbers (3 * 0.1 is 0.3); the last one is the end.
+    """Yield times of steps: decimal multiples of the step (3 * 0.1 is 0.3), and the end.
 
     Parameters
     ----------
     end
         Last time.
     step
-        From one time to the next; in the same unit.
+        Step size, in the same unit.
 
     Yields
     ------
     float
-        Ascending; without 0.
+        Times in ascending order, without 0.
 
     Examples
     --------
@@ -566,43 +629,44 @@ def times(end: float, step: float) -> Iterator[float]:
     yield end
 
 
-# ---------------------------------------------------------------- stops on purpose, between two steps
-# Asked for by a signal, or because the time that was given is over.
+# ---------------------------------------------------------------- intended stops between two steps
+# A signal requests the stop, or the wall time limit requires it.
 
-MARGIN = 1.2  # how much longer than those before it the next step may take
+MARGIN = 1.2  # largest expected wall time of the next step over that of earlier steps
 NOT_ASKED, BY_SIGNAL, BY_CLOCK = range(3)
 REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall-time is over"}
 
 
 class Pause(Watcher):
-    """Raises `Paused` after a step, on all ranks, if somebody asked for it or the next step would come too late."""
+    """Watcher that raises `Paused` on all ranks on request, or before a time limit."""
 
-    def __init__(self, comm: MPI.Comm, folder: Path, asked: Callable[[], bool], deadline: float | None = None):
-        self.comm, self.folder, self.asked, self.deadline = comm, folder, asked, deadline
+    def __init__(self, comm: MPI.Comm, folder: Path, is_requested: Callable[[], bool], deadline: float | None = None):
+        self.comm, self.folder = comm, folder
+        self.is_requested, self.deadline = is_requested, deadline
         self._last = clock.monotonic()
-        self._seconds = 0.0  # of a step with all that is written of it
+        self._seconds = 0.0  # wall time of a step with its output
 
     def started(self, step: Step) -> None:
-        """Before the first step."""
+        """Check for a stop before the first step."""
         self._last = clock.monotonic()
         self._check(step)
 
     def resumed(self, step: Step) -> None:
-        """Before the first step of this run."""
+        """Check for a stop before the first step of a resumed run."""
         self.started(step)
 
     def committed(self, step: Step) -> None:
-        """After each step but the last."""
+        """Check for a stop after each step except the last."""
         now = clock.monotonic()
         self._seconds, self._last = max(0.5 * self._seconds, now - self._last), now
         if not step.is_last:
             self._check(step)
 
     def _check(self, step: Step) -> None:
-        reason = BY_SIGNAL if self.asked() else NOT_ASKED
+        reason = BY_SIGNAL if self.is_requested() else NOT_ASKED
         if self.deadline is not None and self.comm.rank == 0 and not reason:
             late = clock.monotonic() + MARGIN * self._seconds > self.deadline
             reason = BY_CLOCK if late else NOT_ASKED
-        asked = [one for one in self.comm.allgather(reason) if one]
-        if asked:
-            raise Paused(REASONS[asked[0]], step.time, self.folder)
+        reasons = [code for code in self.comm.allgather(reason) if code]
+        if reasons:
+            raise Paused(REASONS[reasons[0]], step.time, self.folder)

@@ -1,4 +1,4 @@
-"""Steps of chosen lengths: the error of a row, estimated from the step itself, and what follows of it."""
+"""Adaptive time stepping: the estimated error of a row, and step size control."""
 
 from __future__ import annotations
 
@@ -23,160 +23,172 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 
-# ---------------------------------------------------------------- how far a row is from what smaller steps would give
-# An estimate from the step itself.
+# ---------------------------------------------------------------- error of a row
+# The time discretisation error is estimated from the step itself.
 
-SLOWEST = 20.0  # times as slowly as the cells alone body and cells may forget
-LARGEST_LINEAR_CHANGE = 1.0  # change of a length: a linear answer says no more
+# Largest ratio of the decay times of body and cells together, and of the cells alone.
+SLOWEST = 20.0
+# Relative change of a length up to which a linear response has a meaning.
+LARGEST_LINEAR_CHANGE = 1.0
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of one step, in degrees."""
+    """Estimated time discretisation errors of one step, in degrees."""
 
     controlled: float
     row: float
 
 
-AllValues = Sequence[Values]  # of all that remodels, in its order
+AllValues = Sequence[Values]  # values of all remodeling processes, in order
 
 
 class TimeError:
-    """Compares each row with a better one that the coupling has (docs/theory.md, Error-controlled steps)."""
+    """Error estimator, which compares each row with a higher-order one of the coupling."""
+
+    # See docs/theory.md, Error-controlled steps.
 
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.slowest
-        self.remodels = [part for part in stepper.remodels if part.components]
-        # the error of rows so far, by name; "row": that of the cells
-        self._errors = ["row" if part is stepper.remodeling else part.name for part in self.remodels]
+        self.remodels = [process for process in stepper.remodels if process.components]
+        # Names of the errors of rows so far; "row" is that of the cells.
+        self._errors = ["row" if process is stepper.remodeling else process.name for process in self.remodels]
         initial = {"speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0}
         self._numbers = Numbers(stepper.state, "time_error", initial | dict.fromkeys(self._errors, 0.0))
-        # with rows that lag the last error, with others the last row
+        # The last error if rows lag behind, otherwise the last row.
         self._last = [
             Earlier(
                 stepper.state,
-                f"time_error_{part.name}",
-                partial(self.quadrature.function, "", (part.components,)),
+                f"time_error_{process.name}",
+                partial(self.quadrature.function, "", (process.components,)),
                 1,
             )
-            for part in self.remodels
+            for process in self.remodels
         ]
 
     def measure(self, step: Step) -> Estimate:
-        """Estimate the error of a step whose pass is done, within its transaction."""
+        """Estimate the error of a step after its pass, within its transaction."""
         duration = step.time - self.state.time
-        rows = [part.row() for part in self.remodels]
-        betters = [self._better(part) for part in self.remodels]
-        if self.stepper.coupling.traits.accumulates:
-            found = self._added_up(step, rows, betters, duration)
+        rows = [process.row() for process in self.remodels]
+        betters = [self._better(process) for process in self.remodels]
+        traits = self.stepper.coupling.traits
+        if traits.accumulates:
+            estimate = self._added_up(step, rows, betters, duration)
         elif all(better is None for better in betters):
-            found = Estimate(0.0, 0.0)
+            estimate = Estimate(0.0, 0.0)
         else:
             lag = self._lag(step, rows, _known(betters, rows), duration)
-            found = Estimate(lag, lag)
+            estimate = Estimate(lag, lag)
         self._numbers["duration"] = duration
-        step.time_error = found.row
-        return found
+        step.time_error = estimate.row
+        return estimate
 
-    def _better(self, part: Remodels) -> Values:
-        return self.stepper.coupling.better if part is self.stepper.remodeling else part.better()
+    def _better(self, process: Remodels) -> Values:
+        return self.stepper.coupling.better if process is self.stepper.remodeling else process.better()
 
     # ------------------------------------------------------------ rows that lag behind
     def _lag(self, step: Step, rows: AllValues, betters: AllValues, duration: float) -> float:
-        """Measure the distance to what a pass makes with the stress of a body that has remodeled so."""
-        known, angle = betters, self._apart(rows, betters)
+        """Return the error of a lagging row, by a pass after the linear response of the body."""
+        first_betters, angle = betters, self._apart(rows, betters)
         with self.state.tentative():
             strain, admissible = self._strain(step, self._expected(rows, betters, duration))
             if admissible:
                 pairs = zip(self.remodels, rows, strict=True)
-                betters = [part.passed(row, step.time, step.work.residual) for part, row in pairs]
-        most, angle = SLOWEST * angle, self._apart(rows, betters)
-        if angle > most:  # another state, to which this one does not tend
-            betters, angle = known, most
-        for part, last, row, better in zip(self.remodels, self._last, rows, betters, strict=True):
-            last.push((part.as_components(better) - part.as_components(row)).ravel())
+                betters = [process.passed(row, step.time, step.work.residual) for process, row in pairs]
+        limit, angle = SLOWEST * angle, self._apart(rows, betters)
+        if angle > limit:  # the pass leads to another state, to which this state does not tend
+            betters, angle = first_betters, limit
+        for process, last, row, better in zip(self.remodels, self._last, rows, betters, strict=True):
+            last.push((process.as_components(better) - process.as_components(row)).ravel())
         return max(angle, strain)
 
     def _expected(self, rows: AllValues, betters: AllValues, duration: float) -> AllValues:
-        """Return what the last error lets expect; at first the better ones."""
+        """Return the values predicted by the last error; at first the higher-order values."""
         if not self._last[0].known:
             return betters
-        longer, parts = duration / self._numbers["duration"], zip(self.remodels, self._last, rows, strict=True)
-        return [part.moved(row, longer * last.values[0].reshape(-1, part.components)) for part, last, row in parts]
+        ratio, processes = duration / self._numbers["duration"], zip(self.remodels, self._last, rows, strict=True)
+        return [
+            process.moved(row, ratio * last.values[0].reshape(-1, process.components))
+            for process, last, row in processes
+        ]
 
-    # ------------------------------------------------------------ errors that add up
+    # ------------------------------------------------------------ accumulating errors
     def _added_up(self, step: Step, rows: AllValues, betters: AllValues, duration: float) -> Estimate:
-        fading, numbers, strain = self._fading(step, rows, duration), self._numbers, 0.0
-        answer, ends, left = self._answer(fading, duration), [], []
+        decay_rate = self._fading(step, rows, duration)
+        amplification = self._answer(decay_rate, duration)
+        numbers, strain = self._numbers, 0.0
+        limits, errors = [], []
         if any(better is not None for better in betters):
             betters = _known(betters, rows)
             with self.state.tentative():
                 strain, _ = self._strain(step, betters)
-        for part, name, row, better in zip(self.remodels, self._errors, rows, _known(betters, rows), strict=True):
-            error = max(part.apart(row, better), strain if part is self.stepper.remodeling else 0.0)
-            # bounded rates change no longer than the cells do
-            ends.append(_end_of(error, max(self.kappa, part.slowest) * duration))
-            rate = min(fading, part.slowest) if fading else part.slowest
+        for process, name, row, better in zip(self.remodels, self._errors, rows, _known(betters, rows), strict=True):
+            error = max(process.apart(row, better), strain if process is self.stepper.remodeling else 0.0)
+            # Bounded rates do not change for longer than the cells do.
+            limits.append(_end_of(error, max(self.kappa, process.slowest) * duration))
+            rate = min(decay_rate, process.slowest) if decay_rate else process.slowest
             numbers[name] = float(np.exp(-rate * duration)) * numbers[name] + error
-            left.append(numbers[name])
-        return Estimate(answer * max(ends), max(left))
+            errors.append(numbers[name])
+        return Estimate(amplification * max(limits), max(errors))
 
     def _fading(self, step: Step, rows: AllValues, duration: float) -> float:
-        """Return the rate at which errors fade: that at which all slows down while loads are held."""
-        numbers, speed, shape = self._numbers, 0.0, self.quadrature.shape
-        before, fading = numbers["speed"], numbers["fading"]
-        present = [part.as_components(row).ravel() for part, row in zip(self.remodels, rows, strict=True)]
+        """Return the decay rate of errors, from changes that slow down under constant loads."""
+        numbers, speed = self._numbers, 0.0
+        shape = self.quadrature.shape
+        before, decay_rate = numbers["speed"], numbers["fading"]
+        present = [process.as_components(row).ravel() for process, row in zip(self.remodels, rows, strict=True)]
         if self._last[0].known:
-            changes = [one - last.values[0] for one, last in zip(present, self._last, strict=True)]
-            points = max(shape[0] * shape[1], 1)  # a rank may have none
+            changes = [values - last.values[0] for values, last in zip(present, self._last, strict=True)]
+            points = max(shape[0] * shape[1], 1)  # a rank may have no points
             squares = [(change**2).reshape(*shape, change.size // points).sum(axis=-1) for change in changes]
             speed = float(np.sqrt(self.quadrature.mean(sum(squares)))) / duration
         if not self._held(step):
-            fading = self.kappa
+            decay_rate = self.kappa
         elif before > 0 and speed > 0:
             rate = np.log(before / speed) / (0.5 * (duration + numbers["duration"]))
-            fading = float(np.sqrt(fading * np.clip(rate, self.kappa / SLOWEST, self.kappa)))
-        for last, one in zip(self._last, present, strict=True):
-            last.push(one)
-        numbers["speed"], numbers["fading"] = speed, fading
-        return fading
+            decay_rate = float(np.sqrt(decay_rate * np.clip(rate, self.kappa / SLOWEST, self.kappa)))
+        for last, values in zip(self._last, present, strict=True):
+            last.push(values)
+        numbers["speed"], numbers["fading"] = speed, decay_rate
+        return decay_rate
 
-    def _answer(self, fading: float, duration: float) -> float:
-        """By what the stress, which follows the cells, has magnified an error since loads are held: to kappa/fading."""
-        left = float(np.exp(-fading * duration))
-        limit = self.kappa / fading if fading else 1.0
-        answer = max(1.0, left * self._numbers["answer"] + (1.0 - left) * limit)
-        self._numbers["answer"] = answer
-        return answer
+    def _answer(self, decay_rate: float, duration: float) -> float:
+        """Return the amplification of an error by the stress since loads are constant."""
+        # It tends to kappa over the decay rate.
+        decay = float(np.exp(-decay_rate * duration))
+        limit = self.kappa / decay_rate if decay_rate else 1.0
+        amplification = max(1.0, decay * self._numbers["answer"] + (1.0 - decay) * limit)
+        self._numbers["answer"] = amplification
+        return amplification
 
     def _held(self, step: Step) -> bool:
-        """Whether no load has changed over the step."""
-        first, *others = self.stepper.each_case
-        time, loads = self.state.time, [step.loads, *(case.state.loading.values for case in others)]
+        """Return whether all loads were constant over the step."""
+        first, *further = self.stepper.each_case
+        time, loads = self.state.time, [step.loads, *(case.state.loading.values for case in further)]
         return all(
             values.get(name) == value
-            for case, values in zip((first, *others), loads, strict=True)
+            for case, values in zip((first, *further), loads, strict=True)
             for name, value in case.load_values(time).items()
         )
 
     # ------------------------------------------------------------ distances
     def _apart(self, rows: AllValues, betters: AllValues) -> float:
-        """Return the largest distance of what remodels, degrees."""
-        return max(part.apart(*pair) for part, *pair in zip(self.remodels, rows, betters, strict=True))
+        """Return the largest distance over all remodeling processes, in degrees."""
+        return max(process.apart(*pair) for process, *pair in zip(self.remodels, rows, betters, strict=True))
 
     def _strain(self, step: Step, remodeled: AllValues) -> tuple[float, bool]:
-        """Let the body answer what has remodeled: the largest change of a length, and whether that is a state."""
+        """Return length change, in degrees, and admissibility of the linear response."""
         cases = self.stepper.each_case
         before = [case.state.elastic_gradient() for case in cases]
-        for part, values in zip(self.remodels, remodeled, strict=True):
-            part.set(values)
+        for process, values in zip(self.remodels, remodeled, strict=True):
+            process.set(values)
         tangents = [case.coupling.tangents for case in cases] if cases[1:] else [step.work.tangents]
-        found = [self._answered(*parts) for parts in zip(cases, before, tangents, strict=True)]
-        return max(strain for strain, _ in found), all(admissible for _, admissible in found)
+        responses = [self._answered(*arguments) for arguments in zip(cases, before, tangents, strict=True)]
+        return max(strain for strain, _ in responses), all(admissible for _, admissible in responses)
 
     def _answered(self, case: LoadCaseSolver, before: Array, tangents: int) -> tuple[float, bool]:
-        """Of one load case; `before`: its F_e."""
+        """Return length change and admissibility of one load case; `before` is its earlier F_e."""
         state, equilibrium = case.state, case.coupling.equilibrium
         state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
         after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
@@ -186,42 +198,48 @@ class TimeError:
 
 
 def _known(betters: AllValues, rows: AllValues) -> AllValues:
-    """Better values where there are any, those of the row elsewhere."""
+    """Return the higher-order values, or the row's values if there are none."""
     return [row if better is None else better for better, row in zip(betters, rows, strict=True)]
 
 
 def _end_of(difference: float, forgotten: float) -> float:
-    """Where an error ends that each step adds to, if all steps are alike and exp(-forgotten) is left after each."""
-    share = float(-np.expm1(-forgotten))
-    return difference / share if share else difference
+    """Return the limit of an error that each step increases and damps by exp(-forgotten)."""
+    fraction = float(-np.expm1(-forgotten))
+    return difference / fraction if fraction else difference
 
 
-# ---------------------------------------------------------------- steps as long as a tolerance allows
-# Chosen by the error of those before, taken back where they were too long.
+# ---------------------------------------------------------------- step size control
+# The step size follows from the errors of earlier steps. A step with too large an error is
+# rejected.
 
-AIM = 0.85  # share of the tolerance that another length aims at
-KEPT, WORTHWHILE = 0.9, 1.5  # best lengths over the present one between which steps stay as they are
-LENGTHENING, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two steps
-HALVED = 0.5  # what is left, at most, of a step that is taken back once more: its error hardly falls
-STRETCHED = 1.05  # so much longer steps are allowed to be where they are one fewer to a stop
-SMALLEST = 2.0**-12  # of the first step: shorter ones are not tried where steps cannot be solved
-FASTEST = 360.0  # degrees by which chains turn, at most, while cells remodel or loads go from one corner to the next
-IN_VAIN = 20  # steps above the tolerance in such a time that shorter ones would not help, until longer ones go on
-NEAR_TOLERANCE = 4.0  # tolerances: below such an error shorter steps are tried again
-FAILED_STEPS = 3  # steps in a row that could not be solved, each a quarter of the one before
-TELLING_ERROR = 1e-4  # of the tolerance: smaller errors say nothing about the next step
+AIM = 0.85  # the next step aims at this fraction of the tolerance
+KEPT, WORTHWHILE = 0.9, 1.5  # optimal over present step size between which the size stays
+LENGTHENING, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two step sizes
+HALVED = 0.5  # largest factor after a second rejection, because the error hardly decreases
+STRETCHED = 1.05  # factor by which steps may grow if that saves one before a breakpoint
+SMALLEST = 2.0**-12  # minimum over the first step: unsolved steps are not reduced further
+# Largest rotation of chains in degrees while cells remodel or loads go from one breakpoint to the
+# next.
+FASTEST = 360.0
+# Number of steps of minimum size above the tolerance, in the time of `_fastest_time`, after which
+# larger steps follow.
+IN_VAIN = 20
+NEAR_TOLERANCE = 4.0  # error over the tolerance below which smaller steps are tried again
+FAILED_STEPS = 3  # maximum number of failed steps in sequence, each a quarter of the step before
+TELLING_ERROR = 1e-4  # smallest error over the tolerance that affects the next step size
 
 
 class StepTooLongError(Exception):
-    """The step was too long: it has been taken back."""
+    """Step rejected because its error exceeds the tolerance."""
 
     def __init__(self, step: Step, duration: float, error: float):
         super().__init__(f"error of {error:g} times the tolerance")
-        self.step, self.duration, self.error = step, duration, error
+        self.step, self.duration = step, duration
+        self.error = error
 
 
 class StepControl:
-    """Marches a stepper to the last of some times, which are hit exactly, in steps of an error below a tolerance."""
+    """Adaptive time stepping with an error tolerance, which hits breakpoints exactly."""
 
     def __init__(
         self,
@@ -232,103 +250,108 @@ class StepControl:
         longest: float = math.inf,
         level: int = logging.WARNING,
     ):
-        self.stepper, self.state, self.first, self.stops = stepper, stepper.state, first, list(stops)
+        self.stepper, self.state = stepper, stepper.state
+        self.first, self.stops = first, list(stops)
         self.error = TimeError(stepper)
-        self.level = level  # of what is said of steps above the tolerance
-        # "before": error of the last step; "usual": length of steps within the tolerance
+        self.level = level  # of warnings about steps above the tolerance
+        # "before" is the error of the last step, "usual" the step size within the tolerance.
         initial = {"wanted": first, "before": 1.0, "usual": first, "in_vain": 0.0, "said": 0.0}
         self._numbers = Numbers(stepper.state, "step_control", initial)
-        self._rejected: list[StepTooLongError] = []  # attempts at the step under way
+        self._rejected: list[StepTooLongError] = []  # rejected attempts at the present step
         self.limit(tolerance, longest)
 
     def limit(self, tolerance: float, longest: float) -> None:
-        """From now on take this tolerance in degrees, and no longer steps than this one times kappa."""
-        self.tolerance, self.longest = tolerance, min(longest, self.stepper.coupling.traits.longest)
+        """Set the tolerance in degrees, and the largest step times kappa."""
+        traits = self.stepper.coupling.traits
+        self.tolerance, self.longest = tolerance, min(longest, traits.longest)
 
     def with_stops(self, stops: Sequence[float]) -> StepControl:
-        """Return one that goes on to other times."""
-        other = copy.copy(self)
-        other.stops = list(stops)
-        return other
+        """Return a copy with other breakpoints."""
+        control = copy.copy(self)
+        control.stops = list(stops)
+        return control
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
-        """From where the state is to the last stop; what is yielded is committed."""
+        """Yield the committed steps from the present state to the last breakpoint."""
         self.stepper.start(watchers)
         while stops := self.remaining():
             yield self._accepted(stops[0], watchers)
 
     def remaining(self) -> list[float]:
-        """Return the stops that are left."""
+        """Return the breakpoints after the present time."""
         time = self.state.time
         return [stop for stop in self.stops if stop > time and not math.isclose(stop, time)]
 
     def _accepted(self, stop: float, watchers: Sequence[Watcher]) -> Step:
-        """The next step, shortened until it is accepted."""
-        self._rejected, duration, failures = [], self._numbers["wanted"], 0
+        """Advance by one step, whose size is reduced until the step is accepted."""
+        self._rejected, failures = [], 0
+        duration = self._numbers["wanted"]
         while True:
             time = self._end_of_step(duration, stop)
             before = self._rejected[-1].step if self._rejected else None
             advance = partial(self.stepper.advance, time, watchers, time == self.stops[-1], before, judge=self._judge)
-            found = attempted(advance, StepFailure, StepTooLongError)
-            if isinstance(found, Step):
-                return found
-            if isinstance(found, StepTooLongError):
-                log.debug("time %g: %s, taken back", time, found)
-                self._rejected.append(found)
-                most = 1.0 if len(self._rejected) == 1 else HALVED
-                duration = max(self._best(found.error, found.duration, most), self._shortest())
+            outcome = attempted(advance, StepFailure, StepTooLongError)
+            if isinstance(outcome, Step):
+                return outcome
+            if isinstance(outcome, StepTooLongError):
+                log.debug("time %g: %s; step rejected", time, outcome)
+                self._rejected.append(outcome)
+                max_factor = 1.0 if len(self._rejected) == 1 else HALVED
+                duration = max(self._best(outcome.error, outcome.duration, max_factor), self._shortest())
                 continue
             failures += 1
             duration = (time - self.state.time) / 4
             if failures > FAILED_STEPS or duration < SMALLEST * self.first:
-                raise found
-            say(SHORTER_STEP, found)
+                raise outcome
+            say(SHORTER_STEP, outcome)
 
     def _end_of_step(self, duration: float, stop: float) -> float:
-        """Steps to a stop are alike: none that is left over is shorter than the others."""
+        """Return the end of the next step, so that steps to a breakpoint have one size."""
         time = self.state.time
-        left = stop - time
-        number = math.ceil(left / (STRETCHED * duration))
-        return stop if number <= 1 else time + left / number
+        interval = stop - time
+        number = math.ceil(interval / (STRETCHED * duration))
+        return stop if number <= 1 else time + interval / number
 
     # ------------------------------------------------------------ within the step's transaction
     def _judge(self, step: Step) -> None:
-        """Accept a step and choose the next one, or raise."""
+        """Accept a step and choose the next step size, or raise."""
         error, duration = self.error.measure(step).controlled / self.tolerance, step.time - self.state.time
-        numbers, shortest, goes_on = self._numbers, self._shortest(), self._numbers["in_vain"] > IN_VAIN
+        numbers, shortest = self._numbers, self._shortest()
+        goes_on = numbers["in_vain"] > IN_VAIN
         if error > 1 and not (goes_on or duration <= (1 + 1e-9) * STRETCHED * shortest):
             raise StepTooLongError(step, duration, error)
-        wanted = self._next(error, duration)
+        next_step = self._next(error, duration)
         goes_on = self._count(error, duration)
         if step.time_error > self.tolerance and error > 1 and numbers["said"] < 1 + goes_on:
             numbers["said"] = 1.0 + goes_on
             self._say(step, goes_on)
         fastest = self.stepper.fastest
-        wanted = max(numbers["usual"] if goes_on else wanted, shortest)
-        numbers["wanted"] = min(wanted, self.longest / fastest if fastest else wanted)
+        next_step = max(numbers["usual"] if goes_on else next_step, shortest)
+        numbers["wanted"] = min(next_step, self.longest / fastest if fastest else next_step)
         numbers["before"] = max(error, TELLING_ERROR)
 
-    def _best(self, error: float, duration: float, most: float) -> float:
-        """Length of a step with the error that is aimed at."""
-        ratio = (AIM / max(error, TELLING_ERROR)) ** (1 / self.stepper.coupling.traits.order)
-        return duration * min(most, max(SHRINKAGE, ratio))
+    def _best(self, error: float, duration: float, max_factor: float) -> float:
+        """Return the step size with the intended error."""
+        traits = self.stepper.coupling.traits
+        ratio = (AIM / max(error, TELLING_ERROR)) ** (1 / traits.order)
+        return duration * min(max_factor, max(SHRINKAGE, ratio))
 
     def _next(self, error: float, duration: float) -> float:
-        """Length of the next steps: as they are, or another one where it is worth it."""
+        """Return the next step size, the present one within the deadband."""
         if self._rejected:
             return self._best(error, duration, 1.0)
-        # an error that lags behind rises once more after a longer step, by as much
+        # A lagging error rises a second time after a larger step, by the same amount.
         present = self._numbers["wanted"]
         best = self._best(error + max(0.0, error - self._numbers["before"]), duration, LENGTHENING * present / duration)
         return present if KEPT * present <= best < WORTHWHILE * present else best
 
-    # ------------------------------------------------------------ steps in vain
+    # ------------------------------------------------------------ steps of minimum size
     def _count(self, error: float, duration: float) -> bool:
-        """Steps above the tolerance that could not be made shorter: whether they are so many that longer ones go on."""
-        numbers, faded = self._numbers, math.exp(-duration / self._fastest_time())
-        numbers["in_vain"] *= faded
+        """Count steps of minimum size above the tolerance; return whether larger steps follow."""
+        numbers, decay = self._numbers, math.exp(-duration / self._fastest_time())
+        numbers["in_vain"] *= decay
         if error <= 1:
-            numbers["usual"] = max(duration, faded * numbers["usual"])
+            numbers["usual"] = max(duration, decay * numbers["usual"])
         elif numbers["in_vain"] <= IN_VAIN:
             numbers["in_vain"] += 1
         if error <= NEAR_TOLERANCE:
@@ -336,12 +359,13 @@ class StepControl:
         return numbers["in_vain"] > IN_VAIN
 
     def _shortest(self) -> float:
-        """Length below which no step is cut for its error."""
+        """Return the minimum step size of error control."""
         return max(self.tolerance / FASTEST * self._fastest_time(), SMALLEST * self.first)
 
     def _fastest_time(self) -> float:
-        """In which chains may turn by `FASTEST` degrees."""
-        remodeling, fastest, after = self.stepper.remodeling, self.stepper.fastest, self.remaining()[0]
+        """Return the time in which chains may rotate by `FASTEST` degrees."""
+        remodeling, fastest = self.stepper.remodeling, self.stepper.fastest
+        after = self.remaining()[0]
         before = max([0.0, *(stop for stop in self.stops if stop < after)])
         if remodeling.law.remodels and not remodeling.law.asks_kappa:
             return min(after - before, remodeling.settings.rotation_time)
@@ -352,12 +376,11 @@ class StepControl:
             return
         log.log(
             self.level,
-            "time %g: the estimated error in time, %.3g degrees, does not fall to time.tolerance = %g with steps of "
-            "%.3g: some cells turn at once, or the pass over-corrects%s. The column time_error has the error that "
-            "was reached",
+            "time %g: estimated time error %.3g degrees exceeds time.tolerance = %g at step size "
+            "%.3g: cells rotate abruptly, or the pass overshoots%s. See column time_error",
             step.time,
             step.time_error,
             self.tolerance,
             step.time - self.state.time,
-            f". The run goes on with steps of {self._numbers['usual']:.3g}" if goes_on else "",
+            f"; continuing with step size {self._numbers['usual']:.3g}" if goes_on else "",
         )

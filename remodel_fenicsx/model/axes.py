@@ -1,4 +1,4 @@
-"""Directions in a body: local axes and depths at points, and the fibres that cells have there."""
+"""Directions in a body: local axes and depths at points, and unit cells from measured fibres."""
 
 from __future__ import annotations
 
@@ -14,61 +14,65 @@ from remodel_fenicsx.model.spectral import principal
 Array = NDArray[np.float64]
 Maker = Callable[[], Array]
 
-# name of what is measured: numbers that a row of it may have
+# name of a measured quantity: allowed numbers of columns
 NATURAL_GRADIENT = "natural_gradient"
 GROWTH = "growth"  # J_g
 MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
-MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}  # beside one of SOURCES
-SOURCES = ("structure_tensor", "fibre", "angle")  # one of these is needed
-FULL_OF_VTK = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, xz (VTK's order), row by row
-# eigenvalue below zero, over the trace, that may be rounding of files with 7 digits
+# These need one of SOURCES.
+MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}
+SOURCES = ("structure_tensor", "fibre", "angle")  # exactly one is needed
+# Row-major tensor from xx, yy, zz, xy, yz, xz (VTK's order).
+FULL_OF_VTK = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])
+# Smallest negative eigenvalue over the trace that counts as rounding of a file with 7 digits.
 FILE_ROUNDING = 1e-6
 
 
 # ---------------------------------------------------------------- local axes of a body
-# What is circumferential, axial and radial at its points, and how deep they lie.
+# Circumferential, axial and radial direction at the points of a body, and the depth of the points.
 
 
 class LocalAxes:
-    """What a body knows of its points; its shape makes it once (`Shape.local_axes`).
+    """Local axes and depths at points of a body; the shape makes them once (`Shape.local_axes`).
 
     Parameters
     ----------
     coordinates
-        Reference places of the points, (..., 3).
+        Reference positions of the points, (..., 3).
     axes, depth, station, nodal_depth
-        Functions that make the attributes of these names; nothing is made that nobody asks for.
+        Functions that compute the attributes of these names on first access.
     thickness, undefined
-        The attributes of these names, of axes that were found on a mesh (`body.local_axes`).
+        The attributes of these names, for axes computed on a mesh (`body.local_axes`).
 
     Attributes
     ----------
     coordinates
-        Reference places of the points, (..., 3).
+        Reference positions of the points, (..., 3).
     axes
         Circumferential, axial and radial unit vectors c, a, r as rows, (..., 3, 3); c x a = r.
     depth
-        From 0 to 1 through the wall, or along a body without one, (...,).
+        Normalised depth from 0 to 1 through the wall, or along a body without a wall, (...,).
     station
-        Share of the length along the body, (...,).
+        Position along the body as a fraction of its length, (...,).
     nodal_depth
         Depth of the local geometry nodes, ghosts included, (nodes,).
     thickness
-        Of the wall at the points, (...,); None where the shape's keys say it.
+        Thickness of the wall at the points, (...,); None if the shape's keys give it.
     undefined
-        Where the axes are those of the nearest point that has some, (...,); None where all have their own.
+        Points whose axes are copied from the nearest point with defined axes, (...,); None if all
+        points have defined axes.
 
     Examples
     --------
-    Those of a tube at one place, half through its wall:
+    Local axes of a tube at one point at mid-wall:
 
     >>> import numpy as np
     >>> from remodel_fenicsx import parts
     >>> from remodel_fenicsx.extend import LocalAxes
     >>> tube = parts.Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
-    >>> places = np.array([[2.0, 0.0, 4.0]])
-    >>> local = LocalAxes(places, axes=lambda: tube.axes_at(places), depth=lambda: tube.depth(places),
-    ...                   station=lambda: tube.station(places), nodal_depth=lambda: None)
+    >>> points = np.array([[2.0, 0.0, 4.0]])
+    >>> local = LocalAxes(points, axes=lambda: tube.axes_at(points),
+    ...                   depth=lambda: tube.depth(points), station=lambda: tube.station(points),
+    ...                   nodal_depth=lambda: None)
     >>> local.axes[0]  # circumferential, axial, radial
     array([[-0.,  1.,  0.],
            [ 0.,  0.,  1.],
@@ -87,34 +91,37 @@ class LocalAxes:
         thickness: Array | None = None,
         undefined: NDArray[np.bool_] | None = None,
     ):
-        self.coordinates, self.thickness, self.undefined = coordinates, thickness, undefined
-        self._axes, self._depth, self._station, self._nodal_depth = axes, depth, station, nodal_depth
+        self.coordinates = coordinates
+        self.thickness, self.undefined = thickness, undefined
+        self._axes, self._depth = axes, depth
+        self._station, self._nodal_depth = station, nodal_depth
 
     @cached_property
     def axes(self) -> Array:
-        """Rows c, a, r, (..., 3, 3)."""
+        """Unit vectors c, a, r as rows, (..., 3, 3)."""
         return self._axes()
 
     @cached_property
     def depth(self) -> Array:
-        """Of the points, (...,)."""
+        """Normalised depth of the points, (...,)."""
         return self._depth()
 
     @cached_property
     def station(self) -> Array:
-        """Of the points, (...,)."""
+        """Normalised position along the body, (...,)."""
         return self._station()
 
     @cached_property
     def nodal_depth(self) -> Array:
-        """Of the local geometry nodes, (nodes,)."""
+        """Normalised depth of the local geometry nodes, ghosts included, (nodes,)."""
         return self._nodal_depth()
 
     def deformed(self, deformation_gradient: Array) -> Array:
-        """The axes in the deformed body: rows c', a', r', (..., 3, 3), with F (..., 3, 3).
+        """Return the axes in the deformed configuration: rows c', a', r', (..., 3, 3).
 
-        ``c' = F c / |F c|`` follows a material line. ``r' = F^-T r / |F^-T r|`` stays normal to a material surface,
-        and is taken as F c x F a, which needs no inverse. a' = r' x c' lies in that surface, square to c'.
+        ``c' = F c / |F c|`` follows a material line. ``r' = F^-T r / |F^-T r|`` stays normal to a
+        material surface. It is computed as F c x F a, which needs no inverse. a' = r' x c' lies in
+        that surface, orthogonal to c'.
 
         Parameters
         ----------
@@ -125,20 +132,20 @@ class LocalAxes:
 
 
 def moved_axes(axes: Array, deformation_gradient: Array) -> Array:
-    """As `LocalAxes.deformed`, of local axes as rows (..., 3, 3)."""
+    """Return deformed axes, rows (..., 3, 3), from reference axes; see `LocalAxes.deformed`."""
     F, rows = by_component(deformation_gradient), by_component(axes)
     circumferential, axial = (
         [F[i, 0] * rows[k, 0] + F[i, 1] * rows[k, 1] + F[i, 2] * rows[k, 2] for i in range(3)] for k in (0, 1)
     )
     radial = _unit(_cross(circumferential, axial))
     circumferential = _unit(circumferential)
-    found = [circumferential, _cross(radial, circumferential), radial]
-    return np.moveaxis(np.array(found), (0, 1), (-2, -1))
+    deformed = [circumferential, _cross(radial, circumferential), radial]
+    return np.moveaxis(np.array(deformed), (0, 1), (-2, -1))
 
 
-def _cross(one: list[Array], other: list[Array]) -> list[Array]:
-    """Of vectors by component."""
-    return [one[j] * other[k] - one[k] * other[j] for j, k in ((1, 2), (2, 0), (0, 1))]
+def _cross(first: list[Array], second: list[Array]) -> list[Array]:
+    """Return the cross product of two vectors by component."""
+    return [first[j] * second[k] - first[k] * second[j] for j, k in ((1, 2), (2, 0), (0, 1))]
 
 
 def _unit(vector: list[Array]) -> list[Array]:
@@ -151,55 +158,55 @@ AXES: dict[str, Callable[[LocalAxes], Array]] = {
     "cylindrical": lambda points: cylindrical_axes(points.coordinates),
     "local": lambda points: points.axes,
 }
-"""Axes of the cells before the first pass by name: functions of a `LocalAxes`."""
+"""Initial axes of the cells by name: functions of a `LocalAxes`."""
 
 
-# ---------------------------------------------------------------- unit cells that follow from measured fibres
-# Structure tensors, fibre directions or fibre angles.
+# ---------------------------------------------------------------- unit cells from measured fibres
+# The measurements are structure tensors, fibre directions or fibre angles.
 
 
 def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:
-    """What keeps rows (n, columns) by name of `MEASURED` from being fibres, in words; None if nothing does."""
+    """Return the first error in measured fibres, (n, columns) by name of `MEASURED`, or None."""
     sources = [name for name in SOURCES if name in measured]
     if len(sources) != 1:
         return f"has {' and '.join(sources) or 'none'} of {', '.join(SOURCES)}; exactly one is needed"
     for name, values in measured.items():
         if values.shape[1] not in MEASURED[name]:
             numbers = " or ".join(map(str, MEASURED[name]))
-            return f"{name} has {values.shape[1]} numbers in a row; allowed is {numbers}"
-        if not (fine := np.isfinite(values).all(axis=1)).all():
-            return _row(name, fine, "is not finite")
+            return f"{name} has {values.shape[1]} numbers in a row; must be {numbers}"
+        if not (valid := np.isfinite(values).all(axis=1)).all():
+            return _row(name, valid, "is not finite")
     (source,) = sources
-    for name, of in (("fibre_2", ("fibre",)), ("weight", ("fibre", "angle"))):
-        if name in measured and source not in of:
-            return f"has {name} beside {source}; it belongs to {' or '.join(of)}"
+    for name, allowed in (("fibre_2", ("fibre",)), ("weight", ("fibre", "angle"))):
+        if name in measured and source not in allowed:
+            return f"has {name} with {source}; it belongs to {' or '.join(allowed)}"
     for name in ("fibre", "fibre_2"):
-        if name in measured and not (fine := (measured[name] != 0).any(axis=1)).all():
-            return _row(name, fine, "is the zero vector")
+        if name in measured and not (valid := (measured[name] != 0).any(axis=1)).all():
+            return _row(name, valid, "is the zero vector")
     weight = measured.get("weight", np.zeros((1, 1)))[:, 0]
-    if not (fine := (weight >= 0) & (weight <= 1)).all():
-        return _row("weight", fine, "is not from 0 to 1")
+    if not (valid := (weight >= 0) & (weight <= 1)).all():
+        return _row("weight", valid, "is not from 0 to 1")
     for name in ("content", "natural_length", GROWTH):
-        if name in measured and not (fine := measured[name][:, 0] > 0).all():
-            return _row(name, fine, "is not above 0")
+        if name in measured and not (valid := measured[name][:, 0] > 0).all():
+            return _row(name, valid, "is not above 0")
     if NATURAL_GRADIENT in measured:
-        if not (fine := np.linalg.det(measured[NATURAL_GRADIENT].reshape(-1, 3, 3)) > 0).all():
-            return _row(NATURAL_GRADIENT, fine, "has no determinant above 0")
+        if not (valid := np.linalg.det(measured[NATURAL_GRADIENT].reshape(-1, 3, 3)) > 0).all():
+            return _row(NATURAL_GRADIENT, valid, "has no determinant above 0")
     if source == "structure_tensor":
         eigenvalues = np.linalg.eigvalsh(_tensors(measured[source]))
         trace = eigenvalues.sum(axis=1)
-        if not (fine := (trace > 0) & (eigenvalues[:, 0] >= -FILE_ROUNDING * trace)).all():
-            return _row(source, fine, f"has eigenvalues {', '.join(f'{v:.3g}' for v in eigenvalues[~fine][0])}; "
+        if not (valid := (trace > 0) & (eigenvalues[:, 0] >= -FILE_ROUNDING * trace)).all():
+            return _row(source, valid, f"has eigenvalues {', '.join(f'{v:.3g}' for v in eigenvalues[~valid][0])}; "
                         "none may be below 0, nor all be 0")  # fmt: skip
     return None
 
 
-def _row(name: str, fine: NDArray[np.bool_] | np.bool_, what: str) -> str:
-    return f"{name} of row {int(np.argmin(fine)) + 1} {what}"
+def _row(name: str, valid: NDArray[np.bool_] | np.bool_, problem: str) -> str:
+    return f"{name} of row {int(np.argmin(valid)) + 1} {problem}"
 
 
 def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
-    """A of any size at points, (..., 3, 3); `cells_of` scales it."""
+    """Return unscaled structure tensors at points, (..., 3, 3); `cells_of` scales them."""
     if "structure_tensor" in measured:
         return _tensors(measured["structure_tensor"])
     if "angle" in measured:
@@ -207,15 +214,16 @@ def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
         first = np.cos(angle) * axes[..., 0, :] + np.sin(angle) * axes[..., 1, :]
     else:
         first = measured["fibre"]
-    others = _along(measured["fibre_2"]) if "fibre_2" in measured else np.eye(3) / 3
-    usual = np.full((*first.shape[:-1], 1), 0.5 if "fibre_2" in measured else 1.0)
-    weight = measured.get("weight", usual)[..., None]
-    return weight * _along(first) + (1 - weight) * others
+    remainder = _along(measured["fibre_2"]) if "fibre_2" in measured else np.eye(3) / 3
+    default_weight = np.full((*first.shape[:-1], 1), 0.5 if "fibre_2" in measured else 1.0)
+    weight = measured.get("weight", default_weight)[..., None]
+    return weight * _along(first) + (1 - weight) * remainder
 
 
 def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple[Array, Array]:
-    """l_I (..., 3), longest first, and n_I as rows (..., 3, 3) of cells with A = r0^2 T / tr T of tensors T."""
-    # Where tensors leave axes open (equal eigenvalues), they are those of `previous`, (..., 3, 3).
+    """Return l_I (..., 3), longest first, and n_I as rows (..., 3, 3) with A = r0^2 T / tr T."""
+    # Equal eigenvalues of T leave axes undetermined; these are then taken from `previous`,
+    # (..., 3, 3).
     shape = tensors.shape[:-2]
     values, axes = principal(tensors.reshape(-1, 3, 3), previous.reshape(-1, 3, 3))
     values = np.maximum(values, 0.0)
@@ -224,7 +232,7 @@ def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple
 
 
 def _tensors(rows: Array) -> Array:
-    """Symmetric (..., 3, 3) of rows of 9 or 6 numbers."""
+    """Return symmetric tensors (..., 3, 3) from rows of 9 or 6 numbers."""
     full = rows if rows.shape[-1] == 9 else rows[..., FULL_OF_VTK]
     tensors = full.reshape(*rows.shape[:-1], 3, 3)
     return (tensors + np.swapaxes(tensors, -1, -2)) / 2

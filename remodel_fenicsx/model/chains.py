@@ -1,6 +1,7 @@
-"""Chain laws: the free energy of one collagen chain over its end-to-end length.
+"""Chain laws: the free energy of one collagen chain as a function of its end-to-end length.
 
-Pure arithmetic on numbers, arrays or UFL expressions. All lengths are in link lengths of the chain (paper, Remark 1).
+Pure arithmetic on numbers, arrays or UFL expressions. All lengths are in link lengths of the chain
+(paper, Remark 1).
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from typing import Any, ClassVar, Protocol, Self, TypeAlias, TypeVar
 
 
 UflOrArray: TypeAlias = Any  # type: ignore[explicit-any]
-"""A UFL expression, an array over points or a number: what the formulas of the model take alike. UFL has no types."""
+"""UFL expression, array over points or number; UFL has no types for its expressions."""
 
 Result = TypeVar("Result", covariant=True)
 
 
 class Formula(Protocol[Result]):
-    """A function of such values; parts with parameters of their own take these too, by keyword."""
+    """Function of UFL or arrays; components with additional parameters get these by keyword."""
 
     def __call__(self, *values: UflOrArray, **parameters: UflOrArray) -> Result: ...
 
@@ -28,30 +29,30 @@ BOLTZMANN_CONSTANT = 1.381e-23  # J/K, as printed in the paper
 
 
 def wormlike_energy(end_to_end_length: UflOrArray, contour_length: UflOrArray) -> UflOrArray:
-    """Energy of a wormlike chain over k theta / A_p (eq. 1)."""
+    """Return the energy of a wormlike chain divided by k theta / A_p (eq. 1)."""
     x = end_to_end_length / contour_length
     return contour_length / 4 * (2 * x**2 + 1 / (1 - x) - x)
 
 
 def wormlike_stiffness(end_to_end_length: UflOrArray, contour_length: UflOrArray) -> UflOrArray:
-    """Secant stiffness g(r) = 1/L + 1/(4 r (1-r/L)^2) - 1/(4 r) of eq. (7): d(wormlike_energy)/dr = g r."""
-    # Written with the pole at r = 0 cancelled, so that short chains lose no digits.
+    """Return g(r) = 1/L + 1/(4 r (1-r/L)^2) - 1/(4 r) of eq. (7); d(wormlike_energy)/dr = g r."""
+    # The pole at r = 0 is cancelled, so that short chains lose no digits.
     x = end_to_end_length / contour_length
     return (1 + (2 - x) / (4 * (1 - x) ** 2)) / contour_length
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a part's own: a key of the table in which a scene names the part.
+    """Additional parameter of a component: a key of the table in which a scene names the component.
 
     Attributes
     ----------
     default
-        What it is where a scene does not say it.
+        Value if the scene does not set it.
     meaning
-        In one sentence.
+        Description in one sentence.
     above
-        It must be greater than this; None: any finite number will do.
+        Exclusive minimum; None allows any finite number.
 
     Examples
     --------
@@ -70,18 +71,18 @@ NO_VALUES: Mapping[str, UflOrArray] = MappingProxyType({})
 
 
 class WithParameters:
-    """A part whose functions may take parameters of its own, by keyword; their values come from `of`."""
+    """Component whose functions may take additional parameters by keyword (`of` binds them)."""
 
     functions: ClassVar[tuple[str, ...]]
     parameters: Mapping[str, Parameter]
 
     def of(self, values: Mapping[str, UflOrArray]) -> Self:
-        """The part with these values of its parameters: numbers, arrays or UFL.
+        """Return the component with bound values of its parameters.
 
         Parameters
         ----------
         values
-            By the names of `parameters`.
+            Numbers, arrays or UFL by the names of `parameters`.
         """
         if not values:
             return self
@@ -92,22 +93,23 @@ class WithParameters:
 
 @dataclass(frozen=True)
 class Chain(WithParameters):
-    """A law of a single chain: its energy and force (paper, eq. 2).
+    """Law of a single chain: energy and force (paper, eq. 2).
 
     Both functions take numbers, arrays or UFL; lengths are in link lengths.
 
     Attributes
     ----------
     energy
-        energy(r, L) over k theta / A_p, in link lengths.
+        energy(r, L) divided by k theta / A_p, in link lengths.
     stiffness
-        Its secant stiffness g(r, L): d(energy)/dr = g r.
+        Secant stiffness g(r, L): d(energy)/dr = g r.
     locks
-        Whether a chain cannot become longer than L. Where it can, nothing is held below L, and r0 may be above it.
+        Whether a chain cannot become longer than L. If it does not lock, r has no upper limit, and
+        r0 may exceed L.
     parameters
-        Numbers of its own, keys of `[material]`. Both functions take them by their names.
+        Additional parameters, keys of `[material]`. Both functions take them by their names.
     values
-        Of its parameters (`of`).
+        Values of the parameters (`of`).
 
     Examples
     --------
@@ -137,14 +139,20 @@ class Chain(WithParameters):
         persistence_length: UflOrArray,
         k_theta: UflOrArray = 1.0,
     ) -> UflOrArray:
-        """Force that holds the ends of one chain apart: k theta / A_p times the derivative of its energy (eq. 2).
+        """Return the force of one chain, k theta / A_p times the energy's derivative (eq. 2).
 
         Parameters
         ----------
         end_to_end_length, contour_length, persistence_length
-            r, L and A_p, in one unit of length; numbers, arrays or UFL.
+            r, L and A_p in the same unit of length; numbers, arrays or UFL.
         k_theta
-            Boltzmann's constant times the temperature: an energy. With 1 the force is in k theta over that length.
+            Boltzmann's constant times the temperature, an energy. With 1 the force is in k theta
+            per unit of length.
+
+        Returns
+        -------
+        number, array or UFL
+            Force in the unit of `k_theta` over the unit of length.
         """
         return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
 

@@ -1,4 +1,4 @@
-"""Driving tensors, and the frames that make cell axes of their eigenvectors (paper, eqs. 8 and 9)."""
+"""Driving tensors, and frames that map their eigenvectors to cell axes (paper, eqs. 8 and 9)."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Driver:
-    """A driving tensor.
+    """Driving tensor, whose principal directions the cells follow.
 
     Attributes
     ----------
     tensor
-        Its UFL expression from (F, stresses).
+        Function of (F, stresses) that returns the UFL expression.
     material
-        Whether its eigenvectors are material vectors.
+        Whether the eigenvectors are material vectors.
     is_stress
-        Whether it is a stress, zero up to the rounding of stresses and to the residual that was accepted; else it is a
-        number near one, zero up to its own rounding.
+        Whether the tensor is a stress. A stress is zero within the rounding error of stresses and
+        the accepted residual. Other tensors are of order one, and zero within their own rounding
+        error.
     over_corrects
-        Whether the coupling "staggered" may leave a symmetric solution with it.
+        Whether the coupling "staggered" may leave a symmetric solution with this driver.
 
     Examples
     --------
-    The Kirchhoff stress, which turns the cells as Cauchy's does:
+    The Kirchhoff stress, whose principal directions are those of the Cauchy stress:
 
     >>> import ufl
     >>> from remodel_fenicsx.extend import DRIVERS, Driver
@@ -53,7 +54,7 @@ class Driver:
 
 
 def finger_tensor(deformation_gradient: UflOrArray, stresses: Stresses) -> UflOrArray:
-    """b = F F^T (UFL)."""
+    """Return b = F F^T (UFL)."""
     return ufl.dot(deformation_gradient, deformation_gradient.T)
 
 
@@ -74,28 +75,31 @@ DRIVERS: dict[str, Driver] = {
 
 
 def rotated_back(F: Array, spatial_tensor: Array) -> Array:
-    """R^T t R (n, 3, 3) with the rotation R of F = R U: objective. For t = sigma it is U S U / J, for t = b it is C."""
+    """Return R^T t R (n, 3, 3), R of F = R U; U S U / J for t = sigma, C for t = b; objective."""
     squared, basis = tensors.eigen(np.swapaxes(F, 1, 2) @ F)
     R = F @ (basis / np.sqrt(squared)[:, None, :]) @ np.swapaxes(basis, 1, 2)  # F U^-1
-    back: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
-    return (back + np.swapaxes(back, 1, 2)) / 2
+    rotated: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
+    return (rotated + np.swapaxes(rotated, 1, 2)) / 2
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What becomes of the eigenvectors of a spatial driver.
+    """Map from the eigenvectors of a spatial driver to cell axes.
 
     Attributes
     ----------
     axes
-        n_I from (F (n, 3, 3), m_I as rows (n, 3, 3)).
+        Function of (F (n, 3, 3), m_I as rows (n, 3, 3)) that returns n_I as rows.
     carries_axes
-        Whether the cells' axes move with the material, so that F n_I are the previous axes in space.
+        Whether the cells' axes move with the material, so that F n_I are the previous axes in
+        space.
     tensor
-        A spatial tensor as one in material space, from (F (n, 3, 3), tensor (n, 3, 3)): for laws that need no axes.
+        Function of (F (n, 3, 3), spatial tensor (n, 3, 3)) that returns the tensor in material
+        space, for laws that need no axes.
+
     Examples
     --------
-    A frame that turns spatial axes back with the rotation R of F = R U:
+    A frame that rotates spatial axes back by the rotation R of F = R U:
 
     >>> import numpy as np
     >>> from remodel_fenicsx.extend import FRAMES, Frame
@@ -116,13 +120,14 @@ class Frame:
 
 
 def spatial_frame(F: Array, spatial_axes: Array) -> Array:
-    """n_I = m_I as printed in eq. (9): spatial eigenvectors taken for material axes. Not objective (erratum 4)."""
+    """Return n_I = m_I as printed in eq. (9): spatial eigenvectors; not objective (erratum 4)."""
     return spatial_axes
 
 
 def material_frame(F: Array, spatial_axes: Array) -> Array:
-    """n_1 = F^-1 m_1 normalised, n_2 = F^-1 m_2 orthogonalised against n_1, n_3 = n_1 x n_2. Objective."""
-    # n_1 is the fibre that the deformation carries onto the first principal direction. F (n, 3, 3); rows (n, 3, 3).
+    """Return n_1 ~ F^-1 m_1, n_2 ~ F^-1 m_2 orthogonal to n_1, n_3 = n_1 x n_2; objective."""
+    # The deformation maps the fibre n_1 onto the first principal direction. F (n, 3, 3); rows
+    # (n, 3, 3).
     pulled_back = np.swapaxes(np.linalg.solve(F, np.swapaxes(spatial_axes, -1, -2)), -1, -2)
     first = _unit(pulled_back[:, 0])
     second = pulled_back[:, 1] - np.sum(pulled_back[:, 1] * first, axis=-1, keepdims=True) * first
@@ -137,7 +142,7 @@ FRAMES: dict[str, Frame] = {
 
 
 def carried_axes(F: Array, axes: Array) -> Array:
-    """F n_I normalised: where the deformation carries the axes, rows, (n, 3, 3)."""
+    """Return F n_I normalised, the convected axes as rows, (n, 3, 3)."""
     return _unit(axes @ np.swapaxes(F, 1, 2))
 
 

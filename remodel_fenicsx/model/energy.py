@@ -1,6 +1,7 @@
-"""The strain energy of tissue with remodeling collagen, in UFL or on arrays: the only place where it is written.
+"""Strain energy of tissue with remodeling collagen, in UFL or on arrays; it is written only here.
 
-Stresses, drivers, residual and tangent follow by differentiation. Per reference volume (docs/theory.md, Energy):
+Stresses, drivers, residual and tangent follow by differentiation. Per reference volume
+(docs/theory.md, Energy):
 
     W      = W_iso + W_chn + W_rep
     W_iso  = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J
@@ -37,27 +38,29 @@ from remodel_fenicsx.model.tensors import det, is_array, ln, sqrt, squared_norm
 ufl = Late("ufl")
 Array = NDArray[np.float64]
 Term = Formula[UflOrArray]  # of F or J, lambda and mu
-TURNED_OVER = ("content", "natural_length")  # what turnover changes at every point
-PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")  # of every tissue
+TURNED_OVER = ("content", "natural_length")  # parameters that turnover changes at every point
+# Every tissue has these parameters.
+PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 
 
 class Matrix:
-    """An energy of the matrix whose volumetric part is told apart, as `fem.formulations` need it.
+    """Matrix energy with a separate volumetric part, as `fem.formulations` require it.
 
-    Called with F, lambda and mu it is the whole energy. Its terms are added one after the other: grouped otherwise, the
-    last digits would be others.
+    A call with F, lambda and mu returns the total energy. The terms are added one by one: another
+    grouping would change the last digits.
 
     Parameters
     ----------
     volumetric
-        What resists a change of volume, a function of J, lambda and mu: zero and without slope at J = 1.
+        Volumetric energy, a function of J, lambda and mu, with zero value and slope at J = 1.
     others
-        All other terms, functions of F, lambda and mu; together zero and stress-free at F = I.
+        All other terms, functions of F, lambda and mu; their sum is zero and stress-free at F = I.
     parameters
-        Numbers of its own, keys of `[material]`. All of its functions take them by their names.
+        Additional parameters, keys of `[material]`. All functions take them by their names.
 
-    Where a tube closes from a sector or is cut, the terms take arrays of complex numbers: np.maximum(x, 0), not |x|.
-    Directions along x, y and z are the radius, the circumference and the length of a tube on its radius.
+    If a tube is closed from a sector or cut, the terms get arrays of complex numbers: use
+    np.maximum(x, 0), not |x|. For the kinematics that solve a tube on one radius, x, y and z are
+    the radial, circumferential and axial directions.
 
     Examples
     --------
@@ -81,47 +84,47 @@ class Matrix:
         self.parameters, self.values = parameters, NO_VALUES
 
     def of(self, values: Mapping[str, UflOrArray]) -> Matrix:
-        """The matrix with these values of its parameters.
+        """Return the matrix with bound values of its parameters.
 
         Parameters
         ----------
         values
-            By the names of `parameters`: numbers, arrays or UFL.
+            Numbers, arrays or UFL by the names of `parameters`.
         """
-        found = copy.copy(self)
-        found.values, found.volumetric = values, partial(self.volumetric, **values)
-        found.others = tuple(partial(term, **values) for term in self.others)
-        return found
+        matrix = copy.copy(self)
+        matrix.values, matrix.volumetric = values, partial(self.volumetric, **values)
+        matrix.others = tuple(partial(term, **values) for term in self.others)
+        return matrix
 
     def __call__(self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray) -> UflOrArray:
-        """The whole energy."""
+        """Return the total energy of the matrix."""
         volumetric = self.volumetric(det(deformation_gradient), lame_lambda, lame_mu)
         return sum((term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric)
 
     def distortional(
         self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray
     ) -> UflOrArray:
-        """All but the volumetric part.
+        """Return the energy without the volumetric part.
 
         Parameters
         ----------
         deformation_gradient
             F, UFL of shape (3, 3) or array (..., 3, 3).
         lame_lambda, lame_mu
-            In the unit of stress.
+            Lame constants in the unit of stress.
         """
-        first, *rest = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
-        return sum(rest, first)
+        first, *remaining = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
+        return sum(remaining, first)
 
 
 def logarithmic_dilatation(
     jacobian: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray, **own: UflOrArray
 ) -> UflOrArray:
-    """U = lambda/2 ln^2 J, the volumetric part of eq. (4a): its Kirchhoff pressure is lambda ln J."""
+    """Return U = lambda/2 ln^2 J, the volumetric part of eq. (4a); J dU/dJ = lambda ln J."""
     return lame_lambda / 2 * ln(jacobian) ** 2
 
 
-# its terms pass over parameters of a matrix that adds others to them
+# The terms ignore the parameters of a matrix that adds other terms to them.
 neo_hookean = Matrix(
     logarithmic_dilatation,
     lambda F, lame_lambda, lame_mu, **own: lame_mu / 2 * (squared_norm(F) - 3),
@@ -131,48 +134,53 @@ neo_hookean = Matrix(
 
 
 def mixed(matrices: Sequence[Matrix]) -> Matrix:
-    """Matrices of parts of a body as one: each times its share there, `share_0` and so on, numbers of its own."""
-    shares = [f"share_{number}" for number in range(len(matrices))]
+    """Combine matrices to one sum, weighted by its parameters share_0, share_1, ..."""
+    names = [f"share_{number}" for number in range(len(matrices))]
     numbers = {name: number for matrix in matrices for name, number in matrix.parameters.items()}
-    numbers |= {share: Parameter(0.0, "Where it is this one: 1, else 0.") for share in shares}
+    numbers |= {name: Parameter(0.0, "1 in regions with this matrix, else 0.") for name in names}
 
-    def parts(values: Mapping[str, UflOrArray]) -> Iterator[tuple[UflOrArray, UflOrArray]]:
-        for share, matrix in zip(shares, matrices, strict=True):
-            yield values[share], matrix.of({name: values[name] for name in matrix.parameters})
+    def weighted_matrices(values: Mapping[str, UflOrArray]) -> Iterator[tuple[UflOrArray, UflOrArray]]:
+        for key, matrix in zip(names, matrices, strict=True):
+            yield values[key], matrix.of({name: values[name] for name in matrix.parameters})
 
     return Matrix(
-        lambda J, lam, mu, **values: sum(share * matrix.volumetric(J, lam, mu) for share, matrix in parts(values)),
-        lambda F, lam, mu, **values: sum(share * matrix.distortional(F, lam, mu) for share, matrix in parts(values)),
+        lambda J, lam, mu, **values: sum(
+            weight * matrix.volumetric(J, lam, mu) for weight, matrix in weighted_matrices(values)
+        ),
+        lambda F, lam, mu, **values: sum(
+            weight * matrix.distortional(F, lam, mu) for weight, matrix in weighted_matrices(values)
+        ),
         parameters=numbers,
     )
 
 
 MATRICES: dict[str, Term] = {"neo-hookean": neo_hookean}
-"""Energies of the matrix by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at F = I; those
-that formulations other than "displacement" can take are a `Matrix`."""
+"""Matrix energies by name: functions of F, lambda and mu (UFL or arrays), zero and stress-free at
+F = I. Formulations other than "displacement" require a `Matrix`."""
 
 
-# ---------------------------------------------------------------- the repulsion: W_rep = -c/2 g(r0) M
-# It makes the unloaded tissue stress-free. M has several forms. `axes` is the paper's (eq. 4c): it sees the axes of a
-# cell. `log` sees the structure tensor A = sum_I l_I^2 n_I (x) n_I alone: it equals `axes` where C and the cell are
-# coaxial, is isotropic for isotropic cells in every frame, and leaves C = I stress-free for every A (docs/theory.md,
-# "The consistent variant"). `length` is the simplest function of A; it has no shear stiffness from isotropic cells.
+# ---------------------------------------------------------------- repulsion: W_rep = -c/2 g(r0) M
+# The repulsion makes the unloaded tissue stress-free. M has several forms. `axes` is the paper's
+# (eq. 4c) and depends on the axes of a cell. `log` depends only on the structure tensor A = sum_I
+# l_I^2 n_I (x) n_I. It equals `axes` if C and the cell are coaxial, is isotropic for isotropic
+# cells in every frame, and leaves C = I stress-free for every A (docs/theory.md, "The consistent
+# variant"). `length` is the simplest function of A; isotropic cells give it no shear stiffness.
 
 
 def squared_end_to_end_length(deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
-    """r^2 = sum_I l_I^2 n_I . C n_I, the squared end-to-end length of the chains (paper, eq. 5).
+    """Return r^2 = sum_I l_I^2 n_I . C n_I, the squared end-to-end length of the chains (eq. 5).
 
     Parameters
     ----------
     deformation_gradient
         F, UFL of shape (3, 3) or array (..., 3, 3).
     cells
-        One whole cell, or shares of it.
+        One whole cell, or weighted cells.
 
     Returns
     -------
     UFL or array (...,)
-        In squared link lengths.
+        r^2 in squared link lengths.
 
     Examples
     --------
@@ -190,21 +198,21 @@ def squared_end_to_end_length(deformation_gradient: UflOrArray, cells: Sequence[
 
 
 def axes_sum(deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
-    """M = sum_I l_I^2 ln(n_I . C n_I), of which the paper's repulsive energy is made (eq. 4c).
+    """Return M = sum_I l_I^2 ln(n_I . C n_I) of the paper's repulsive energy (eq. 4c).
 
     Parameters
     ----------
     deformation_gradient
         F, UFL of shape (3, 3) or array (..., 3, 3).
     cells
-        One whole cell, or shares of it.
+        One whole cell, or weighted cells.
     end_to_end_length
-        r0, in link lengths; this form does not need it.
+        r0 in link lengths; not used in this form.
 
     Returns
     -------
     UFL or array (...,)
-        In squared link lengths; zero at F = I.
+        M in squared link lengths; zero at F = I.
 
     Examples
     --------
@@ -226,31 +234,29 @@ def axes_sum(deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to
 def length_sum(
     deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to_end_length: UflOrArray
 ) -> UflOrArray:
-    """M = r0^2 ln(r^2 / r0^2), r^2 = A : C; UFL or arrays."""
+    """Return M = r0^2 ln(r^2 / r0^2) with r^2 = A : C; UFL or arrays."""
     squared = squared_end_to_end_length(deformation_gradient, cells)
     return end_to_end_length**2 * ln(squared / end_to_end_length**2)
 
 
 def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
-    """M = A : ln C; arrays. Of complex numbers, to first order in the imaginary part."""
+    """Return M = A : ln C of arrays; for complex F to first order in the imaginary part."""
     C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, whole_structure_tensor(cells)
-    found = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
-    return (
-        found + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2)) if np.iscomplexobj(C) else found
-    )
+    M = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
+    return M + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2)) if np.iscomplexobj(C) else M
 
 
 def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
-    """A of a cell, or of its shares with numbers for weights, (n, 3, 3)."""
+    """Return A of one cell or of weighted cells, (n, 3, 3); the weights are numbers."""
     return sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
 
 
 def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
-    """dM/dC (n, 3, 3) and d^2M/dC^2 as Mandel matrices (n, 6, 6) of M = A : ln C, the second on request."""
+    """Return dM/dC (n, 3, 3) and, if `second`, d^2M/dC^2 (n, 6, 6) of M = A : ln C."""
     values, vectors = tensors.eigen(C)
     components = tensors.rotated(A, vectors)
-    back = np.swapaxes(vectors, -1, -2)
-    first = tensors.rotated(tensors.first_divided_differences(values) * components, back)
+    transposed = np.swapaxes(vectors, -1, -2)
+    first = tensors.rotated(tensors.first_divided_differences(values) * components, transposed)
     if not second:
         return first, None
     rotation = tensors.congruence(vectors)
@@ -259,23 +265,23 @@ def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class Repulsion(WithParameters):
-    """A form of the repulsive energy.
+    """Form of the repulsive energy.
 
     Attributes
     ----------
     sum
-        M from (F, cells, r0): arrays, and UFL too where there are no `derivatives`.
+        Function M of (F, cells, r0): arrays, and UFL too unless there are `derivatives`.
     derivatives
-        Where M is no closed expression for UFL: dM/dC (n, 3, 3) and, on request, d^2M/dC^2 as Mandel matrices (n, 6, 6)
-        from (C, A, second), arrays.
+        Function of arrays (C, A, second), needed if UFL has no closed expression of M. It returns
+        dM/dC (n, 3, 3) and, if `second`, d^2M/dC^2 as Mandel matrices (n, 6, 6).
     parameters
-        Numbers of its own, keys of `[material]`. All of its functions take them by their names.
+        Additional parameters, keys of `[material]`. All functions take them by their names.
     values
-        Of its parameters (`of`).
+        Values of the parameters (`of`).
 
     Examples
     --------
-    M = r^2 is another one that leaves unloaded tissue free of stress:
+    With M = r^2 the unloaded tissue is stress-free too:
 
     >>> from remodel_fenicsx.extend import REPULSIONS, Repulsion, squared_end_to_end_length
     >>> REPULSIONS["squared"] = Repulsion(lambda F, cells, r0: squared_end_to_end_length(F, cells))
@@ -316,7 +322,7 @@ class Stresses(NamedTuple):
 
     Examples
     --------
-    They are what a driver is made of:
+    Drivers are functions of the stresses:
 
     >>> from remodel_fenicsx.extend import DRIVERS, Stresses
     >>> stresses = Stresses(first_piola_kirchhoff="P", second_piola_kirchhoff="S", cauchy="sigma")
@@ -329,14 +335,19 @@ class Stresses(NamedTuple):
     cauchy: UflOrArray
 
     def plus(self, deformation_gradient: UflOrArray, second_piola_kirchhoff: UflOrArray) -> Stresses:
-        """With what `Tissue.strain_energy` leaves out of UFL, a second Piola-Kirchhoff stress.
+        """Add a second Piola-Kirchhoff stress that `Tissue.strain_energy` does not contain in UFL.
 
         Parameters
         ----------
         deformation_gradient
             F, UFL, (3, 3).
         second_piola_kirchhoff
-            What is added to S, UFL, (3, 3).
+            Stress to add to S, UFL, (3, 3).
+
+        Returns
+        -------
+        Stresses
+            The sums.
         """
         F, S = deformation_gradient, second_piola_kirchhoff
         P = ufl.dot(F, S)
@@ -346,10 +357,10 @@ class Stresses(NamedTuple):
 
 @dataclass(frozen=True)
 class Tissue:
-    """Matrix and collagen network: the constitutive parameters and what follows from them.
+    """Constitutive parameters of matrix and collagen network, with energy and stresses.
 
-    Every parameter is a number, a dolfinx Constant, a DG0 function (regions) or an array over points: the same
-    functions serve forms and arrays. `fem.assembly` makes one kind of the other.
+    Every parameter is a number, a dolfinx Constant, a DG0 function (regions) or an array over
+    points. The same functions serve forms and arrays; `fem.assembly` converts the parameters.
 
     Attributes
     ----------
@@ -358,7 +369,7 @@ class Tissue:
     network_modulus
         c = omega k theta n_chn / (4 A_p), in the same unit.
     contour_length
-        L, in link lengths. A chain law that does not lock may mean something else by it, or nothing.
+        L, in link lengths. A chain law that does not lock may use it differently, or not at all.
     end_to_end_length
         r0, the initial length of a chain (erratum 3), in link lengths.
     chain
@@ -368,8 +379,8 @@ class Tissue:
     repulsion
         Form of the repulsive energy (`REPULSIONS`).
     content, natural_length
-        m, density of the chains, and rho, their natural length, each over those at the start (`model.laws`):
-        W_net = m c (w(r/rho) - g(r0) M / 2). None where they stay 1.
+        Density m and natural length rho of the chains, relative to their initial values
+        (`model.laws`): W_net = m c (w(r/rho) - g(r0) M / 2). None if they stay 1.
 
     Examples
     --------
@@ -400,25 +411,32 @@ class Tissue:
 
     @property
     def locking_length(self) -> UflOrArray:
-        """Length at which a chain locks, rho L, in link lengths; None where nothing locks."""
+        """Length at which a chain locks, rho L, in link lengths; None if no chain locks."""
         if self.chain is None or not self.chain.locks:
             return None
         return self.contour_length if self.natural_length is None else self.natural_length * self.contour_length
 
     @property
     def present_modulus(self) -> UflOrArray:
-        """m c: the network's modulus with the chains that there are."""
+        """Current modulus of the network, m c."""
         return self.network_modulus if self.content is None else self.content * self.network_modulus
 
     def relative(self, length: UflOrArray) -> UflOrArray:
-        """r/rho."""
+        """Return the normalised length r/rho.
+
+        Parameters
+        ----------
+        length
+            r, in link lengths; number, array or UFL.
+        """
         return length if self.natural_length is None else length / self.natural_length
 
     def stiffness(self, end_to_end_length: UflOrArray) -> UflOrArray:
-        """A stress per strain of matrix and network, where chains have a length r; times eps the rounding of a stress.
+        """Return a stiffness whose product with eps is the rounding error of a stress.
 
-        lambda + 2 mu + c (r^2 d(g r)/dr + g(r0) r0^2): near the contour length the chains' force changes by much more
-        than itself when r changes by a little.
+        The stiffness of matrix and network at length r is
+        lambda + 2 mu + m c (x^2 d(g x)/dx + g(r0) r0^2) with x = r/rho. Near the contour length a
+        small change of r changes the chain force by much more than the force itself.
 
         Parameters
         ----------
@@ -436,58 +454,69 @@ class Tissue:
 
     @property
     def parameters(self) -> dict[str, UflOrArray]:
-        """Every parameter by its name: of all tissues, of turnover where there is any, and those that parts have."""
+        """All parameters by name, with those of turnover and additional ones."""
         turned_over = [name for name in TURNED_OVER if getattr(self, name) is not None]
-        found = {name: getattr(self, name) for name in (*PARAMETERS, *turned_over)}
-        for part in self._own_parameters.values():
-            found |= part
-        return found
+        values = {name: getattr(self, name) for name in (*PARAMETERS, *turned_over)}
+        for additional in self._own_parameters.values():
+            values |= additional
+        return values
 
     @property
     def _own_parameters(self) -> dict[str, Mapping[str, UflOrArray]]:
-        """Of chain, matrix and repulsion, where they have any."""
+        """Additional parameters by component: chain, matrix or repulsion."""
         values = {name: getattr(getattr(self, name), "values", None) for name in ("chain", "matrix", "repulsion")}
-        return {name: own for name, own in values.items() if own}
+        return {name: bound for name, bound in values.items() if bound}
 
     def map(self, function: Callable[[str, UflOrArray], UflOrArray]) -> Tissue:
-        """The same tissue with function(name, value) for every parameter."""
-        found = {name: function(name, value) for name, value in self.parameters.items()}
-        own = {
-            part: getattr(self, part).of({name: found[name] for name in names})
-            for part, names in self._own_parameters.items()
+        """Return the tissue with function(name, value) in place of every parameter.
+
+        Parameters
+        ----------
+        function
+            Function of a parameter's name and value that returns the new value.
+        """
+        values = {name: function(name, value) for name, value in self.parameters.items()}
+        components = {
+            component: getattr(self, component).of({name: values[name] for name in names})
+            for component, names in self._own_parameters.items()
         }
-        return replace(self, **{name: found[name] for name in found if name in PARAMETERS + TURNED_OVER}, **own)
+        own = {name: values[name] for name in values if name in PARAMETERS + TURNED_OVER}
+        return replace(self, **own, **components)
 
     def is_round(self) -> bool:
-        """Whether a turn about z before the deformation leaves the energy of the matrix."""
+        """Return whether a rotation about z before the deformation keeps the matrix energy."""
         pulled, (c, s) = np.diag([1.1, 1.3, 1.2]), (0.8, 0.6)
-        turned = pulled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        found, again = (self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, turned))
-        return bool(np.isclose(found, again, rtol=1e-9))
+        rotated = pulled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        energy, rotated_energy = (self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, rotated))
+        return bool(np.isclose(energy, rotated_energy, rtol=1e-9))
 
     def strain_energy(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
-        """W per reference volume (eqs. 3 and 4 with errata 1 and 2), in the unit of the Lame constants.
+        """Return W per reference volume (eqs. 3 and 4 with errata 1 and 2).
 
         Parameters
         ----------
         deformation_gradient
             F, UFL of shape (3, 3) or array (..., 3, 3).
         cells
-            The unit cell: one whole cell, or shares whose weights add up to one.
+            One whole cell, or cells whose weights add up to one.
 
-        In UFL a repulsion that has derivatives of its own (`Repulsion.derivatives`) is left out: these enter forms as
-        values at the quadrature points (`solver.equilibrium.PointwiseRepulsion`).
+        Returns
+        -------
+        UFL or array (...,)
+            W in the unit of the Lame constants. In UFL it lacks a repulsion with
+            `Repulsion.derivatives`, which enter forms as values at the quadrature points
+            (`solver.equilibrium.PointwiseRepulsion`).
         """
         energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
 
     def distortional_energy(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
-        """W without the volumetric part of the matrix; as `strain_energy`, which it makes together with that part."""
+        """Return W without the volumetric part of the matrix; see `strain_energy`."""
         energy = self._parts().distortional(deformation_gradient, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
 
     def volumetric_energy(self, jacobian: UflOrArray) -> UflOrArray:
-        """The volumetric part of the matrix, U(J).
+        """Return the volumetric energy of the matrix, U(J).
 
         Parameters
         ----------
@@ -499,14 +528,12 @@ class Tissue:
     def _parts(self) -> Matrix:
         if isinstance(self.matrix, Matrix):
             return self.matrix
-        raise TypeError(
-            "the volumetric part of this matrix energy is not told apart: it must be a remodel_fenicsx.extend.Matrix"
-        )
+        raise TypeError("no separate volumetric part in this matrix energy; use remodel_fenicsx.extend.Matrix")
 
     def _with_network(
         self, energy: UflOrArray, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
     ) -> UflOrArray:
-        """An energy plus that of the chains, where there are any."""
+        """Add the network's energy, if there are chains."""
         if self.chain is None:
             return energy
         length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
@@ -519,19 +546,19 @@ class Tissue:
 
     @property
     def repulsion_modulus(self) -> UflOrArray:
-        """m c g(r0): W_rep = -m c g(r0) M / 2."""
+        """Modulus of the repulsion, m c g(r0); W_rep = -m c g(r0) M / 2."""
         assert self.chain is not None
         return self.present_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
 
     def stresses(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> Stresses:
-        """P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5), by differentiation of W; UFL.
+        """Return P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5); UFL.
 
         Parameters
         ----------
         deformation_gradient
             F, UFL of shape (3, 3).
         cells
-            The unit cell: one whole cell, or shares whose weights add up to one.
+            One whole cell, or cells whose weights add up to one.
         """
         F = ufl.variable(deformation_gradient)
         return _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
@@ -539,24 +566,25 @@ class Tissue:
     def stresses_of_parts(
         self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell], jacobian: UflOrArray
     ) -> Stresses:
-        """The same with U at another J than det F: P = d(W - U)/dF + J U'(J) F^-T, J U' the Kirchhoff pressure; UFL."""
+        """Return stresses with U at the given J: P = d(W - U)/dF + J U'(J) F^-T; UFL."""
         F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
         pressure = J * ufl.diff(self.volumetric_energy(J), J)
         return _stresses(F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T)
 
     def energy_increment(self, deformation_gradient: UflOrArray, old: UnitCell, new: UnitCell) -> UflOrArray:
-        """First-order change of W at frozen F when the cells become others, per reference volume; arrays.
+        """Return the first-order change of W for new cells at frozen F (Remark 6).
 
-        W depends on the cells through r^2 = A : C and M = sum_I l_I^2 ln I_I only:
-        dW = c g(r)/2 d(r^2) - c/2 g(r0) dM, taken at the old cells, where r < L. (Remark 6; the new cells themselves
-        may have r > L until the next solve, so their energy is not always defined.)
+        W per reference volume depends on the cells only through r^2 = A : C and M = sum_I l_I^2 ln
+        I_I: dW = c g(r)/2 d(r^2) - c/2 g(r0) dM, evaluated with the old cells, which have r < L.
+        The new cells may have r > L until the next solve, so that their energy is not always
+        defined. Arrays.
 
         Parameters
         ----------
         deformation_gradient
             F, (..., 3, 3).
         old, new
-            The cells, (..., 3) and (..., 3, 3).
+            Cells with dimensions (..., 3) and axes (..., 3, 3).
         """
         F, r0 = deformation_gradient, self.end_to_end_length
         if self.chain is None:
@@ -572,14 +600,14 @@ class Tissue:
     def turnover_increment(
         self, deformation_gradient: UflOrArray, cell: UnitCell, content: UflOrArray, natural_length: UflOrArray
     ) -> UflOrArray:
-        """First-order change of W at frozen F and cells when ln m and ln rho change, per reference volume; arrays.
+        """Return the first-order change of W at frozen F and cells for changes of ln m and ln rho.
 
-        dW = W_net d ln m - m c g(r/rho) (r/rho)^2 d ln rho.
+        dW = W_net d ln m - m c g(r/rho) (r/rho)^2 d ln rho, per reference volume. Arrays.
 
         Parameters
         ----------
         deformation_gradient, cell
-            F (..., 3, 3) and the unit cell.
+            F, (..., 3, 3), and the unit cell.
         content, natural_length
             Changes of ln m and ln rho, (...).
         """
@@ -591,5 +619,5 @@ class Tissue:
 
 
 def _stresses(F: UflOrArray, first: UflOrArray) -> Stresses:
-    """All of them from P; UFL."""
+    """Return all stresses from P; UFL."""
     return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))

@@ -1,9 +1,11 @@
-"""Evolution laws: what the unit cells become while a drive acts on them. Pure functions on arrays.
+"""Evolution laws of the unit cells under a drive, means over load cases, and turnover.
 
-A law is `update(cells, drive, time_old, time_new) -> cells` with cells of shape (n, 3) and (n, 3, 3). The paper's laws
-(eq. 11, eq. 10 over a step, and a form of it without the time) change the dimensions towards a target while the axes
-turn at once: `ranked` makes a law of such a function. `rotation` is the older law that the paper argues against: the
-axes turn gradually and the dimensions stay. `tensor` is consistent: one equation for A (`tensor_law`).
+Pure functions on arrays. A law is `update(cells, drive, time_old, time_new) -> cells` with cells of
+shape (n, 3) and (n, 3, 3). The paper's laws (eq. 11, eq. 10 over a step, and an autonomous form of
+eq. 10) move the dimensions towards a target and set the axes directly to the principal directions;
+`ranked` turns such a function into a law. `rotation` is the older law that the paper rejects: the
+axes rotate gradually and the dimensions stay. `tensor` is consistent: one equation for A
+(`tensor_law`).
 """
 
 from __future__ import annotations
@@ -27,11 +29,12 @@ Tension = Callable[[UflOrArray], UflOrArray]
 RankedFunction = Callable[[Array, Array, Array, Array | float, float, float], Array]
 Weights = Sequence[float]
 
-COMPLEX_STEP = 1e-30  # its square vanishes beside 1: derivatives are exact to rounding
+# Its square is negligible against 1, so that derivatives are exact to rounding.
+COMPLEX_STEP = 1e-30
 
 
 class PrincipalKernels(Protocol):
-    """What computes principal directions: `spectral` itself, or its functions in C."""
+    """Functions that compute principal directions: those of `spectral`, or their versions in C."""
 
     @property
     def principal(self) -> spectral.Pairing: ...
@@ -41,7 +44,7 @@ class PrincipalKernels(Protocol):
 
 
 class Drive(NamedTuple):
-    """What acts on the cells of n points during a step.
+    """Drive of the cells at n points during a step.
 
     Attributes
     ----------
@@ -50,31 +53,34 @@ class Drive(NamedTuple):
     tensor
         The driving tensor, symmetric, (n, 3, 3).
     driver, frame
-        Where the tensor's eigenvectors live, and what becomes of them.
+        Driver of the tensor, and the map from its eigenvectors to cell axes.
     noise
-        Principal values up to this size are zero, in the unit of the tensor; (n,) or a number.
+        Principal values up to this size count as zero, in the unit of the tensor; (n,) or a number.
     initial_dimensions
         l0_I by rank, (n, 3), in link lengths.
     end_to_end_length
         r0, in link lengths; (n,) or a number.
     kappa
-        Speed of remodeling, in 1/time; (n,) or a number.
+        Rate of remodeling, in 1/time; (n,) or a number.
     pairing
-        Of `spectral.PAIRINGS`: principal values and axes, in the order in which they belong to the cell's dimensions.
+        One of `spectral.PAIRINGS`: returns principal values and axes in the order of the cell's
+        dimensions.
     rotation_time
-        Time in which the law `rotation` turns a small angle to 1/e of it.
+        Time in which the law `rotation` reduces a small angle to 1/e.
     kernels
-        Whose `principal` and `positive_direction` are called: those of `spectral`, or of C (`kernels`).
+        Provider of `principal` and `positive_direction`: `spectral`, or the C functions
+        (`kernels`).
     rounding
-        The part of the noise that is the rounding of a stress, in its unit; (n,) or a number.
+        Contribution of a stress's rounding to the noise, in the unit of the tensor; (n,) or a
+        number.
     exponent, least_tension
-        Of `tensor_law.target` and `tensor_law.awake`.
+        Exponent of `tensor_law.target`, and threshold of the activation.
     parameters
-        Values of the law's own (`Law.parameters`) by their names.
+        Values of the law's additional parameters (`Law.parameters`) by name.
 
     Examples
     --------
-    One cell under tension along z makes one step of the paper's law:
+    One step of the paper's law for a cell under tension along z:
 
     >>> import numpy as np
     >>> from remodel_fenicsx.extend import DRIVERS, FRAMES, LAWS, Drive, UnitCell
@@ -105,22 +111,20 @@ class Drive(NamedTuple):
 
     @property
     def kappas(self) -> Array | float:
-        """kappa beside arrays (n, 3)."""
+        """Rate kappa as a number or (n, 1), to multiply arrays (n, 3)."""
         return np.reshape(self.kappa, (-1, 1)) if np.ndim(self.kappa) else self.kappa
 
     @property
     def floor(self) -> Array | float:
-        """Tension below which a principal value counts as none, (n,) or a number, in the unit of the tensor."""
+        """Tension at which the switch is one half, (n,) or a number (`tensor_law.floor_above`)."""
         return tensor_law.floor_above(self.noise, self.rounding)
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
-    """The cells that a pass has reached with a share of its change: A = A_old + factor (A_new - A_old).
-
-    A = sum_I l_I^2 n_I (x) n_I; the dimensions are the roots of its eigenvalues, the axes its eigenvectors, in the
-    order of the new axes that they continue. Where eigenvalues agree, the new axes decide. Arrays of n points; the
-    factor is (n,) or a number, which at 1 gives the new cells as they are.
-    """
+    """Return cells of the relaxed structure tensor A = A_old + factor (A_new - A_old)."""
+    # The dimensions are the square roots of the eigenvalues of A, the axes its eigenvectors, in the
+    # order of the new axes that they continue. If eigenvalues agree, the new axes decide. The
+    # factor is (n,) or a number; the number 1 returns the new cells unchanged.
     if np.ndim(factor) == 0 and factor == 1.0:
         return new
     before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
@@ -130,41 +134,48 @@ def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
 
 @dataclass(frozen=True)
 class Law:
-    """An evolution law.
+    """Evolution law of the unit cells.
 
     Attributes
     ----------
     update
-        New cells from (cells, drive, time_old, time_new).
+        Function of (cells, drive, time_old, time_new) that returns the new cells.
     has_limit
-        Whether the cells tend to a limit under a constant drive that does not depend on the way there.
+        Whether the cells tend to a limit under a constant drive that does not depend on the path.
     remodels
-        False where cells never change: then there is no pass at all.
+        False if the cells never change; then there is no remodeling pass.
     of_absolute_time
-        Whether a pass makes up for what the ones before have left out. The cells of other laws change by steps: those
-        that make a share of each are slower.
+        Whether the law depends on the absolute time, so that a pass makes up for changes that
+        earlier passes have omitted. Cells of other laws change by increments: relaxation slows them
+        down.
     target, follow
-        Of laws whose cells tend to a tensor: ``target(drive)`` and ``follow(cells, target, r0, kappa dt)``, of which
-        `update` is made; r0 and kappa dt are (n,) or numbers. A scheme of second order needs them apart.
+        Functions of laws whose structure tensor tends to a target: ``target(drive)`` and
+        ``follow(cells, target, r0, kappa dt)``. `update` combines both; a second-order scheme needs
+        them separately. r0 and kappa dt are (n,) or numbers.
     is_ranked
-        Whether dimensions follow the rank of principal values (`ranked`).
+        Whether dimensions follow the order of principal values (`ranked`).
     keeps_symmetry
-        Whether planes of symmetry of cells and drive stay such: False where the law turns an axis to one of two sides.
+        Whether the law preserves planes of symmetry of cells and drive. False if it rotates an axis
+        to one of two sides.
     asks_kappa
-        Whether kappa = 0 means that cells never change, so that there is no pass at all.
+        Whether kappa = 0 means that cells never change, so that there is no remodeling pass.
     share
-        Cells that have made a share of a change, from (old, new, factor); `relaxed` where the law has none of its own.
+        Function of (old, new, factor) that returns relaxed cells; default: `relaxed`.
     over_corrects
-        Whether the coupling "staggered" may leave a symmetric solution with it.
+        Whether the coupling "staggered" may leave a symmetric solution with this law.
     takes_set_points
-        Whether `target` takes the exponent and the threshold of a drive, and goes with turnover.
+        Whether `target` uses the exponent and the threshold of the drive, and the law is compatible
+        with turnover.
     parameters
-        Numbers of its own, keys of `[remodeling]`: `speed` takes them by their names, and the drive has them.
+        Additional parameters, keys of `[remodeling]`. `speed` takes them by their names, and the
+        drive holds them.
     speed
-        The kappa that acts, from (kappa of the scene, temperature in K), where it is another.
+        Function of (kappa of the scene, temperature in K) that returns the effective kappa; None if
+        both are equal.
+
     Examples
     --------
-    Collagen that is lost, whatever acts on it (`ranked` makes laws of the paper's kind):
+    Collagen that decays under any drive (`ranked` makes laws of the paper's kind):
 
     >>> import numpy as np
     >>> from remodel_fenicsx import Simulation, preset_scene
@@ -198,20 +209,23 @@ class Law:
 
 
 def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
-    """A law of the paper's kind (eqs. 8 to 11): axes at the drive's principal directions, dimensions by rank.
+    """Make a law that sets axes to principal directions and changes dimensions (eqs. 8 to 11).
 
     Parameters
     ----------
     function
-        ``function(l, l0, target, kappa, time_old, time_new) -> l_new`` with l and l0 (n, 3) by rank (column 0: largest
-        principal value; with the pairing "continuous" by axis instead), target = r0 e, ``e = lambda^+ / |lambda^+|``,
-        kappa a number, or (n, 1) where regions differ. Points without a positive value, or kappa, keep their cells.
+        ``function(l, l0, target, kappa, time_old, time_new) -> l_new``. l and l0 are (n, 3) by
+        rank: column 0 belongs to the largest principal value. With the pairing "continuous" they
+        are by axis instead. The target is r0 e with ``e = lambda^+ / |lambda^+|``. kappa is a
+        number, or (n, 1) if regions differ. Points without a positive principal value or with
+        kappa = 0 keep their cells.
     has_limit, of_absolute_time
-        As in `Law`.
+        See `Law`.
+
     Returns
     -------
     Law
-        For `LAWS`.
+        A law for `LAWS`.
 
     Examples
     --------
@@ -242,7 +256,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
 
 
 def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """Axes at the principal directions (eqs. 8 and 9), dimensions towards r0 e (eqs. 10 and 11)."""
+    """Set principal axes (eqs. 8 and 9), and move dimensions towards r0 e (eqs. 10 and 11)."""
     values, axes = principal_directions(drive, cells.axes, drive.pairing)
     direction, active = drive.kernels.positive_direction(values, threshold=drive.noise)
     target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
@@ -259,7 +273,7 @@ def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: f
 
 
 def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
-    """Principal values and directions of the drive, in the space in which it lives; `previous`: the cells' axes."""
+    """Return principal values and directions of the drive; `previous` are the cells' axes."""
     if not drive.driver.material and drive.frame.carries_axes:
         previous = carried_axes(drive.deformation_gradient, previous)
     function: spectral.Pairing = drive.kernels.principal if pairing is spectral.principal else pairing
@@ -267,10 +281,11 @@ def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairin
 
 
 def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
-    """Axes of the cells from the drive's principal directions, by rank or in an order of their own."""
-    # A frame may treat its axes in their order (the material one takes the first as it is). By rank it is the largest
-    # principal value that comes first. With `dimensions` it is the largest dimension: where two of them change their
-    # order they are equal, so that A does not depend on which is first, and does not jump.
+    """Return cell axes from the drive's principal directions, ordered by value or by dimension."""
+    # A frame may depend on the order of the axes: the material frame keeps the direction of the
+    # first axis. Without `dimensions` the axis of the largest principal value comes first, with
+    # them that of the largest dimension. Two dimensions that change their order are equal at that
+    # moment, so that A does not jump.
     if drive.driver.material:
         return axes
     if dimensions is None:
@@ -281,28 +296,29 @@ def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
 
 
 def explicit(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
-    """Eq. (11): l = l0 + (r0 e - l0)(1 - exp(-kappa t)), a function of the absolute time and the present target."""
+    """Return l = l0 + (r0 e - l0)(1 - exp(-kappa t)), t = time_new, for current e (eq. 11)."""
     return l0 - (target - l0) * np.expm1(-kappa * time_new)
 
 
 def rate(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
-    """Eq. (10): dl/dt = kappa (r0 e - l0) exp(-kappa t), integrated exactly over the step with e frozen."""
+    """Integrate dl/dt = kappa (r0 e - l0) exp(-kappa t) exactly over a step, e frozen (eq. 10)."""
     return l - (target - l0) * np.exp(-kappa * time_old) * np.expm1(-kappa * (time_new - time_old))
 
 
 def relaxation(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
-    """Autonomous form dl/dt = kappa (r0 e - l), integrated exactly over the step with e frozen."""
+    """Integrate the autonomous form dl/dt = kappa (r0 e - l) exactly over the step, e frozen."""
     return l - (target - l) * np.expm1(-kappa * (time_new - time_old))
 
 
 def rotation(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """Remark 5: the fibre turns gradually towards the largest tension, the other axes turn along, dimensions stay."""
-    # n <- exp(dt [omega]) n with omega = n_new x n_max / tau (tau: `Drive.rotation_time`, n_new: at the end of the
-    # step). The fibre n is the axis of the largest dimension (the first of equal ones). n_max is the principal
-    # direction of the largest value, a line: of its two senses the one nearer to n. Where n is orthogonal to it within
-    # `spectral.DECISIVE`, both are as near, and the one nearer to the next of the cell's axes is taken. Where the
-    # largest values agree, n_max is the direction of their plane that is nearest to n. Points without tension keep
-    # their cells.
+    """Rotate the fibre, with the other axes, towards the largest tension (Remark 5)."""
+    # n <- exp(dt [omega]) n with omega = n_new x n_max / tau (tau: `Drive.rotation_time`, n_new: at
+    # the end of the step). The fibre n is the axis of the largest dimension
+    # (the first of equal ones). n_max is the principal direction of the largest value, a line,
+    # taken in the sense that is nearer to n. If n is orthogonal to the line within
+    # `spectral.DECISIVE`, both senses are equally near; the sense nearer to the next axis of the
+    # cell is taken. If the largest values agree, n_max is the direction of their plane that is
+    # nearest to n. Points without tension keep their cells.
     order = (np.argmax(cells.dimensions, axis=1)[:, None] + np.arange(3)) % 3
     axes = np.take_along_axis(cells.axes, order[:, :, None], axis=1)
     values, towards = principal_directions(drive, axes, spectral.principal)
@@ -313,32 +329,34 @@ def rotation(cells: UnitCell, drive: Drive, time_old: float, time_new: float) ->
 
 
 def _turn_towards(fibre: Array, goal: Array, relative_step: float) -> Array:
-    """Rotation vectors dt omega (n, 3) of Remark 5's implicit step, |dt omega| = dt/tau sin(angle at its end)."""
+    """Return rotation vectors dt omega (n, 3) of Remark 5's implicit step."""
+    # |dt omega| = dt/tau sin(angle at the end of the step).
     across = np.cross(fibre, goal)
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.einsum("na,na->n", fibre, goal))
-    turn = angle - angle_left(angle, relative_step)
-    return across * np.divide(turn, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]  # 0: parallel
+    increment = angle - angle_left(angle, relative_step)
+    # The sine is zero if fibre and goal are parallel.
+    return across * np.divide(increment, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]
 
 
 def angle_left(angle: Array, relative_step: float) -> Array:
-    """The root a of a + (dt/tau) sin a = angle: what an implicit step leaves of angles (n,) in [0, pi/2], radians."""
-    # Newton's method from angle / (1 + dt/tau), which is below the root: the left side is increasing and concave, so
-    # each iterate comes nearer from below.
-    left = np.asarray(angle / (1.0 + relative_step), dtype=np.float64)
+    """Return the root a of a + (dt/tau) sin a = angle after an implicit step; (n,) in [0, pi/2]."""
+    # Newton's method starts from angle / (1 + dt/tau), which is below the root. The left side is
+    # increasing and concave, so that the iterates approach the root from below.
+    remaining = np.asarray(angle / (1.0 + relative_step), dtype=np.float64)
     for _ in range(50):
-        missing = angle - left - relative_step * np.sin(left)
-        correction = missing / (1.0 + relative_step * np.cos(left))
-        left = np.asarray(left + correction, dtype=np.float64)
+        residual = angle - remaining - relative_step * np.sin(remaining)
+        correction = residual / (1.0 + relative_step * np.cos(remaining))
+        remaining = np.asarray(remaining + correction, dtype=np.float64)
         if np.all(correction <= 1e-15 * angle):
-            return left
-    raise FloatingPointError(f"no angle is left by a rotation with a step of {relative_step:g} rotation times")
+            return remaining
+    raise FloatingPointError(f"no convergence of a step of {relative_step:g} rotation times")
 
 
 def turned(axes: Array, vectors: Array) -> Array:
-    """Axes (n, 3, 3), rows, after rotations by vectors (n, 3): axis times angle in radians (Rodrigues' formula)."""
+    """Rotate axes (n, 3, 3), rows, by vectors (n, 3), axis times angle in radians (Rodrigues)."""
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    # sin(a)/a and (1 - cos a)/a^2, both without cancellation; np.sinc(x) is sin(pi x)/(pi x)
+    # sin(a)/a and (1 - cos a)/a^2 without cancellation; np.sinc(x) is sin(pi x)/(pi x).
     first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
     along = np.broadcast_to(vectors[:, None], axes.shape)
     once = np.cross(along, axes)
@@ -346,34 +364,35 @@ def turned(axes: Array, vectors: Array) -> Array:
 
 
 def turned_in_part(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
-    """The old cells after a share of the rotation, of less than 180 degrees, that leads to the axes of the new ones."""
+    """Rotate the old axes by a fraction of the rotation to the new ones, less than 180 degrees."""
     if factor == 1.0:
         return new
     across = 0.5 * np.cross(old.axes, new.axes).sum(axis=1)  # sin(angle) times the axis
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, 0.5 * (np.einsum("nia,nia->n", old.axes, new.axes) - 1.0))
-    part = factor * np.divide(angle, sine, out=np.zeros_like(sine), where=sine > 0.0)
-    return UnitCell(new.dimensions, turned(old.axes, part[:, None] * across))
+    scale = factor * np.divide(angle, sine, out=np.zeros_like(sine), where=sine > 0.0)
+    return UnitCell(new.dimensions, turned(old.axes, scale[:, None] * across))
 
 
 def keep(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """The same cells."""
+    """Return cells unchanged, without remodeling."""
     return cells
 
 
 def tensor_target(drive: Drive) -> tensor_law.Target:
-    """What the structure tensor tends to (`tensor_law.target`, `tensor_law.awake`)."""
-    found = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
+    """Return the target of the structure tensor, with a switch reduced below the threshold."""
+    target = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
-        return found
-    return found._replace(switch=found.switch * tensor_law.awake(drive.tensor, drive.least_tension))
+        return target
+    return target._replace(switch=target.switch * tensor_law.awake(drive.tensor, drive.least_tension))
 
 
 def follow_tensor(
     cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, kappa_dt: Array | float
 ) -> UnitCell:
-    """Cells whose structure tensor is `tensor_law.follow`; where its eigenvalues agree, the axes stay."""
-    # Lengths are NaN where the target, extrapolated, makes the tensor indefinite by more than rounding.
+    """Return cells with A of `tensor_law.follow`; axes of equal eigenvalues stay."""
+    # Dimensions are NaN if an extrapolated target makes the tensor indefinite by more than
+    # rounding.
     structure = tensor_law.follow(structure_tensor(*cells[:2]), target, end_to_end_length, kappa_dt)
     squared, axes = spectral.continued(structure, cells.axes)
     rounding = spectral.ROUNDING * np.abs(squared).max(axis=-1, keepdims=True)
@@ -381,7 +400,7 @@ def follow_tensor(
 
 
 def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """dA/dt = kappa s (r0^2 E - A) with E and s frozen over the step (docs/theory.md, "The consistent variant")."""
+    """Integrate dA/dt = kappa s (r0^2 E - A) over a step, E and s frozen (docs/theory.md, Law)."""
     return follow_tensor(cells, tensor_target(drive), drive.end_to_end_length, drive.kappa * (time_new - time_old))
 
 
@@ -404,21 +423,21 @@ LAWS: dict[str, Law] = {
 
 
 # ---------------------------------------------------------------- means over load cases
-# What cells follow that are in several states by turns. Pure functions on arrays.
-# With weights w_i, the shares of time, and the states' F_i = R_i U_i: D = sum_i w_i R_i^T sigma_i R_i, which takes
-# each driving tensor to material space. Remodeling takes days and a cycle a second, so that cells see the mean of
-# many cycles.
+# Mean drive of cells that pass through several load cases in turn. Pure functions on arrays. With
+# weights w_i, the fractions of time, and F_i = R_i U_i: D = sum_i w_i R_i^T sigma_i R_i, with each
+# driving tensor in material space. Remodeling takes days and a cycle takes a second, so that cells
+# follow the mean of many cycles.
 
 
 def material_tensor(drive: Drive) -> Array:
-    """The driving tensor in material space, (n, 3, 3)."""
+    """Return the driving tensor in material space, (n, 3, 3)."""
     if drive.driver.material:
         return drive.tensor
     return drive.frame.tensor(drive.deformation_gradient, drive.tensor)
 
 
 def mean_tensor(drives: Sequence[Drive], weights: Weights) -> Drive:
-    """The first state's drive with the weighted mean of all driving tensors, and of what may be an error in them."""
+    """Return the first drive with the weighted means of driving tensors, noise and rounding."""
     tensor = _weighted([material_tensor(drive) for drive in drives], weights)
     return _with(
         drives[0],
@@ -429,7 +448,7 @@ def mean_tensor(drives: Sequence[Drive], weights: Weights) -> Drive:
 
 
 def largest_tension(drives: Sequence[Drive], weights: Weights) -> Drive:
-    """At each point the driving tensor of the state whose largest principal value is the largest one."""
+    """Return the first drive with the tensor of the largest tension at each point."""
     tensors = np.array([material_tensor(drive) for drive in drives])
     chosen = np.linalg.eigvalsh(tensors)[..., -1].argmax(axis=0)
     shape, points = tensors.shape[:2], np.arange(tensors.shape[1])
@@ -441,7 +460,7 @@ def largest_tension(drives: Sequence[Drive], weights: Weights) -> Drive:
 
 
 def mean_target(targets: Sequence[Target], weights: Weights) -> Target:
-    """The weighted mean of sE: what acts on A is linear in it (`Target.towards`)."""
+    """Return the weighted mean of sE; the rate of A is linear in sE (`Target.towards`)."""
     pulled = _weighted([target.switch[:, None, None] * target.direction for target in targets], weights)
     switch = np.einsum("nii->n", pulled)
     return Target(pulled / np.where(switch > 0.0, switch, 1.0)[:, None, None], switch)
@@ -458,7 +477,7 @@ def _weighted(values: Sequence[Array | float], weights: Weights) -> Array:
 
 @dataclass(frozen=True)
 class Mean:
-    """What becomes of several drives."""
+    """Average over the drives or targets of load cases."""
 
     meaning: str
     drive: Callable[[Sequence[Drive], Weights], Drive] = mean_tensor
@@ -470,37 +489,39 @@ MEANS_OF_CASES: dict[str, Mean] = {
     "target": Mean("the weighted mean of the targets that each case has, for the law 'tensor'", of_targets=True),
     "largest": Mean("at each point the load case with the largest tension, whatever its weight", largest_tension),
 }
-"""By the name that `remodeling.mean` has."""
+"""Averages by the name in `remodeling.mean`."""
 
 
 # ---------------------------------------------------------------- turnover
-# Collagen is removed in time and deposited under a stretch. m is the amount of the chains and rho their natural
-# length, each over that at the start; lambda_e = r/(rho r0), and lambda_h is the stretch of deposition. The rates
-# `cauchy` are those of Cyron, Aydin and Humphrey (2016): with S(lambda) = g(lambda r0) lambda^2, proportional to the
-# Cauchy stress of a chain, s = S(lambda_e)/S(lambda_h), a = d ln S / d ln lambda and p = max(1 + k (s - 1), 0), the
-# production over the removal,
+# Collagen is removed and deposited under a stretch. m is the content of chains and rho their
+# natural length, each relative to its initial value; lambda_e = r/(rho r0), and lambda_h is the
+# deposition stretch. The rates `cauchy` are those of Cyron, Aydin and Humphrey (2016).
+# S(lambda) = g(lambda r0) lambda^2 is proportional to the Cauchy stress of a chain,
+# s = S(lambda_e)/S(lambda_h), a = d ln S / d ln lambda, and p = max(1 + k (s - 1), 0) is production
+# over removal:
 #     dm/dt / m = (p - 1)/T,    drho/dt / rho = p (1 - 1/s)/(a T).
-# The rates `tension` are those of version 0.3.0: with tau(lambda) = g(lambda r0) lambda, proportional to its force,
+# The rates `tension` are those of version 0.3.0. tau(lambda) = g(lambda r0) lambda is proportional
+# to the chain force:
 #     dm/dt / m = k/T (tau(lambda_e)/tau(lambda_h) - 1), limited to k/T,
 #     drho/dt / rho = (1/T + (dm/dt / m)^+) (lambda_e/lambda_h - 1).
 
 
 class TurnoverRates(NamedTuple):
-    """Of content and natural length: d ln m / dt and d ln rho / dt, 1/time, (n,)."""
+    """Rates of content and natural length, d ln m / dt and d ln rho / dt, in 1/time, (n,)."""
 
     content: Array
     natural_length: Array
 
 
 class Followed(NamedTuple):
-    """What amount and natural length follow: their rates, and the power of lambda beside g in it."""
+    """Turnover rates, and the power of lambda in their stimulus, g(lambda r0) lambda^power."""
 
     rates: Callable[[TurnoverRule, Tension, Array], TurnoverRates]
     power: int
 
 
 class TurnoverRule(NamedTuple):
-    """How collagen is turned over: T, lambda_h, k, and one of `TURNOVER_RATES`."""
+    """Rule of turnover: T, lambda_h, k, and one of `TURNOVER_RATES`."""
 
     time: float
     deposition_stretch: float
@@ -508,44 +529,51 @@ class TurnoverRule(NamedTuple):
     followed: Followed
 
     def rates(self, tissue: Tissue, stretch: Array) -> TurnoverRates:
-        """Where chains have a stretch lambda_e (n,)."""
-        chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+        """Return the rates at the stretch lambda_e (n,) of chains."""
+        chain = tissue.chain
+        r0, contour = tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
-        return self.followed.rates(self, lambda some: chain.stiffness(some * r0, contour) * some, stretch)
+        return self.followed.rates(
+            self,
+            lambda lambda_e: chain.stiffness(lambda_e * r0, contour) * lambda_e,
+            stretch,
+        )
 
     def at_length(self, tissue: Tissue, length: Array) -> TurnoverRates:
-        """Where chains have a length."""
+        """Return the rates at the length r (n,) of chains."""
         return self.rates(tissue, tissue.relative(length) / tissue.end_to_end_length)
 
     def rest(self, tissue: Tissue) -> tuple[float, float]:
-        """k a, which must be above 2 for a wall to come to rest, and the time in which it does so by a factor of e."""
-        # The time of a small change near rest: E T/(k a - 2), E = d ln(g - g0/lambda^2)/d ln lambda at lambda_h, where
-        # chains and repulsion act together. Of a tissue of numbers.
+        """Return k a, which must exceed 2 for a steady state of a wall, and the time constant."""
+        # Near the steady state a small change decays by a factor of e in E T/(k a - 2) with E = d
+        # ln(g - g0/lambda^2)/d ln lambda at lambda_h, the slope for chains and repulsion together.
+        # The parameters of the tissue must be numbers.
         deposited = self.deposition_stretch * (1.0 + 1j * COMPLEX_STEP)
-        chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+        chain = tissue.chain
+        r0, contour = tissue.end_to_end_length, tissue.contour_length
         assert chain is not None
         secant = chain.stiffness(deposited * r0, contour)
-        both = secant - chain.stiffness(r0, contour) / deposited**2
-        what = secant * deposited**self.followed.power
-        steep, stiff = (float(np.log(some).imag) / COMPLEX_STEP for some in (what, both))
-        return self.gain * steep, stiff * self.time / (self.gain * steep - 2)
+        total_force = secant - chain.stiffness(r0, contour) / deposited**2
+        stimulus = secant * deposited**self.followed.power
+        stimulus_slope, force_slope = (float(np.log(value).imag) / COMPLEX_STEP for value in (stimulus, total_force))
+        return self.gain * stimulus_slope, force_slope * self.time / (self.gain * stimulus_slope - 2)
 
 
 def by_stress(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
-    """Rates `cauchy`."""
+    """Return the rates `cauchy`, which follow the stress of chains."""
 
-    def steepness(some: Array) -> Array:
-        return 1.0 + np.log(tension(some * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
+    def steepness(lambda_e: Array) -> Array:
+        return 1.0 + np.log(tension(lambda_e * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
 
-    steep = steepness(stretch)
+    slope = steepness(stretch)
     relative = tension(stretch) * stretch / (tension(rule.deposition_stretch) * rule.deposition_stretch)
     produced = 1.0 + rule.gain * (relative - 1.0)
     produced = np.maximum(produced, 0.0)
-    return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (steep * rule.time))
+    return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (slope * rule.time))
 
 
 def by_tension(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
-    """Rates `tension`."""
+    """Return the rates `tension`, which follow the force of chains."""
     relative = tension(stretch) / tension(rule.deposition_stretch) - 1.0
     content = rule.gain / rule.time * np.clip(relative, -1.0, 1.0)
     turned_over = 1.0 / rule.time + np.maximum(content, 0.0)
@@ -553,4 +581,4 @@ def by_tension(rule: TurnoverRule, tension: Tension, stretch: Array) -> Turnover
 
 
 TURNOVER_RATES = {"cauchy": Followed(by_stress, 2), "tension": Followed(by_tension, 1)}
-"""By the name that `remodeling.turnover.rates` has."""
+"""Rates by the name in `remodeling.turnover.rates`."""

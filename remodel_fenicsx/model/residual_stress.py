@@ -1,4 +1,4 @@
-"""Residual stress of a round wall: closed from a sector on panels through its radius, or cut."""
+"""Residual stress of a round wall: closing from a sector, and opening angle after a cut."""
 
 from __future__ import annotations
 
@@ -16,28 +16,40 @@ from remodel_fenicsx.schema.tables import SceneError
 
 Array = NDArray[np.float64]
 
-DEGREE = 24  # of R(r): the paper's artery at 160 degrees changes by less than 1e-8 from 16 to 32
-MISSING = 1e-8  # of dR/dr: a panel that leaves more of it out is halved; walls of 1 to 7 and thicker have some
-MOST_POLYNOMIALS = 8  # of one layer: walls of 1 to 1.05 ... 12 take 1 or 2
-LARGEST_TURN = 0.5  # of k: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2) in one piece too; half of it
-ITERATIONS = 30  # of Newton's method, which takes 5 to 7 for walls of 1 to 1.05 ... 12 at 90 to 270 degrees
-CLOSED = 1e-9  # of the residual over lambda + 2 mu
-ROUNDINGS = 8.0  # of values, over what one of each may leave of a residual: thin layers, of which some hardly leave 1
-TANGENT_DIFFERENCE = 1e-7  # of a logarithm: Newton's method needs no better tangent
-CHECK_DIFFERENCE, CHECKED = 1e-4, 1e-2  # of a logarithm; of the largest stress: |x| for max(x, 0) is off by half of it
+# Polynomial degree of R(r). The paper's artery at 160 degrees changes by less than 1e-8 from 16 to
+# 32.
+DEGREE = 24
+# Relative truncation error of dR/dr above which a panel is halved; walls of 1 to 7 and thicker have
+# larger errors.
+MISSING = 1e-8
+MOST_POLYNOMIALS = 8  # maximum of one layer; walls of 1 to 1.05 ... 12 take 1 or 2
+# Largest increment of k, half of what works: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2)
+# in one increment of 1 too.
+LARGEST_TURN = 0.5
+# Limit of Newton's method, which takes 5 to 7 for walls of 1 to 1.05 ... 12 at 90 to 270 degrees.
+ITERATIONS = 30
+CLOSED = 1e-9  # tolerance of the residual over lambda + 2 mu
+# Accepted residual over the effect of one rounding error in each value. Some thin layers hardly
+# reach 1.
+ROUNDINGS = 8.0
+TANGENT_DIFFERENCE = 1e-7  # difference of a logarithm; Newton's method needs no better tangent
+# Difference of a logarithm, and tolerance over the largest stress: |x| in place of max(x, 0) has an
+# error of half of it.
+CHECK_DIFFERENCE, CHECKED = 1e-4, 1e-2
 UNSTRETCHED = (1.0, 1.0, 1.0)
 ON_THE_RADIUS = [2, 0, 1]
-"""The order of energies: x, y and z of a body on its radius are across, around and along the wall; all else here is
-around, along, across, as local axes have their rows."""
+"""Order of the axes in the energy: x, y, z of the kinematics on one radius are radial,
+circumferential and axial. All other arrays here are circumferential, axial, radial, as the rows of
+local axes."""
 
 
 # ---------------------------------------------------------------- functions of the radius on panels
-# Values at Chebyshev points, with derivative and integral.
-# A panel is a layer or a part of one: within it a function is smooth, from one to the next its derivative may jump.
+# Values at Chebyshev points, with derivative and integral. A panel is a layer or a piece of a
+# layer. Within a panel a function is smooth; between panels its derivative may jump.
 
 
 class Panels:
-    """Chebyshev points of one or more panels, and what is done with values there."""
+    """Chebyshev points on panels, with derivative, integral and interpolation of values."""
 
     def __init__(self, edges: Sequence[float], degree: int):
         self.edges, self.degree = np.asarray(edges, dtype=np.float64), degree
@@ -47,52 +59,54 @@ class Panels:
         self.places[:, -1] = self.edges[1:]
         self._coefficients = np.linalg.inv(chebyshev.chebvander(points, degree))
         ones = np.eye(degree + 1)
-        slopes = np.stack([chebyshev.chebval(points, chebyshev.chebder(one)) for one in ones], axis=-1)
+        slopes = np.stack([chebyshev.chebval(points, chebyshev.chebder(unit)) for unit in ones], axis=-1)
         self._slope: Array = slopes @ self._coefficients
-        areas = np.array([chebyshev.chebval(1.0, chebyshev.chebint(one, lbnd=-1)) for one in ones])
+        areas = np.array([chebyshev.chebval(1.0, chebyshev.chebint(unit, lbnd=-1)) for unit in ones])
         self._weights: Array = areas @ self._coefficients
 
     def derivative(self, values: Array) -> Array:
-        """By the radius, of values (..., panels, points)."""
+        """Return the radial derivative of values (..., panels, points)."""
         return values @ self._slope.T / self._half
 
     def integral(self, values: Array) -> Array:
-        """Over all panels, of values (..., panels, points)."""
+        """Return the integral over all panels of values (..., panels, points)."""
         return np.asarray(np.sum(values * self._weights * self._half, axis=(-2, -1)))
 
     def jumps(self, values: Array) -> Array:
-        """From one panel to the next, (..., panels - 1)."""
+        """Return the jumps of values from one panel to the next, (..., panels - 1)."""
         return values[..., 1:, 0] - values[..., :-1, -1]
 
     def of(self, radius: Array) -> NDArray[np.intp]:
-        """Number of the panel of each radius (...,); what is outside belongs to the nearest."""
+        """Return the panel number of each radius (...,); outside the wall it is the nearest."""
         return np.clip(np.searchsorted(self.edges, radius, side="right") - 1, 0, len(self.edges) - 2)
 
     def missing(self, values: Array) -> Array:
-        """About what the polynomials leave out of values (panels, points), as shares of the largest; (panels,)."""
-        found: Array = np.abs(values @ self._coefficients.T)
-        return found[:, -2:].max(axis=1) / found.max()
+        """Return the relative truncation error of values (panels, points), (panels,)."""
+        # Estimated by the last two Chebyshev coefficients over the largest coefficient.
+        coefficients: Array = np.abs(values @ self._coefficients.T)
+        return coefficients[:, -2:].max(axis=1) / coefficients.max()
 
     def at(self, radius: Array, values: Array) -> Array:
-        """Of values (panels, points), at radii (...,)."""
+        """Interpolate values (panels, points) at radii (...,)."""
         panel = self.of(radius)
-        share = (radius - self.edges[panel]) / (2 * self._half[panel, 0]) * 2 - 1
-        found = np.empty_like(radius, dtype=np.float64)
+        coordinate = (radius - self.edges[panel]) / (2 * self._half[panel, 0]) * 2 - 1
+        interpolated = np.empty_like(radius, dtype=np.float64)
         for number, row in enumerate(values @ self._coefficients.T):
-            found[panel == number] = chebyshev.chebval(share[panel == number], row)
-        return found
+            interpolated[panel == number] = chebyshev.chebval(coordinate[panel == number], row)
+        return interpolated
 
 
-# ---------------------------------------------------------------- the natural configuration of a tube
-# What closes and joins to a known ring, with or without loads.
-# A ring that is cut opens to a sector, and its layers may be stretched before they are joined. In cylindrical axes
+# ---------------------------------------------------------------- natural configuration of a tube
+# A sector, whose layers may be prestretched before they are joined, closes to a ring of known
+# radii. In cylindrical axes
 #     G = diag(k r/R, g_z, dr/dR) P,    k = 360/(360 - opening angle),
-# where R(r) is the sector's radius of what lies at r in the ring, and P the prestretch of the layer. R and g_z are
-# such that the ring is in equilibrium: as the unloaded tube without pressure and without axial force.
+# where R(r) is the radius in the sector of the point at r in the ring, and P the prestretch of the
+# layer. R and g_z bring the ring to equilibrium with its loads; the unloaded tube has no pressure
+# and no axial force.
 
 
 class Layer(NamedTuple):
-    """A layer of a ring."""
+    """Layer of a ring: radii, tissue and prestretch."""
 
     radii: tuple[float, float]
     tissue: Tissue
@@ -100,7 +114,7 @@ class Layer(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """What acts on the ring."""
+    """Loads on the ring: pressure, and axial force or, if that is None, axial stretch of G."""
 
     pressure: float = 0.0
     force: float | None = 0.0
@@ -108,7 +122,7 @@ class Loads(NamedTuple):
 
 
 class Closing(NamedTuple):
-    """What closes to a ring."""
+    """Sector that closes to a ring: its radii at the panels' points, k and axial stretch g_z."""
 
     layers: tuple[Layer, ...]
     panels: Panels
@@ -117,64 +131,64 @@ class Closing(NamedTuple):
     axial: Array | float
 
     def natural_radius(self, radius: Array) -> Array:
-        """R at r, both (...,)."""
+        """Return R at r, both (...,)."""
         return self.panels.at(radius, self.radius)
 
     def stretches(self, radius: Array) -> Array:
-        """Circumferential, axial and radial stretch of G at r (...,): (..., 3), as the rows of cylindrical axes."""
+        """Return circumferential, axial and radial stretch of G at r (...,), (..., 3)."""
         slope = self.panels.at(radius, self.panels.derivative(self.radius))
         prestretch = np.array([layer.prestretch for layer in self.layers])[self.panels.of(radius)]
         return self._joined(radius, self.natural_radius(radius), slope) * prestretch
 
     def at_panels(self) -> Array:
-        """The same at the panels' own points, (panels, points, 3)."""
+        """Return the stretches of G at the panels' points, (panels, points, 3)."""
         prestretch = np.array([layer.prestretch for layer in self.layers])[:, None]
         return self._joined(self.panels.places, self.radius, self.panels.derivative(self.radius)) * prestretch
 
     def _joined(self, radius: Array, natural: Array, slope: Array) -> Array:
-        """G without the prestretch."""
+        """Return the stretches of G without the prestretch."""
         hoop = self.circumferential * radius / natural
         return np.stack(np.broadcast_arrays(hoop, self.axial, 1.0 / slope), axis=-1)
 
 
 def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads()) -> Closing:
-    """What closes to a ring in equilibrium: of a tissue with isotropic cells."""
-    whole = 360.0 / (360.0 - opening_angle)
+    """Compute the sector that closes to a ring in equilibrium, with isotropic cells."""
+    final_k = 360.0 / (360.0 - opening_angle)
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], DEGREE)
-    turns = np.linspace(1.0, whole, 1 + max(1, int(np.ceil((whole - 1.0) / LARGEST_TURN))))[1:]
-    found = Closing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
-    for k in turns:
-        grown = np.mean(found.radius + (k - 1.0) * panels.places * 0.5) / np.mean(found.radius)
-        found = _balanced(found._replace(radius=grown * found.radius, circumferential=float(k)), loads)
-    while (rough := found.panels.missing(found.panels.derivative(found.radius)) > MISSING).any():
-        parts = [
-            part
-            for layer, one in zip(found.layers, rough, strict=True)
-            for part in (_halves(layer) if one else [layer])
+    factors = np.linspace(1.0, final_k, 1 + max(1, int(np.ceil((final_k - 1.0) / LARGEST_TURN))))[1:]
+    ring = Closing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
+    for k in factors:
+        grown = np.mean(ring.radius + (k - 1.0) * panels.places * 0.5) / np.mean(ring.radius)
+        ring = _balanced(ring._replace(radius=grown * ring.radius, circumferential=float(k)), loads)
+    while (rough := ring.panels.missing(ring.panels.derivative(ring.radius)) > MISSING).any():
+        pieces = [
+            piece
+            for layer, is_rough in zip(ring.layers, rough, strict=True)
+            for piece in (_halves(layer) if is_rough else [layer])
         ]
-        if len(parts) > MOST_POLYNOMIALS * len(layers):
-            raise ArithmeticError(f"ring and sector vary too much through the wall for {len(parts)} polynomials")
-        finer = Panels([parts[0].radii[0], *(part.radii[1] for part in parts)], DEGREE)
-        radius = found.natural_radius(finer.places)
-        found = _balanced(found._replace(layers=tuple(parts), panels=finer, radius=radius), loads)
-    return found
+        if len(pieces) > MOST_POLYNOMIALS * len(layers):
+            raise ArithmeticError(f"ring and sector vary too much through the wall for {len(pieces)} polynomials")
+        finer = Panels([pieces[0].radii[0], *(piece.radii[1] for piece in pieces)], DEGREE)
+        radius = ring.natural_radius(finer.places)
+        ring = _balanced(ring._replace(layers=tuple(pieces), panels=finer, radius=radius), loads)
+    return ring
 
 
 def _halves(layer: Layer) -> list[Layer]:
-    """Of one ratio of radii: what closes varies with the logarithm of the radius."""
+    """Split a layer at the geometric mean of its radii, because R varies with ln r."""
     low, high = layer.radii
     middle = float(np.sqrt(low * high))
     return [layer._replace(radii=(low, middle)), layer._replace(radii=(middle, high))]
 
 
-def _balanced(near: Closing, loads: Loads) -> Closing:
-    """The equilibrium that is near: forces on both faces, and along."""
-    panels, tissues = near.panels, [layer.tissue for layer in near.layers]
+def _balanced(start: Closing, loads: Loads) -> Closing:
+    """Return the neighbouring equilibrium with the loads on both faces and along the axis."""
+    panels, tissues = start.panels, [layer.tissue for layer in start.layers]
     stiffness, edges = _stiffness(tissues), panels.edges
 
     def stretches(values: Array) -> Array:
-        radius = values[..., :-1].reshape(*values.shape[:-1], *near.radius.shape)
-        return near._replace(radius=radius, axial=values[..., -1:, None]).at_panels()
+        radius = values[..., :-1].reshape(*values.shape[:-1], *start.radius.shape)
+        return start._replace(radius=radius, axial=values[..., -1:, None]).at_panels()
 
     def residual(values: Array, stresses: Array) -> Array:
         through = _through(panels, values[..., :-1], stresses, loads.pressure / stiffness)
@@ -185,8 +199,8 @@ def _balanced(near: Closing, loads: Loads) -> Closing:
             along = (force - loads.force / stiffness) / (np.pi * (edges[-1] ** 2 - edges[0] ** 2))
         return np.concatenate([through, along[..., None]], axis=-1)
 
-    found = solved(tissues, [None] * len(tissues), stretches, residual, np.append(near.radius, near.axial))
-    return near._replace(radius=found[:-1].reshape(near.radius.shape), axial=float(found[-1]))
+    solution = solved(tissues, [None] * len(tissues), stretches, residual, np.append(start.radius, start.axial))
+    return start._replace(radius=solution[:-1].reshape(start.radius.shape), axial=float(solution[-1]))
 
 
 def _stiffness(tissues: Sequence[Tissue]) -> float:
@@ -194,7 +208,7 @@ def _stiffness(tissues: Sequence[Tissue]) -> float:
 
 
 def _through(panels: Panels, unknown: Array, stresses: Array, pressure: float) -> Array:
-    """Radial balance in the layers, radial stress on both faces, and what goes from one layer to the next."""
+    """Return the residuals of radial balance, faces, and continuity between panels."""
     hoop, _, radial = np.moveaxis(stresses, -1, 0)
     balance = panels.derivative(radial) + (radial - hoop) / panels.places
     inside = balance[..., 1:-1] * (panels.edges[-1] - panels.edges[0]) / 2
@@ -211,22 +225,24 @@ def solved(
     residual: Callable[[Array, Array], Array],
     values: Array,
 ) -> Array:
-    """Newton, halved where a step leaves what has an energy: values (n,) whose residual is zero."""
-    # `stretches` (..., panels, points, 3) and `residual` (..., n) are of values (..., n), and of stresses over the
-    # largest stiffness, real or complex
+    """Find values (n,) with zero residual by Newton's method with step halving."""
+    # A step is halved if the energy is not finite after it, or the residual is 10 times as large.
+    # `stretches` maps values (..., n) to (..., panels, points, 3). `residual` maps values and
+    # stresses over the largest stiffness, real or complex, to (..., n).
     stiffness = _stiffness(tissues)
 
     def state(trial: Array) -> tuple[Array, Array, Array, Array]:
-        of = stretches(trial)
-        found = [principal_stresses(*layer) for layer in zip(tissues, [*of], dimensions, strict=True)]
-        stresses, tangents = (np.stack(parts) / stiffness for parts in zip(*found, strict=True))
-        return of, stresses, tangents, residual(trial, stresses)
+        stretch = stretches(trial)
+        by_layer = [principal_stresses(*layer) for layer in zip(tissues, [*stretch], dimensions, strict=True)]
+        stresses, tangents = (np.stack(arrays) / stiffness for arrays in zip(*by_layer, strict=True))
+        return stretch, stresses, tangents, residual(trial, stresses)
 
-    of, stresses, tangents, present = state(values)
+    stretch, stresses, tangents, present = state(values)
     for _ in range(ITERATIONS):
-        # a stress depends on its own point's stretches alone; all else is closed formulas: exact by a complex step
+        # A stress depends only on the stretches at its point. The derivatives of the formulas are
+        # exact by a complex step.
         moved = values + 1j * COMPLEX_STEP * np.eye(len(values))
-        strains = np.log(stretches(moved) / of)
+        strains = np.log(stretches(moved) / stretch)
         columns = residual(moved, stresses + (tangents @ strains[..., None])[..., 0]).imag / COMPLEX_STEP
         if not np.isfinite(columns).all() or not np.isfinite(present).all():
             break
@@ -236,29 +252,32 @@ def solved(
             break
         rounding = ROUNDINGS * np.finfo(np.float64).eps * np.abs(values) @ np.abs(columns)
         if (np.abs(present) < np.maximum(CLOSED, rounding)).all():
-            for tissue, of_layer, cells in zip(tissues, [*of], dimensions, strict=True):
-                _check_complex(tissue, of_layer, cells)
-            return values - step  # bending is soft: what is left of the balance may be a millionth of the angle
-        for share in (0.5**power for power in range(12)):
-            of, stresses, tangents, trial = state(values - share * step)
+            for tissue, layer_stretches, cells in zip(tissues, [*stretch], dimensions, strict=True):
+                _check_complex(tissue, layer_stretches, cells)
+            # The bending stiffness is small: the accepted residual may be a millionth of the angle,
+            # so the step is added.
+            return values - step
+        for step_length in (0.5**power for power in range(12)):
+            stretch, stresses, tangents, trial = state(values - step_length * step)
             if np.isfinite(trial).all() and np.linalg.norm(trial) < np.linalg.norm(present) * 10:
                 break
-        values, present = values - share * step, trial
-    raise ArithmeticError(f"no equilibrium of ring and sector; out of balance by {np.abs(present).max():.2g}")
+        values, present = values - step_length * step, trial
+    raise ArithmeticError(f"no equilibrium of the ring: residual {np.abs(present).max():.2g}")
 
 
 def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> tuple[Array, Array]:
-    """Principal Cauchy stresses (..., 3) along stretches (..., 3), axes of the cells, and d sigma_i/d ln lambda_j."""
-    one = np.eye(3).reshape(3, *(1,) * (stretches.ndim - 1), 3)
-    near = stretches * np.exp(TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(one[:1]), one]))
-    ways = np.exp(1j * COMPLEX_STEP * one)
-    slopes = np.imag(_energy(tissue, near * ways[:, None], dimensions)) / COMPLEX_STEP
-    stresses, *others = np.moveaxis(slopes, 0, -1) / np.prod(near, axis=-1)[..., None]
-    return stresses, np.stack([(other - stresses) / TANGENT_DIFFERENCE for other in others], axis=-1)
+    """Return principal Cauchy stresses (..., 3) and d sigma_i/d ln lambda_j at stretches."""
+    # The stretches (..., 3) are along the axes of the cells.
+    units = np.eye(3).reshape(3, *(1,) * (stretches.ndim - 1), 3)
+    perturbed = stretches * np.exp(TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(units[:1]), units]))
+    complex_stretches = np.exp(1j * COMPLEX_STEP * units)
+    slopes = np.imag(_energy(tissue, perturbed * complex_stretches[:, None], dimensions)) / COMPLEX_STEP
+    stresses, *neighbours = np.moveaxis(slopes, 0, -1) / np.prod(perturbed, axis=-1)[..., None]
+    return stresses, np.stack([(neighbour - stresses) / TANGENT_DIFFERENCE for neighbour in neighbours], axis=-1)
 
 
 def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array:
-    """W (...) at stretches (..., 3)."""
+    """Return W (...) at stretches (..., 3) along the axes of the cells."""
     length = np.broadcast_to(
         tissue.end_to_end_length / np.sqrt(3.0) if dimensions is None else dimensions, stretches.shape
     )
@@ -267,26 +286,29 @@ def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array
 
 
 def _check_complex(tissue: Tissue, stretches: Array, dimensions: Array | None) -> None:
-    """Refuse an energy that is another function of complex numbers: as |x| is, for x where that is positive."""
-    way = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])  # in which the volume, however stiff, stays
-    of_complex = np.imag(_energy(tissue, stretches * np.exp(1j * COMPLEX_STEP * way), dimensions)) / COMPLEX_STEP
-    ahead, still, behind = (_energy(tissue, stretches * np.exp(side * way), dimensions) for side in (1, 0, -1))
-    slope, bend = (ahead - behind) / 2, np.abs(ahead + behind - 2 * still) + 1e-14 * np.abs(still)
-    if not (np.abs(of_complex - slope) <= CHECKED * np.abs(slope).max() + bend).all():
-        rule = "its energy must take complex numbers, by whose imaginary part it is derived: np.maximum(x, 0), not |x|"
+    """Reject an energy whose complex-step derivative is wrong, as with |x|."""
+    # The direction preserves the volume, because the volumetric stiffness may be large.
+    direction = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])
+    complex_stretches = stretches * np.exp(1j * COMPLEX_STEP * direction)
+    complex_slope = np.imag(_energy(tissue, complex_stretches, dimensions)) / COMPLEX_STEP
+    ahead, centre, behind = (_energy(tissue, stretches * np.exp(side * direction), dimensions) for side in (1, 0, -1))
+    slope, bend = (ahead - behind) / 2, np.abs(ahead + behind - 2 * centre) + 1e-14 * np.abs(centre)
+    if not (np.abs(complex_slope - slope) <= CHECKED * np.abs(slope).max() + bend).all():
+        rule = "must accept complex numbers for its derivatives: np.maximum(x, 0), not |x|"
         raise SceneError(f"material.matrix, chain or repulsion: {rule}")
 
 
-# ---------------------------------------------------------------- what a tube without loads does when it is cut
-# It is cut along its length, and opens to a sector. The mesh's ring of radii R becomes a sector of radii rho(R), in
-# cylindrical axes
+# ---------------------------------------------------------------- opening angle after a cut
+# A cut along the length opens the unloaded tube to a sector. The mesh's ring of radii R becomes a
+# sector of radii rho(R). In cylindrical axes
 #     F = diag(k rho/R, e, drho/dR),    F_e = F G,
-# of least energy, so that there is no pressure, axial force and bending moment; its opening angle is 360 (1 - k). The
-# cells stay. The energy is summed up as that of the run is: over its points, with its elements through the wall.
+# with minimal energy, so that pressure, axial force and bending moment vanish. The opening angle is
+# 360 (1 - k). The cells do not change. The energy is the sum over the points of the run, with its
+# elements through the wall.
 
 
 class Rings(NamedTuple):
-    """Thin rings of which an unloaded tube is made: arrays of n, or (n, 3) around, along and across the wall."""
+    """Thin rings of an unloaded tube, (n,) or (n, 3) in circumferential, axial, radial order."""
 
     radius: Array
     volume: Array
@@ -295,56 +317,60 @@ class Rings(NamedTuple):
 
 
 def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = None) -> float:
-    """Opening angle of rings: volumes of stress-free tissue, G and squared dimensions of cells; edges of elements."""
-    from scipy.interpolate import BSpline  # which few runs need
+    """Return the opening angle in degrees of rings after a cut; `edges` are radii of elements."""
+    # The volumes are those of the stress-free tissue. `closed` is the sector of the initial state,
+    # a starting value.
+    from scipy.interpolate import BSpline  # imported here, because few runs need it
 
     knots = np.concatenate([edges[:1], np.repeat(edges, 2), edges[-1:]])
     spline = BSpline(knots, np.eye(len(knots) - 3), 2)
-    functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]  # zero at the lumen
-    depth, steepness, inner = rings.radius - edges[0], np.ones_like(rings.radius), edges[0]
+    # The functions are zero at the lumen.
+    functions, slopes = spline(rings.radius)[:, 1:], spline(rings.radius, 1)[:, 1:]
+    inner = edges[0]
+    depth, steepness = rings.radius - edges[0], np.ones_like(rings.radius)
     axial: Array | float = 1.0
     k = 1.0
-    if closed is not None:  # what opens, were the cells as they were
-        inner, axial, k = closed.radius[0, 0], 1 / closed.axial, 1 / closed.circumferential
+    if closed is not None:  # start from the sector of the initial cells
+        inner = closed.radius[0, 0]
+        axial, k = 1 / closed.axial, 1 / closed.circumferential
         depth = closed.natural_radius(rings.radius) - inner
         steepness = closed.panels.at(rings.radius, closed.panels.derivative(closed.radius))
-    shares = rings.volume / rings.volume.sum()
-    thinner = shares @ (1 / (steepness * rings.natural[:, 2]))  # where tissue has grown across
+    fractions = rings.volume / rings.volume.sum()
+    thinner = fractions @ (1 / (steepness * rings.natural[:, 2]))  # growth across the wall
     depth, steepness = thinner * depth, thinner * steepness
 
-    # k rho of the lumen, rho - rho of the lumen, e and k: in these a thin wall that bends far is almost linear, and
-    # k may be zero or less
+    # The unknowns are k rho at the lumen, rho minus rho at the lumen, e and k. In them a thin wall
+    # with large bending is almost linear, and k may be zero or negative.
     def opened(values: Array) -> tuple[Array, Array, Array, Array]:
         across, slope = depth + values[..., 1:-2] @ functions.T, steepness + values[..., 1:-2] @ slopes.T
         around = values[..., :1] + values[..., -1:] * across
         gradient = np.stack(np.broadcast_arrays(around / rings.radius, values[..., -2:-1], slope), axis=-1)
         return across, slope, around, gradient * rings.natural
 
-    def residual(values: Array, stresses: Array) -> Array:  # derivatives by all of them
+    def residual(values: Array, stresses: Array) -> Array:  # derivatives of the energy
         across, slope, around, stretches = opened(values)
-        work = stresses[..., 0, :, :] * (np.prod(stretches, axis=-1) * shares)[..., None]
+        work = stresses[..., 0, :, :] * (np.prod(stretches, axis=-1) * fractions)[..., None]
         hoop, axial, radial = np.moveaxis(work, -1, 0)
         hoop = edges[-1] * hoop / around
         nodes = (values[..., -1:] * hoop) @ functions + edges[-1] * (radial / slope) @ slopes
-        whole = [part.sum(axis=-1, keepdims=True) for part in (hoop, axial, hoop * across / np.ptp(edges))]
-        return np.concatenate([whole[0], nodes, *whole[1:]], axis=-1)
+        integrals = [density.sum(axis=-1, keepdims=True) for density in (hoop, axial, hoop * across / np.ptp(edges))]
+        return np.concatenate([integrals[0], nodes, *integrals[1:]], axis=-1)
 
     values = np.concatenate([[inner * k], np.zeros(functions.shape[1]), [axial, k / thinner]])
     dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
-    found = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
-    return float(360.0 * (1.0 - found[-1]))
+    solution = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
+    return float(360.0 * (1.0 - solution[-1]))
 
 
 def means_through(radius: Array, volumes: Array, values: Array, edges: Array) -> tuple[Array, Array]:
-    """Volumes (m) and means by volume of values (n, ...) in rings: between edges, those of the same share of the whole.
-
-    Facets of elements lie inside of the cylinders, by more than a thin ring: the radius itself leaves some rings empty.
-    """
+    """Return volumes (m,) of rings between edges, and volume means of values (n, ...)."""
+    # Points are assigned to rings by their cumulated fraction of the volume. Facets of elements lie
+    # inside the cylinders by more than a thin ring, so that an assignment by the radius would leave
+    # some rings empty.
     order = np.argsort(radius, kind="stable")
     inside = np.cumsum(volumes[order]) - volumes[order] / 2
     bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
     ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
-    sums: list[Array] = [
-        np.bincount(ring, volumes[order] * part[order]).astype(np.float64) for part in (np.ones_like(radius), *values.T)
-    ]
+    columns = (np.ones_like(radius), *values.T)
+    sums: list[Array] = [np.bincount(ring, volumes[order] * column[order]).astype(np.float64) for column in columns]
     return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]

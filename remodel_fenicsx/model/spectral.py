@@ -1,8 +1,8 @@
-"""Principal values and axes of many symmetric tensors at once, safe at repeated and zero values.
+"""Principal values and axes of arrays of symmetric tensors, robust at repeated and zero values.
 
-LAPACK's eigenvectors are arbitrary inside the eigenspace of a repeated value and arbitrary in sign, so they differ
-between machines and between numbers of ranks. The axes enter the stress (erratum 6 of docs/theory.md), hence every
-choice that the tensor itself does not make is made here by the previous axes.
+LAPACK's eigenvectors are arbitrary in sign and inside the eigenspace of a repeated value, so that
+they differ between machines and between numbers of ranks. The axes enter the stress (erratum 6 of
+docs/theory.md). Therefore the previous axes decide whatever the tensor leaves undetermined.
 """
 
 from itertools import permutations
@@ -19,13 +19,14 @@ ROUNDING = 64 * float(np.finfo(np.float64).eps)
 """Relative size below which a principal value is rounding error (eigh is accurate to a few eps)."""
 
 DECISIVE = 1e-3
-"""Cosine below which a previous axis says nothing about a direction. Symmetric problems put this cosine at exactly
-zero, up to rounding; any threshold far above rounding gives the same choice on every machine."""
+"""Cosine below which a previous axis does not determine a direction. In symmetric problems this
+cosine is exactly zero up to rounding; any threshold far above rounding gives the same choice on
+every machine."""
 
 
 AGREEMENT = 1e-8
-"""Difference of two principal values, over the largest, up to which they are equal: about the root of eps. Their axes
-are then rounding to eps / AGREEMENT."""
+"""Relative difference up to which two principal values count as equal, about the square root of
+eps. Their axes have rounding errors of eps / AGREEMENT."""
 
 
 def principal(
@@ -33,39 +34,42 @@ def principal(
 ) -> tuple[Array, Array]:
     """Return the principal values, descending, and the principal axes of symmetric tensors.
 
-    Where neighbouring values agree (also in a chain: first with second, second with third), the tensor does not
-    determine the axes of these ranks. They are then the previous axes of the same ranks, projected onto the common
-    eigenspace and orthonormalised in the order of rank. A previous axis that is orthogonal to the eigenspace within
-    ``DECISIVE`` is passed over for the next previous axis (cyclic order of ranks), so that the outcome never
-    depends on LAPACK. The zero tensor keeps all three previous axes.
+    If neighbouring values agree (also first with second and second with third), the tensor does not
+    determine the axes of these ranks. They are then the previous axes of the same ranks, projected
+    onto the common eigenspace and orthonormalised in the order of rank. A previous axis that is
+    orthogonal to the eigenspace within ``DECISIVE`` is replaced by the next previous axis
+    (cyclic order of ranks), so that the result never depends on LAPACK. The zero tensor keeps all
+    three previous axes.
 
-    Signs: each axis has a positive cosine with the previous axis of its rank; where that cosine is not decisive
-    (the axes have swapped ranks), with the first of the next two that is. The triad may be left-handed.
+    Each axis has a positive cosine with the previous axis of its rank. If that cosine is not
+    decisive (the axes have swapped ranks), the first decisive cosine with the next two previous
+    axes is positive. The triad may be left-handed.
 
     Parameters
     ----------
     tensors : (n, 3, 3)
-        Symmetric tensors, any unit. Only the symmetric part is seen.
+        Symmetric tensors, any unit. Only the symmetric part is used.
     previous : (n, 3, 3)
-        Rows are the previous axes in the same (spatial or material) frame as the tensors. They need neither be
-        normalised nor orthogonal: F n_I will do.
+        Rows are the previous axes in the same (spatial or material) frame as the tensors. They need
+        not be normalised or orthogonal; F n_I is allowed.
     tolerance : float
-        Values whose difference is at most `tolerance` times the largest absolute value are taken as equal.
+        Values whose difference is at most `tolerance` times the largest absolute value count as
+        equal.
     threshold : float or (n,)
-        Differences up to this size, in the unit of the tensors, are taken as zero too. With the default 0 the axes do
-        not depend on the unit.
+        Differences up to this size, in the unit of the tensors, count as zero too. With the default
+        0 the axes do not depend on the unit.
 
     Returns
     -------
     values : (n, 3)
-        Descending.
+        Principal values, descending.
     axes : (n, 3, 3)
-        Rows are orthonormal, row I belongs to value I.
+        Orthonormal rows; row I belongs to value I.
 
     Raises
     ------
     FloatingPointError
-        If a tensor or a previous axis holds NaN or infinity; names the first one.
+        If a tensor or a previous axis contains NaN or infinity; the message names the first.
 
     Examples
     --------
@@ -86,34 +90,35 @@ def principal(
 def continued(
     tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = AGREEMENT, threshold: npt.ArrayLike = 0.0
 ) -> tuple[Array, Array]:
-    """Return the principal values and axes of symmetric tensors in the order of the previous axes."""
-    # Each principal axis takes the place of the previous axis that it continues: of the six ways to pair them, the one
-    # with the largest sum of squared cosines. So values that cross do not exchange their places. Where values agree,
-    # their common eigenspace counts as a whole, and the previous axes that it is paired with are kept in it as by
-    # `principal`. Of ways whose sums agree within ``DECISIVE`` the first in lexicographic order is taken, so that
-    # rounding does not choose.
-    # Parameters and errors are those of `principal`.
+    """Return principal values and axes of symmetric tensors in the order of previous axes."""
+    # Each principal axis takes the position of the previous axis that it continues. Of the six
+    # pairings the one with the largest sum of squared cosines is taken, so that values that cross
+    # do not exchange their positions. If values agree, their common eigenspace counts as a whole,
+    # and the paired previous axes are kept in it as by `principal`. If the sums of several pairings
+    # agree within ``DECISIVE``, the first in lexicographic order is taken, so that rounding does
+    # not decide. Parameters and errors are those of `principal`.
     values, axes, reference = _decomposed(tensors, previous)
     upper, lower = _agreeing(values, tolerance, threshold)
-    place = _places(axes, reference, upper, lower)
-    axes = _settled(axes, np.take_along_axis(reference, place[:, :, None], axis=1), upper, lower)
-    rank = np.argsort(place, axis=1)
-    return np.take_along_axis(values, rank, axis=1), np.take_along_axis(axes, rank[:, :, None], axis=1)
+    positions = _places(axes, reference, upper, lower)
+    axes = _settled(axes, np.take_along_axis(reference, positions[:, :, None], axis=1), upper, lower)
+    order = np.argsort(positions, axis=1)
+    return np.take_along_axis(values, order, axis=1), np.take_along_axis(axes, order[:, :, None], axis=1)
 
 
 Pairing = Formula[tuple[Array, Array]]
 
 PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": continued}
-"""Which dimension of a cell belongs to which principal value: by rank, or by the axis that it continues."""
+"""Pairings of cell dimensions with principal values: by rank, or by continued axis."""
 
 
 def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return the direction e = lambda^+ / |lambda^+| of the positive principal values (eqs. 9 to 11)."""
+    """Return e = lambda^+ / |lambda^+| (eqs. 9 to 11), and the points with a positive value."""
     values = np.asarray(values, dtype=np.float64)
     _require_finite(values, "set of principal values")
     largest = _largest(values)
     rounding = np.maximum(ROUNDING * largest, threshold)
-    # divided by the largest value first: the squares of very small or large values would underflow or overflow
+    # Scaled by the largest value, because squares of very small or large values would underflow or
+    # overflow.
     positive = np.where(values > rounding[:, None], values, 0.0) / np.where(largest > 0.0, largest, 1.0)[:, None]
     norm = _length(positive)
     active = norm > 0.0
@@ -121,9 +126,10 @@ def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) ->
 
 
 def without_noise(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array:
-    """Return the symmetric tensors with the given axes as principal axes."""
-    # Where two principal values are close, an error of the tensor turns its axes by far more than its own size. What
-    # decides is therefore what the tensor has across the given axes: up to `noise` it is taken for zero.
+    """Return the tensors without shear components in these axes if none exceeds `noise`."""
+    # If two principal values are close, an error of the tensor rotates its axes by far more than
+    # the relative error. The shear components in the old axes are therefore set to zero up to
+    # `noise`.
     first = _normalised(axes[:, 0])
     second = _normalised(axes[:, 1] - np.einsum("na,na->n", axes[:, 1], first)[:, None] * first)
     frame = np.stack([first, second, np.cross(first, second)], axis=1)
@@ -135,7 +141,7 @@ def without_noise(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array:
 
 
 def _decomposed(tensors: npt.ArrayLike, previous: npt.ArrayLike) -> tuple[Array, Array, Array]:
-    """Return descending values, LAPACK's axes for them as rows, and the previous axes normalised."""
+    """Return descending values, LAPACK's axes as rows, and the normalised previous axes."""
     tensors = np.asarray(tensors, dtype=np.float64)
     previous = np.asarray(previous, dtype=np.float64)
     _require_finite(tensors, "tensor")
@@ -148,50 +154,51 @@ def _decomposed(tensors: npt.ArrayLike, previous: npt.ArrayLike) -> tuple[Array,
 
 
 def _agreeing(values: Array, tolerance: float, threshold: npt.ArrayLike) -> tuple[Flags, Flags]:
-    """Return where the first two and where the last two values agree."""
+    """Return the points whose first two and whose last two values agree."""
     equal = np.maximum(tolerance * _largest(values), threshold)
     return values[:, 0] - values[:, 1] <= equal, values[:, 1] - values[:, 2] <= equal
 
 
 def _settled(axes: Array, reference: Array, upper: Flags, lower: Flags) -> Array:
-    """Return the axes with what values that agree leave open, and with all signs, as `reference` chooses them."""
+    """Return the axes with signs and undetermined directions taken from `reference`."""
     for cluster, normal_rank, first, second in (upper & ~lower, 2, 0, 1), (lower & ~upper, 0, 1, 2):
-        at = np.flatnonzero(cluster)
-        if at.size:
-            normal = axes[at, normal_rank]
-            axes[at, first] = _project(normal, _candidates(reference[at], first))
-            axes[at, second] = np.cross(normal, axes[at, first])
-    at = np.flatnonzero(upper & lower)
-    if at.size:
-        axes[at, 0] = _project(np.zeros((at.size, 3)), _candidates(reference[at], 0))
-        axes[at, 1] = _project(axes[at, 0], _candidates(reference[at], 1))
-        axes[at, 2] = np.cross(axes[at, 0], axes[at, 1])
+        points = np.flatnonzero(cluster)
+        if points.size:
+            normal = axes[points, normal_rank]
+            axes[points, first] = _project(normal, _candidates(reference[points], first))
+            axes[points, second] = np.cross(normal, axes[points, first])
+    points = np.flatnonzero(upper & lower)
+    if points.size:
+        axes[points, 0] = _project(np.zeros((points.size, 3)), _candidates(reference[points], 0))
+        axes[points, 1] = _project(axes[points, 0], _candidates(reference[points], 1))
+        axes[points, 2] = np.cross(axes[points, 0], axes[points, 1])
     return with_signs_of(reference, axes)
 
 
 def _places(axes: Array, reference: Array, upper: Flags, lower: Flags) -> npt.NDArray[np.intp]:
     """Return for each rank the number of the previous axis that it continues, (n, 3)."""
     overlap = np.einsum("nia,nja->nij", axes, reference) ** 2
-    # of an eigenspace only the sum over any of its bases has a meaning
+    # For an eigenspace only the sum over a basis has a meaning.
     for cluster, ranks in (upper & ~lower, [0, 1]), (lower & ~upper, [1, 2]), (upper & lower, [0, 1, 2]):
-        at = np.flatnonzero(cluster)
-        overlap[at[:, None], ranks] = overlap[at][:, ranks].mean(axis=1, keepdims=True)
-    ways = np.array(list(permutations(range(3))))
-    sums = sum(overlap[:, rank, ways[:, rank]] for rank in range(3))
-    return ways[np.argmax(sums >= sums.max(axis=1, keepdims=True) - DECISIVE, axis=1)]
+        points = np.flatnonzero(cluster)
+        overlap[points[:, None], ranks] = overlap[points][:, ranks].mean(axis=1, keepdims=True)
+    pairings = np.array(list(permutations(range(3))))
+    sums = sum(overlap[:, rank, pairings[:, rank]] for rank in range(3))
+    return pairings[np.argmax(sums >= sums.max(axis=1, keepdims=True) - DECISIVE, axis=1)]
 
 
 def _require_finite(values: Array, noun: str) -> None:
     if not np.isfinite(values).all():
-        bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-        first = int(np.argmax(bad))
+        invalid = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        first = int(np.argmax(invalid))
         raise FloatingPointError(
-            f"{noun} {first} of {len(values)} is not finite ({int(bad.sum())} in all): " f"{values[first].tolist()}"
+            f"{noun} {first} of {len(values)} is not finite ({int(invalid.sum())} in all): " f"{values[first].tolist()}"
         )
 
 
 def _largest(vectors: Array) -> Array:
-    """Return the largest absolute component of vectors (..., 3); by columns, ten times faster than np.max."""
+    """Return the largest absolute component of vectors (..., 3)."""
+    # By columns it is ten times faster than np.max.
     size = np.abs(vectors)
     return np.maximum(np.maximum(size[..., 0], size[..., 1]), size[..., 2])
 
@@ -201,22 +208,24 @@ def _length(vectors: Array) -> Array:
 
 
 def _normalised(vectors: Array) -> Array:
-    """Return the vectors (..., 3) with length one; zero vectors stay zero."""
+    """Return unit vectors (..., 3); zero vectors stay zero."""
     largest = _largest(vectors)
-    vectors = vectors / np.where(largest > 0.0, largest, 1.0)[..., None]  # squares must not overflow
+    # Scaled, because squares must not overflow.
+    vectors = vectors / np.where(largest > 0.0, largest, 1.0)[..., None]
     length = _length(vectors)
     return vectors / np.where(length > 0.0, length, 1.0)[..., None]
 
 
 def _candidates(reference: Array, rank: int) -> list[Array]:
-    """Return the directions (n, 3) that may stand for a rank, best first; the coordinate axes end the list."""
+    """Return candidate directions (n, 3) for a rank, best first; the coordinate axes come last."""
     coordinate_axes = [np.broadcast_to(row, (len(reference), 3)) for row in np.eye(3)]
     return [reference[:, (rank + shift) % 3] for shift in range(3)] + coordinate_axes
 
 
 def _project(normal: Array, candidates: list[Array]) -> Array:
-    """Return the first candidate that is not along the normal, projected onto the plane across it, normalised."""
-    # normal: (n, 3) unit vectors, or zero vectors for the whole space instead of a plane.
+    """Project the first candidate that is not along the normal onto the normal plane; normalise."""
+    # The normals are unit vectors (n, 3); zero vectors stand for the whole space instead of a
+    # plane.
     chosen = np.zeros_like(normal)
     open_points = np.ones(len(normal), dtype=bool)
     for candidate in candidates:
@@ -227,12 +236,13 @@ def _project(normal: Array, candidates: list[Array]) -> Array:
         if not open_points.any():
             break
     chosen = _normalised(chosen)
-    # once more: a candidate almost along the normal leaves a projection that is orthogonal to 1e-13 only
+    # Repeated, because the projection of a candidate almost along the normal is orthogonal only to
+    # 1e-13.
     return _normalised(chosen - np.einsum("na,na->n", chosen, normal)[:, None] * normal)
 
 
 def with_signs_of(reference: Array, axes: Array) -> Array:
-    """Return the axes (n, 3, 3) with the signs that `principal` promises; reference (n, 3, 3): unit rows."""
+    """Return axes (n, 3, 3) with the signs of `principal`; rows of `reference` are unit vectors."""
     decisive = np.einsum("nia,nia->ni", axes, reference)
     for shift in (1, 2):
         point, rank = np.nonzero(np.abs(decisive) <= DECISIVE)

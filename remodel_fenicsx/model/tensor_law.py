@@ -1,9 +1,10 @@
-"""The consistent evolution law: one symmetric tensor A per point, without ranks and without axes (docs/theory.md, Law).
+"""Consistent evolution law of one symmetric tensor A per point, without ranks and axes.
 
     dA/dt = kappa s (r0^2 E - A),    E = N / tr N,  N = (D+)^n,  n = 2
 
-D is the driving tensor in material space, D+ its positive part, s a switch that is one under tension and vanishes with
-it. For the driver `finger` D is C. E has trace one, so tr A stays r0^2. Pure functions on arrays (n, 3, 3).
+D is the driving tensor in material space, D+ its positive part, s a switch that is one under
+tension and zero without tension. For the driver `finger` D is C. E has trace one, so tr A stays
+r0^2. Pure functions on arrays (n, 3, 3).
 """
 
 from __future__ import annotations
@@ -16,40 +17,41 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 COMPRESSION = 0.01
-"""Share of the squared compression that counts against the tension: the switch is one half where n+ = COMPRESSION n-,
-a tension of a tenth of the compression."""
+"""Weight of the squared compression against the squared tension. The switch is one half if
+n+ = COMPRESSION n-, a tension of a tenth of the compression."""
 
 ABOVE_ROUNDING = 7000.0
-"""Where the switch sets in, over the rounding of a principal value (1e-10 of the stiffness): wide enough that Newton's
-method sees a smooth function."""
+"""Threshold of the switch over the rounding of a principal value (1e-10 of the stiffness), wide
+enough that the switch is smooth for Newton's method."""
 
 
 def floor_above(noise: Array | float, rounding: Array | float) -> Array | float:
-    """Tension at which the switch is one half, where there is no compression."""
-    # What the solver's tolerance leaves out of balance counts as it is: multiplied like the rounding, it would be
-    # stress.
+    """Return the tension at which the switch is one half without compression."""
+    # The noise from the solver's residual is not multiplied like the rounding: the product would be
+    # as large as a stress.
     return ABOVE_ROUNDING * rounding + noise
 
 
 class Target(NamedTuple):
-    """What A tends to, E, and how much of kappa acts, s."""
+    """Target E of A, (n, 3, 3), and switch s, the active fraction of kappa, (n,)."""
 
     direction: Array
     switch: Array
 
     def towards(self, other: Target, weight: Array | float) -> Target:
-        """sE + weight (s'E' - sE), of another target s'E'; weights below 0 or above 1 extrapolate."""
-        # What acts on A is kappa (r0^2 sE - sA): it is sE that changes linearly, and s is its trace. So a target that
-        # does not count takes no part, and E has trace one. An s below 0 is 0, one above 1 is 1.
-        ends = (self.switch[:, None, None] * self.direction, other.switch[:, None, None] * other.direction)
-        changed = ends[0] + np.reshape(weight, (-1, 1, 1)) * (ends[1] - ends[0])
+        """Return the target with sE + weight (s'E' - sE); weights outside [0, 1] extrapolate."""
+        # The rate of A is kappa (r0^2 sE - sA). Therefore sE is interpolated; its trace is s, so
+        # that E keeps trace one and a target with s = 0 has no influence. The result s is clipped
+        # to [0, 1].
+        scaled = (self.switch[:, None, None] * self.direction, other.switch[:, None, None] * other.direction)
+        changed = scaled[0] + np.reshape(weight, (-1, 1, 1)) * (scaled[1] - scaled[0])
         switch = np.einsum("nii->n", changed)
-        some = switch > 0.0
-        direction = changed / np.where(some, switch, 1.0)[:, None, None]
-        return Target(direction, np.where(some, np.minimum(switch, 1.0), 0.0))
+        active = switch > 0.0
+        direction = changed / np.where(active, switch, 1.0)[:, None, None]
+        return Target(direction, np.where(active, np.minimum(switch, 1.0), 0.0))
 
     def where(self, chosen: NDArray[np.bool_], other: Target) -> Target:
-        """Itself, and at the chosen points another target."""
+        """Return the target, replaced by `other` at the chosen points."""
         return Target(
             np.where(chosen[:, None, None], other.direction, self.direction),
             np.where(chosen, other.switch, self.switch),
@@ -57,7 +59,7 @@ class Target(NamedTuple):
 
 
 def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target:
-    """E and s of driving tensors in material space."""
+    """Return E and s of driving tensors in material space, (n, 3, 3)."""
     values, vectors = np.linalg.eigh(tensor)
     largest = np.abs(values).max(axis=1)
     unit = np.where(largest > 0, largest, 1.0)
@@ -75,15 +77,17 @@ def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target
 
 
 def awake(tensor: Array, least_tension: float) -> Array:
-    """Share of kappa that acts: max(0, 1 - s0/s) with the largest principal value s; (n,)."""
-    # A lazy zone, as in models of the adaptation of bone; Hypothesis I of the paper says "within a range".
+    """Return the active fraction of kappa, max(0, 1 - s0/s) for the largest tension s; (n,)."""
+    # This is a lazy zone, as in models of bone adaptation; Hypothesis I of the paper reads "within
+    # a range".
     return 1 - least_tension / np.maximum(np.linalg.eigvalsh(tensor)[:, -1], least_tension)
 
 
 def weight_of_the_end(kappa_dt: Array | float) -> Array:
-    """Weight of the target at the end of a step in the one that acts, if targets change linearly over it; (n,)."""
-    # A forgets: A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z, z = kappa h:
-    # one half for short steps, one for long ones.
+    """Return the end target's weight in the effective target of a step with linear change; (n,)."""
+    # A(h) = (1 - w) A(0) + w (E_0 + weight (E_1 - E_0)), w = 1 - exp(-z), weight = 1/w - 1/z,
+    # z = kappa h. Past targets decay: the weight is one half for small steps and one for large
+    # steps.
     z = np.asarray(kappa_dt, dtype=np.float64)
     short = z < 1e-3
     long = np.where(short, 1.0, z)
@@ -91,7 +95,7 @@ def weight_of_the_end(kappa_dt: Array | float) -> Array:
 
 
 def follow(structure: Array, towards: Target, end_to_end_length: Array | float, kappa_dt: Array | float) -> Array:
-    """A after a time in which the target does not change: exact."""
+    """Return A after a time with a constant target; exact."""
     squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
     weight = -np.expm1(-kappa_dt * towards.switch)[:, None, None]
     change: Array = weight * (squared * towards.direction - structure)

@@ -162,7 +162,7 @@ def test_cells_without_tension_stay_where_the_way_has_left_them(caplog: pytest.L
     caplog.set_level("INFO")
     (_, cells, _), (_, others, simulation) = tube_in_time(3.0, 0.1, HALF_WAY_BACK)
     np.testing.assert_allclose(cells, others, atol=0.03)
-    (said,) = [record.getMessage() for record in caplog.records if "no tension at rest" in record.getMessage()]
+    (said,) = [record.getMessage() for record in caplog.records if "no tension in equilibrium" in record.getMessage()]
     values = np.linalg.eigvalsh(simulation.stepper.remodeling.driving_tensor()[1])
     squares = np.sign(values) * values**2
     tension, compression = np.maximum(squares, 0).sum(axis=1), -np.minimum(squares, 0).sum(axis=1)
@@ -182,7 +182,7 @@ def test_an_unloaded_body_keeps_its_cells_and_says_so(caplog: pytest.LogCaptureF
         simulation = Simulation(scene_from_dict(values("point") | tables), SELF)
         found.append(list(simulation.steps())[-1].row["mean_fibre_angle"])
     assert found[0] == pytest.approx(found[1], abs=0.5) and 20 < found[1] < 45
-    assert "100 % of the body has no tension at rest" in caplog.text
+    assert "100 % of the body carries no tension in equilibrium" in caplog.text
 
 
 def test_the_artery_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
