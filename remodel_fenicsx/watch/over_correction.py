@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 ORDER = 3  # of the difference over passes that takes a smooth course away and keeps what changes its sign each time
 GAIN = 2.0**ORDER  # by which it magnifies that
-# factor of a pass, and passes in a row, from which on a swing is told that will be over `TOLERANCE` after one more:
+# factor of a pass, and passes in a row, from which on a swing is told that will be over `TOLD_SIZE` after one more:
 # the beginning of an instability, of the cells over r0^2. All bodies that left their solution had it, no other one
 GROWING = -1.2, 2
 # its end, of the displacement over itself: random cells swing for ever at single points, each its own way, which the
 # body hardly feels
 SUSTAINED = -0.9, 3
-TOLERANCE = 0.02
+TOLD_SIZE = 0.02
 RESTED_SHARE = 0.5  # of the body: after a pass that has left so much of it as it was, a jump is no swing
 UNEVEN = 1.5  # ratio of two steps up to which they are about alike; of uneven ones a jump looks like a swing
 LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
@@ -104,7 +104,7 @@ class OverCorrection(WarnsOnce):
         for (name, swing), (factor, passes) in zip(self.swings.items(), (GROWING, SUSTAINED), strict=True):
             self._numbers[name] = self._numbers[name] + 1 if tells and swing.factor < factor else 0
             after_one_more = swing.size * abs(swing.factor)
-            found |= self._numbers[name] >= passes and after_one_more >= TOLERANCE
+            found |= self._numbers[name] >= passes and after_one_more >= TOLD_SIZE
         if found and not self.said:
             most = quadrature.shown_place_of_largest(np.linalg.norm(_difference(times, cells), axis=-1))
             self.find(
