@@ -1,1 +1,2 @@
-"""Strict tables with errors of one line, and TOML in and out; knows no key of any scene."""
+"""Strict tables with one-line errors, and TOML input and output, independent of any scene's
+keys."""
