@@ -150,7 +150,7 @@ def test_what_is_no_list_of_a_mesh_and_surfaces_is_refused(tmp_path: Path) -> No
         ({"file": [files["volume"], files["msh"]]}, "geometry.file = .*or a list of it and paths of its su"),
         (
             {"file": [files["volume"], files["inner"], str(twice)]},
-            "geometry.file = .*: .*lumen.vtp: there is a face .lumen. already",
+            "geometry.file = .*: .*lumen.vtp: face .lumen. already exists",
         ),
         ({"file": files["msh"], "faces": {"inner": {"file": "lumen.txt"}}}, "geometry.f.*name or a number in the fi"),
         ({"file": files["volume"]}, "geometry.file = 'volume.vtu': has no array 'gmsh:physical' or"),
