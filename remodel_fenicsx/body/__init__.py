@@ -1,5 +1,4 @@
-"""Bodies: meshed domains with supports and loads, one file for each shape; `SHAPES` names the
-shapes."""
+"""Bodies: meshed domains with supports and loads, one file a shape; `SHAPES` names them."""
 
 from __future__ import annotations
 

@@ -143,8 +143,7 @@ def _normal_to_ends(function: Function, starts: Facets, ends: Facets) -> Dirichl
 
 # ---------------------------------------------------------------- facets
 def outward_areas(mesh: Mesh, facets: Facets) -> Array:
-    """Return area times outward normal of facets by their corners, (n, 3); zero if another rank
-    owns it."""
+    """Return area times outward normal of facets, (n, 3); zero if another rank owns the facet."""
     cells, number = cells_of(mesh, facets)
     of_facets, nodes = np.array(basix.topology(mesh.basix_cell())[2]), geometry_dofmap(mesh)[cells]
     if of_facets.shape[1] == 4:
@@ -183,7 +182,7 @@ class UndefinedAxes(SceneError):
 def found_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
     """Compute the local axes of a mesh with the faces `ROLES`. Collective."""
     if missing := [face for face in ROLES if face not in domain.faces]:
-        raise UndefinedAxes("geometry.faces: the local axes of a wall need a face " f"{', '.join(map(repr, missing))}")
+        raise UndefinedAxes(f"geometry.faces: the local axes need a face {', '.join(map(repr, missing))}")
     try:
         radial, axial, *lengths = _fields(domain, quadrature)
     except SolveStopped as stopped:

@@ -1,5 +1,4 @@
-"""Blocks: the unit cube, the paper's first specimen (Fig. 5), and the planar sheet of a biaxial
-test."""
+"""Blocks: the cube, the paper's first specimen (Fig. 5), and the sheet of a biaxial test."""
 
 from __future__ import annotations
 

@@ -258,7 +258,7 @@ def build_domain(
     region[cell_tags.indices] = cell_tags.values
     drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups[0], shape, dimensions, groups[1]
     domain = Domain(*drawn, region)
-    return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # ghosts too
+    return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # with ghosts
 
 
 # ---------------------------------------------------------------- facets
@@ -272,13 +272,12 @@ def cells_of(mesh: Mesh, facets: npt.NDArray[np.int32]) -> tuple[Integers, Integ
     to_cells = topology.connectivity(dimension - 1, dimension)
     cells = to_cells.array[to_cells.offsets[facets]].astype(np.int64)
     of_cells = topology.connectivity(dimension, dimension - 1)
-    number = of_cells.offsets[1] if len(cells) else 1  # facets of an element
+    number = of_cells.offsets[1] if len(cells) else 1  # number of an element's facets
     return cells, np.argmax(of_cells.array.reshape(-1, number)[cells] == facets[:, None], axis=1)
 
 
 def dof_of_node(mesh: Mesh, space: FunctionSpace) -> Integers:
-    """Return the number of the (blocked) degree of freedom at each local geometry node,
-    (nodes,)."""
+    """Return the (blocked) degree of freedom at each local geometry node, (nodes,)."""
     # The space and the geometry have the same degree: node k of an element is its dof k.
     found = np.zeros(len(mesh.geometry.x), dtype=np.int64)
     found[compat.geometry_dofmap(mesh).reshape(-1)] = space.dofmap.list.reshape(-1)
@@ -296,8 +295,7 @@ def lattice_domain(
     points: Array, counts: Sequence[int], degree: int, faces: Mapping[str, Marker], shape: str,
     dimensions: dict[str, float], comm: MPI.Intracomm | None = None,
 ) -> Domain:  # fmt: skip
-    """Mesh a lattice of nodes, rows of the first direction, by lines or quadrilaterals.
-    Collective."""
+    """Mesh nodes in rows by lines or quadrilaterals. Collective."""
     comm = comm or MPI.COMM_WORLD
     first, *second = (degree * np.arange(count)[:, None] + np.arange(degree + 1) for count in counts)
     kind, elements = "interval", first[:, [0, degree, *range(1, degree)]]

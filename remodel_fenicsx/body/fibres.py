@@ -65,9 +65,7 @@ class FibreFile:
             if self.places is None or (np.abs(self.places - centres) < SAME_PLACE * sizes[:, None]).all():
                 return np.arange(count), None
         if self.places is None:
-            raise UnreadableFile(
-                f"has {count} rows without positions (x, y, z); " f"the mesh has {len(centres)} elements"
-            )
+            raise UnreadableFile(f"has {count} rows without positions x, y, z; the mesh has {len(centres)} elements")
         rows = np.zeros(len(centres), dtype=np.int64)
         far, rows[chosen] = cKDTree(self.places).query(centres[chosen])
         if (far > sizes[chosen]).any():

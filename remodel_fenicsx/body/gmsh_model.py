@@ -39,12 +39,12 @@ def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
     """Return the name of a length that prevents meshing, and the rule that it breaks, or None."""
     for name, length in lengths.items():
         if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:
-            return name, (f"a length of {length:g}; must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}")
+            return name, f"{length:g} long; must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
     smallest, largest = min(lengths, key=lambda k: lengths[k]), max(lengths, key=lambda k: lengths[k])
     if lengths[largest] <= LARGEST_LENGTH_RATIO * lengths[smallest]:
         return None
     return smallest, (
-        f"a length of {lengths[smallest]:g} is too small with one of {lengths[largest]:g}; "
+        f"{lengths[smallest]:g} long, too small for a length of {lengths[largest]:g}; "
         f"their ratio must be at most {LARGEST_LENGTH_RATIO:g}"
     )
 
@@ -72,8 +72,7 @@ def gmsh_model(name: str) -> Iterator[Any]:
 
 
 def named_groups() -> tuple[dict[str, int], dict[str, int]]:
-    """Return the numbers of the current model's faces and regions by name; regions must not
-    overlap."""
+    """Return the numbers of the model's faces and disjoint regions by name."""
     # dolfinx checks these conditions only on rank 0. A failure there would leave the other ranks
     # waiting.
     faces, regions, kinds = _groups(2), _groups(3), gmsh.model.mesh.getElements(3)[0]
@@ -98,10 +97,9 @@ def _groups(dimension: int) -> dict[str, int]:
 
 # ---------------------------------------------------------------- components of shapes
 def circle(radius: float, number: int, start: int = 0) -> Array:
-    """Return the corners of a regular polygon around the origin, (number, 2), from corner `start`
-    on.
+    """Return the corners of a regular polygon around the origin, (number, 2).
 
-    Corner 0 is on the x axis.
+    Corner `start` is the first one; corner 0 is on the x axis.
     """
     angle = 2.0 * np.pi * (start + np.arange(number)) / number
     corners = np.column_stack((np.cos(angle), np.sin(angle)))
@@ -144,8 +142,7 @@ def polygon(corners: Sequence[Point], is_closed: bool = True) -> list[int]:
 
 
 def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], element: str) -> int:
-    """Add a structured plane surface between four sides, a closed loop of chains, and four
-    corners."""
+    """Add a structured plane surface between four sides (chains of curves) and four corners."""
     geo = gmsh.model.geo
     surface = geo.addPlaneSurface([geo.addCurveLoop([curve for side in edges for curve in side])])
     geo.mesh.setTransfiniteSurface(surface, cornerTags=[corner.tag for corner in corners])

@@ -1,5 +1,4 @@
-"""Supports and loads of a body: boundary conditions, dead traction, follower pressure,
-elongation."""
+"""Supports and loads: boundary conditions, dead traction, follower pressure, elongation."""
 
 from __future__ import annotations
 
@@ -108,7 +107,7 @@ class Loading:
             self._prescribe_face(face, component, self.constant(0.0))
         elif face in self.domain.faces and component != 2:
             raise SceneError(
-                f"model.kinematics = {self.kinematics.name!r}: " f"{face} is constrained laterally, so the body bulges"
+                f"model.kinematics = {self.kinematics.name!r}: {face} " "is constrained laterally, so the body bulges"
             )
         elif self._begins.setdefault(component, face) != face:
             self._prescribe_strain(component, self.constant(0.0))
@@ -238,8 +237,7 @@ class Loading:
         self.add_potential(potential)
 
     def add_axial_force(self, name: str) -> None:
-        """Add a force on the ends along z, if the kinematics has the length as an unknown
-        (`FreeLength`)."""
+        """Add a force on the ends along z if the length is an unknown (`FreeLength`)."""
         change = getattr(self.kinematics, "change_of_length", None)
         if change is None:
             return
@@ -361,15 +359,13 @@ class Loading:
         return constant
 
     def surface_measure(self, face: str) -> ufl.Measure:
-        """Return the measure over a named face of the mesh; times `weight` it is over the body's
-        face."""
+        """Return the measure over a face of the mesh; `weight` makes it the body's."""
         measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)
         degree = field_degree(self.space)
         return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
 
     def measure_alone(self, face: str) -> ufl.Measure:
-        """Return `surface_measure` for forms of one face, whose kernels are shared between
-        faces."""
+        """Return `surface_measure` for forms of one face, which share their kernels."""
         mesh, facets = self.domain.mesh, self.domain.facets(face)
         ones = np.ones(len(facets), dtype=np.int32)
         tags = dolfinx.mesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
@@ -377,8 +373,7 @@ class Loading:
         return measure(1, metadata={"quadrature_degree": 2 * field_degree(self.space)})
 
     def external_residual(self, test: ufl.Argument) -> ufl.Form | None:
-        """Return minus the virtual work of the external forces, a UFL form, or None without
-        loads."""
+        """Return minus the external virtual work, a UFL form, or None without loads."""
         virtual = self.kinematics.displacement(test)
         terms = [term(self.unknown, virtual) for term in self._terms]
         potentials = self.residual_of_potentials(test)

@@ -168,8 +168,7 @@ def polygons(points: Array, simplices: Integers) -> Any:
 
 
 class GrownWall(NamedTuple):
-    """Tetrahedra of degree 2 with the numbers of their layers, and each face's triangles of degree
-    2."""
+    """Tetrahedra of degree 2 with layer numbers, and the triangles of degree 2 of each face."""
 
     points: Array
     tetrahedra: Integers
@@ -293,9 +292,9 @@ def write_wall(
         raise SceneError(f"--through: must be an integer from 1 to {MOST_THROUGH}")
     shares, read = _thicknesses(layers), read_surface(surface)
     area = np.linalg.norm(area_vectors(read.points[read.triangles]), axis=1).sum()
-    number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # of equilateral triangles
+    number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # for equilateral triangles
     if number > LARGEST_MESH:
-        raise SceneError(f"--size {size:g}: makes about {number:.2g} tetrahedra; " f"must be at most {LARGEST_MESH:g}")
+        raise SceneError(f"--size {size:g}: about {number:.2g} tetrahedra; must be at most {LARGEST_MESH:g}")
     depth, radius = _thickness(thickness, shares, read), 2 * _signed_volume(read.points, read.triangles) / area
     _check_units(radius, size, depth)
     if len(read.triangles) > LARGE_SURFACE:
@@ -357,9 +356,7 @@ def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) 
     """Return the thickness at the points, (n,): a number, an array, or the layers' sum."""
     whole = sum(layers.values())
     if said is None and not layers:
-        raise SceneError(
-            "--thickness: missing; must be a number in the surface's unit or the name of an array; " "or set --layers"
-        )
+        raise SceneError("--thickness: missing; must be a number or an array of the surface; or set --layers")
     value = _positive(said or "")
     if said is None or value is not None:
         number = value or whole

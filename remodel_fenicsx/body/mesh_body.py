@@ -197,8 +197,7 @@ class FileBody(WithRegions, FromFile):
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
 
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """Return the file to store with the scene under its own name, and the key of its
-        SHA-256."""
+        """Return the file under its own name, to store with the scene, and its SHA-256."""
         file = self._read()
         kept = {self._name: file.data, **file.surfaces}
         names = [*kept] if file.surfaces else self._name
@@ -234,7 +233,7 @@ class FileBody(WithRegions, FromFile):
         file = replace(file, points=scale * file.points)
         extent = float(np.ptp(file.points, axis=0).max())
         if not SMALLEST_LENGTH <= extent <= LARGEST_LENGTH:
-            limits = f"must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} " "(geometry.file_unit, geometry.length_unit)"
+            limits = f"must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, length_unit)"
             raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
         try:
             boundary = self.boundary(file)
@@ -259,8 +258,8 @@ class FileBody(WithRegions, FromFile):
                 f"mesh.refinement = {mesh.refinement}: {number} elements; " f"must be at most {LARGEST_MESH}"
             )
         file = refined(file, mesh.refinement, mesh.degree)
-        words = "the faces stay plane as in the file"
-        log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
+        text = "split into %d elements of degree %d; the faces stay plane as in the file"
+        log.info(text, len(file.cells), file.degree)
         return file, self.boundary(file)
 
     def _read(self) -> MeshFile:
@@ -365,9 +364,7 @@ class FileBody(WithRegions, FromFile):
             if load == "displacement" and face in moved:
                 raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
             if load == "pressure" and kind in HELD_ACROSS:
-                raise SceneError(
-                    f"{key}: its support ({kind!r}) carries the whole pressure; " "must be a face that moves"
-                )
+                raise SceneError(f"{key}: its support ({kind!r}) carries all of it; must be a face that moves")
             moved |= {face: name} if load == "displacement" else {}
 
     def hold_faces(
@@ -441,8 +438,7 @@ class WalledMesh(Walled):
     defaults = {"cells": {"axes": "local"}}
 
     def log_of_radii(self, wall: Any) -> float | None:
-        """Return the logarithm of the ratio of the faces' areas, or None if the wall does not go
-        around."""
+        """Return the logarithm of the faces' area ratio, or None for an open wall."""
         area = getattr(wall, "area", None)  # only a mesh from a file has it
         ratio = area("outer") / area("inner") if area is not None else 0.0
         return math.log(ratio) if ratio > 1.0 else None
@@ -454,8 +450,7 @@ class WalledMesh(Walled):
         return found_axes(domain, quadrature)
 
     def depth(self, coordinates: Array) -> Array:
-        """Return zero, because depth is no function of position: without recorded depth all is one
-        layer."""
+        """Return zero: unrecorded depth is unknown, so that all is one layer."""
         return np.zeros(coordinates.shape[:-1])
 
 

@@ -1,5 +1,4 @@
-"""Mesh of a user-supplied body on all ranks: read and checked on rank 0, with its faces and
-supports."""
+"""Mesh of a user-supplied body on all ranks, with its faces and supports."""
 
 from __future__ import annotations
 
@@ -46,8 +45,7 @@ class MeshDomain(Domain):
     rims: list[Integers]
 
     def of_parts(self, face: str, name: str) -> Function:
-        """Return `normal` or `centre` of a face's parts as a function, constant on each element
-        behind them."""
+        """Return `normal` or `centre` of a face's parts, constant on each adjacent element."""
         found = dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, ("DG", 0, (3,))))
         values, dofs = found.x.array.reshape(-1, 3), found.function_space.dofmap.list.reshape(-1)
         for part, facets in self.facets_of_parts(face):
@@ -65,8 +63,7 @@ class MeshDomain(Domain):
 
     @property
     def thickness(self) -> float:
-        """Mean thickness of the wall: twice the volume over the areas of its faces, or a cube's
-        side."""
+        """Mean thickness of the wall from volume and face areas; without them a cube's side."""
         volume, area = self.boundary.volume, self.area("inner") + self.area("outer")
         return 2 * volume / area if area else float(np.cbrt(volume))
 
@@ -91,7 +88,7 @@ def shared(
 ) -> MeshDomain:
     """Distribute the mesh that rank 0 reads. Collective."""
     found = agreed(comm, lambda: read() if comm.rank == 0 else None)
-    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as in `domain`
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # see `domain.build_domain`
     told = cells = groups = None
     points: Array = np.empty((0, 3))
     if found is not None:
@@ -174,8 +171,7 @@ def _density(loading: Loading, face: str, support: Support, moves: tuple[str, fl
 
 
 def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
-    """Check that the supports leave no rigid motion free, and that an elongation strains the
-    body."""
+    """Check that no rigid motion is free, and that an elongation strains the body."""
     if free := free_motions(domain.boundary.faces, supports):
         kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
         raise SceneError(f"supports ({kinds}): {free} of 6 rigid motions are unconstrained")
@@ -202,8 +198,7 @@ def warn_of_twist(name: str, support: Support, comm: MPI.Intracomm) -> None:
 
 
 def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
-    """Return the number of rigid motions that no support constrains: zero eigenvalues of a 6 x 6
-    matrix."""
+    """Return the number of rigid motions that no support constrains."""
     everywhere = np.concatenate([part.places for part in parts])
     middle = everywhere.mean(axis=0)
     size = float(np.linalg.norm(everywhere - middle, axis=1).max())

@@ -71,14 +71,12 @@ class Boundary:
         return sum(face.area for face in self.parts(name))
 
     def goes_around(self, name: str) -> bool:
-        """Return whether a part of a named face goes around, so that it has no clear mean
-        normal."""
+        """Return whether a part of a named face has no mean normal."""
         return min(face.flatness for face in self.parts(name)) < NOT_AROUND
 
 
 def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Groups = MappingProxyType({})) -> Boundary:
-    """Find the named faces on the boundary of a file's body, and the other groups that are
-    faces."""
+    """Find the named faces on a body's boundary, and the other groups that are faces."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
     owner = np.full(len(facets), "", dtype=object)
@@ -129,8 +127,7 @@ def through_the_wall(boundary: Boundary) -> bool:
 
 
 def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
-    """Return the closed lines that bound a face, as nodes of edges, (edges, 2 or 3: start, end,
-    middle)."""
+    """Return the closed lines that bound a face, as edges (edges, 2 or 3: start, end, middle)."""
     # The normal of a flat cap on such a line points out of the enclosed region.
     there = boundary.owner == face
     lines = rims(boundary.facets[there])
@@ -160,8 +157,7 @@ def cap_volume(points: Array, rim: Integers) -> float:
 
 
 def components(rows: Integers, nodes: int) -> Integers:
-    """Return the number of each row's connected component, (rows,); rows in a component share
-    nodes."""
+    """Return the number of each row's connected component, (rows,)."""
     from scipy.sparse import coo_array, csgraph
 
     first = np.repeat(rows[:, :1], rows.shape[1], axis=1)
@@ -196,8 +192,7 @@ def _checked_signs(file: MeshFile) -> Array:
     ordered = np.sort(file.corners, axis=1)
     _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
-        rule = "is duplicated: is it in two named volumes?"
-        raise UnreadableFile(f"element {file.cell_numbers[first[count > 1][0]]} {rule}")
+        raise UnreadableFile(f"element {file.cell_numbers[first[count > 1][0]]} is duplicated: in two named volumes?")
     extent = np.ptp(file.points, axis=0).max()
     if extent == 0:
         raise UnreadableFile("all nodes coincide")

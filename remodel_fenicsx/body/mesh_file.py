@@ -87,8 +87,7 @@ class MeshFile:
 
 
 class Block(NamedTuple):
-    """Elements of one type, by meshio's name: their groups, and rows of their nodes in Gmsh's
-    order."""
+    """Elements of one type (meshio's name): groups, and rows of nodes in Gmsh's order."""
 
     kind: str
     groups: Integers
@@ -130,8 +129,7 @@ Blocks = list[tuple[str, Integers]]
 
 
 class ExchangeFile(NamedTuple):
-    """Contents of an exchange file: element types with rows of nodes, arrays over all, and the
-    bytes."""
+    """Contents of an exchange file: element types with nodes, arrays, and the bytes."""
 
     points: Array
     cells: Blocks
@@ -279,8 +277,7 @@ class Surface(NamedTuple):
 
 
 def triangles_of(path: Path) -> tuple[Surface, bytes]:
-    """Read the triangles of a file, without orienting them, and return them with the file's
-    bytes."""
+    """Read the triangles of a file, in any orientation, and the file's bytes."""
     try:
         found, data = read_guarded(path, f"{__name__}:{path.suffix[1:].lower()}")
     except UnreadableFile as error:

@@ -79,8 +79,7 @@ _MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}  # order of the corne
 
 
 def mirrored_twice(points: Array, elements: Integers) -> Body:
-    """Mirror the quarter x > 0, y > 0 in the planes x = 0 and y = 0; nodes on the planes are
-    shared."""
+    """Mirror the quarter x > 0, y > 0 in the planes x = 0 and y = 0, with shared nodes."""
     signs = np.array([(1.0, 1.0, 1.0), (-1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, 1.0)])
     ways = elements, elements[:, _MIRRORED[elements.shape[1]]]  # keeps all volumes positive
     every = [ways[number % 2] + number * len(points) for number in range(4)]
@@ -108,8 +107,7 @@ def box(*sides: float) -> Body:
 
 
 def cylinder(radius: float, length: float) -> Body:
-    """Return a cylinder about z, from z = 0 to the length, of hexahedra with one edge on the
-    axis."""
+    """Return a cylinder about z of hexahedra with one edge on the axis."""
     return revolved(*extended(np.array([(0.0, 0.0, 0.0), (radius, 0.0, 0.0)]), np.array([[0, 1]]), length))
 
 
@@ -311,8 +309,7 @@ def too_many_elements(scene: ReducedScene) -> str:
 
 
 def step_cost(scene: ReducedScene, name: str) -> float:
-    """Estimate the cost of a step from the quadrature points, in that of one point of a
-    hexahedron."""
+    """Estimate the cost of a step from its quadrature points; 1 is a point of a hexahedron."""
     kinematics, mesh = KINEMATICS[name], scene.mesh
     element, number = kinematics.element(mesh.element), elements(scene, name)
     if element == "tetrahedron":
@@ -366,8 +363,7 @@ def drawn_once(scene: ReducedScene) -> str | None:
 def symmetric_law(scene: ReducedScene) -> str | None:
     """Require a law that keeps the symmetry of body and loads."""
     law = scene.remodeling.law
-    reason = f"remodeling.law = {law!r} may rotate axes out of planes of symmetry"
-    return None if LAWS[law].keeps_symmetry else reason
+    return None if LAWS[law].keeps_symmetry else f"remodeling.law = {law!r} may break the symmetry"
 
 
 def round_about_z(scene: ReducedScene) -> str | None:

@@ -116,8 +116,7 @@ PROFILE = tuple(f"angle_profile_{number}" for number in range(PROFILE_PLACES))
 
 
 def profile_weights(depth: Array) -> Array:
-    """Return hat functions about equally spaced depths from 0 to 1, on a new axis; their sum is
-    one."""
+    """Return hat functions about equal depths from 0 to 1, on a new axis; they sum to one."""
     return np.maximum(
         0.0, 1.0 - np.abs(np.asarray(depth)[..., None] * (PROFILE_PLACES - 1) - np.arange(PROFILE_PLACES))
     )
@@ -474,9 +473,8 @@ _Is: Any = with_key(
     "is",
     Literal["unloaded", "loaded"],
     default="unloaded",
-    description="State of the geometry: without loads, or (tube or user-supplied body) under the "
-    "loads at the end of their ramps. The program then first computes the unloaded body "
-    "(docs/tissue_that_lives.md).",
+    description="State of the geometry: without loads, or (tube, user-supplied body) under the loads "
+    "at the end of their ramps; the unloaded body is then computed (docs/tissue_that_lives.md).",
 )
 
 
@@ -587,18 +585,15 @@ class Shape(_Is):  # type: ignore[misc]
 
     @property
     def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
-        """Ratios of lengths that reveal mixed units: key, label, ratio, and decades of usual
-        bodies."""
+        """Ratios of lengths that reveal wrong units: key, label, ratio, usual decades."""
         return ()
 
     def log_of_radii(self, wall: Any) -> float | None:
-        """Return ln(r_o/r_i) of a wall, from areas `wall.area(face)` of a mesh, or None if
-        unknown."""
+        """Return ln(r_o/r_i) of a wall, from `wall.area(face)` on a mesh, or None."""
         return None
 
     def strut(self, ends: str) -> reduced.Strut | None:
-        """Return the column that may buckle, with the supports `supports.ends`, or None if nothing
-        bends it."""
+        """Return the column that compression may buckle, or None if nothing bends it."""
         return None
 
     def axes_at(self, coordinates: Array) -> Array:
@@ -690,8 +685,7 @@ class Shape(_Is):  # type: ignore[misc]
         """
 
     def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the body with the regions of a scene, if the scene defines their geometry.
-        Collective."""
+        """Mesh the body with a scene's regions, if these have a geometry. Collective."""
         return self.build(mesh, comm)
 
     def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
@@ -827,8 +821,7 @@ class Shape(_Is):  # type: ignore[misc]
         return angle_to_axis(dimensions, axes, np.array([0.0, 0.0, 1.0]))
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Return the fraction of the chains, by squared length, that `fibre_angle` omits,
-        (...,)."""
+        """Return the chains' fraction that `fibre_angle` omits, by squared length, (...,)."""
         return np.zeros(dimensions.shape[:-1])
 
 

@@ -109,8 +109,7 @@ class Tendon(Shape):
         return self
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh a core of 4 x 4 elements with rounded sides in two rings of 16 elements, in ten
-        layers.
+        """Mesh a core of 4 x 4 elements, rounded, in two rings of 16, in ten layers.
 
         The refinement multiplies these numbers. The centre of the section and the axes have nodes.
         `dimensions["radius"]` is the radius of the outer nodes. It slightly exceeds sqrt(area /
@@ -149,8 +148,7 @@ def outer_radius(area: float, refinement: int = 1, degree: int = 1) -> float:
 
 
 def draw_tendon(length: float, area: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1) -> None:
-    """Draw and mesh the tendon in the current Gmsh model: a core and four ring quarters,
-    extruded."""
+    """Draw and mesh the tendon in Gmsh: a core and four ring quarters, extruded."""
     radius = outer_radius(area, refinement, degree)
     number, quarter = AROUND * refinement, CORE * refinement
     inner = model.points(core_boundary(CORE_RADIUS * radius, refinement))

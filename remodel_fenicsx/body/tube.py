@@ -116,8 +116,7 @@ def _in_layers(points: Array, elements: Integers) -> reduced.Body:
 
 
 def springs_across(scene: reduced.ReducedScene) -> str | None:
-    """Require springs without stiffness along the wall, which would pull sections out of their
-    planes."""
+    """Require springs without tangential stiffness, so that sections stay plane."""
     for face, support in scene.supports.faces.items():
         if support.tangential:
             return f"supports.{face}.tangential is above 0: sections do not stay plane"
@@ -125,8 +124,7 @@ def springs_across(scene: reduced.ReducedScene) -> str | None:
 
 
 def mirrored_draws(scene: reduced.ReducedScene) -> str | None:
-    """Return that a quarter's random cells represent the tube only in means, approximately, or
-    None."""
+    """Require no random cells: those of a quarter represent the tube only in means."""
     if reduced.drawn_once(scene) is None:
         return None
     return (
@@ -221,7 +219,7 @@ def _opening_angle(m: Any) -> float:
     from remodel_fenicsx.model.residual_stress import Rings, cut, means_through
 
     cells, state, stepper, comm = m.state.cells, m.state, m.observer.stepper, m.state.comm
-    local, tissue = cells.local_axes, stepper.remodeling.parameters.largest()  # one tissue: numbers
+    local, tissue = cells.local_axes, stepper.remodeling.parameters.largest()  # numbers
     axes = local.axes.reshape(-1, 3, 3)
 
     def along(tensors: Array) -> Array:
@@ -301,8 +299,7 @@ class Tube(RoundWall):
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
-            "engineering strain of the length (0.1: 10 % longer), prescribed, or the solution if "
-            "the length is an unknown",
+            "engineering strain of the length (0.1: 10 % longer), prescribed or computed",
             column="axial_elongation",
             above=-1.0,
             reductions=("radial", "axisymmetric", "sector"),
@@ -384,7 +381,7 @@ class Tube(RoundWall):
     ) -> None:
         """Add springs for the surrounding tissue."""
         for face, support in supports.items():
-            from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # which few tubes need
+            from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # few tubes need it
 
             add_support(loading, face, support, modulus, None)
             if loading.kinematics.moves_rigidly:
@@ -404,8 +401,7 @@ class Tube(RoundWall):
         return self
 
     def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
-        """Return warnings of stresses at the inner face if linear elements are thick for its
-        radius."""
+        """Warn of stresses at the inner face of linear elements that are too thick."""
         size = (self.outer_radius - self.inner_radius) / _counts(mesh)[1] / self.inner_radius
         at_face = [name for name in columns if name in {f"{component}_stress_inner" for component in STRESSES}]
         if mesh.degree > 1 or size < THICK_ELEMENTS:
@@ -417,13 +413,11 @@ class Tube(RoundWall):
         ]
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the tube: 16 elements around, 8 through the wall and 12 along, times the
-        refinement."""
+        """Mesh 16 elements around, 8 through the wall, 12 along, times the refinement."""
         return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm)
 
     def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the tube with the scene's layers, of equal elements each; no element is in two
-        layers."""
+        """Mesh the tube with the scene's layers; no element lies in two layers."""
         return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm, regions)
 
     def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
@@ -437,8 +431,7 @@ class Tube(RoundWall):
         return dict(zip(wall.names, itertools.pairwise(places), strict=True)) if regions else {}
 
     def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
-        """Add supports and loads; without an elongation the distance of the ends is fixed or an
-        unknown."""
+        """Add supports and loads; without elongation the top is fixed along z."""
         super().support(loading, ends, loads)
         if "elongation" not in loading.values:
             loading.hold_face("top", 2)
@@ -474,8 +467,7 @@ class Tube(RoundWall):
 
     @property
     def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
-        """Proportions of vessels: not far from the paper's wall of two radii, neither ring nor
-        thread."""
+        """Proportions of vessels, which are neither rings nor threads."""
         outer = self.outer_radius
         return (
             ("inner_radius", "outer_radius / inner_radius", outer / self.inner_radius, (0, 0.5)),
@@ -487,8 +479,7 @@ class Tube(RoundWall):
         return math.log(self.outer_radius / self.inner_radius)
 
     def strut(self, ends: str) -> reduced.Strut:
-        """Return the column: the ends keep their planes, and one moves sideways unless they are
-        clamped."""
+        """Return the column: planes of the ends are fixed, one end moves unless clamped."""
 
         def squared_distances(places: Array) -> Array:
             return np.square(places[:, :2]).sum(axis=1) / 2

@@ -37,8 +37,7 @@ class Wall(NamedTuple):
 
     @classmethod
     def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> Wall:
-        """Return the wall of a scene's regions with this number of elements, at least one in each
-        layer."""
+        """Return the wall of a scene's regions with these elements, at least one a layer."""
         order = sorted(regions, key=lambda name: _outer(regions[name], outer_radius)) or ["body"]
         inside = [_outer(regions[name], outer_radius) for name in order[:-1]]
         radii = (inner_radius, *inside, outer_radius)
@@ -66,8 +65,7 @@ def _outer(region: Region, outer_radius: float) -> float:
 
 
 def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
-    """Distribute elements over layers: one in each, then always to the layer with the thickest
-    elements."""
+    """Distribute elements over layers, at least one each, as evenly thick as possible."""
     counts = [1] * len(thicknesses)
     for _ in range(elements - len(counts)):
         counts[int(np.argmax(np.divide(thicknesses, counts)))] += 1
@@ -75,8 +73,7 @@ def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
 
 
 def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> None:
-    """Check that the regions are layers of the wall, and that there are enough elements for
-    them."""
+    """Check that the regions are layers of the wall, with at least one element each."""
     # A layer is at least as thick as Gmsh can mesh (`length_fault`).
     seen: dict[float, str] = {}
     for name, region in regions.items():
@@ -93,7 +90,7 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
         rule = f"must be geometry.outer_radius = {shown(outer_radius)} or omitted: outermost region"
         raise fault(rule, f"regions.{last}.outer_radius", max(seen))
     if len(regions) > elements:
-        rule = f"{len(regions)} regions with {elements} elements through the wall; " "set a larger mesh.refinement"
+        rule = f"{len(regions)} regions, {elements} elements through the wall; increase mesh.refinement"
         raise fault(rule, "regions", None)
     for inside, radius in itertools.pairwise([inner_radius, *sorted(seen)]):
         key = f"regions.{seen[radius]}.outer_radius"
@@ -129,8 +126,7 @@ def tube_layers(wall: Wall, natural: Natural, tissues: Mapping[str, Tissue]) -> 
 
 
 def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array:
-    """Return the layers' circumferential, axial and radial stretch at the points, (elements,
-    points, 3)."""
+    """Return the layers' three stretches at the points, (elements, points, 3)."""
     depth = local_axes.depth
     found = np.ones((*depth.shape, 3))
     for layer in natural.layers:
@@ -150,7 +146,7 @@ def gradient(stretches: Array, axes: Array) -> Array:
 # ---------------------------------------------------------------- bodies with inner and outer face
 # Measurements in the wall, and its local axes on any mesh.
 
-AngleOf = Callable[[Any, Array], float]  # of a measurement and angles at its points
+AngleOf = Callable[[Any, Array], float]  # function of a measurement and of angles at its points
 ANGLE_IN = "mean reference fibre angle (0 circumferential, 90 axial) in the wall, over the elements"
 
 
@@ -189,8 +185,7 @@ STRESSES = {"hoop": ("around", 0), "axial": ("along", 1), "radial": ("across", 2
 
 
 def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
-    """Return columns of the Cauchy stress in the wall: at its faces, and means as for the
-    angles."""
+    """Return columns of the Cauchy stress at the wall's faces, and of its means."""
     return tuple(
         Column(
             f"{name}_stress_{where}",
@@ -218,7 +213,7 @@ FACES = ("inner", "outer")
 FITTED_TO_FACE = (
     "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
 )
-ON_THE_FACE = 1e-6  # normalised depth: rounding of coordinates
+ON_THE_FACE = 1e-6  # normalised depth within the rounding of coordinates
 SECOND_LAYER = 1.5  # depth over layer thickness, between the start of the second and third layer
 
 
@@ -296,8 +291,7 @@ class Walled(Shape):
         return stress_columns({name: (f"of the region `{name}`", _in_region(name))})
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Return the pitch of the chains in degrees, (...,): circumferential 0, axial 90, NaN if
-        radial."""
+        """Return the pitch of chains, degrees, (...,): circumferential 0, axial 90, else NaN."""
         return pitch_angle(dimensions, axes, local)
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:

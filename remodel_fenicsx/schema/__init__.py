@@ -1,2 +1,1 @@
-"""Strict tables with one-line errors, and TOML input and output, independent of any scene's
-keys."""
+"""Strict tables with one-line errors, and TOML in and out; independent of any scene's keys."""

@@ -123,8 +123,7 @@ class Model(Table):
 
 
 class Support(Table):
-    """Support of a face of a user-supplied body (shapes `'mesh'`, `'solid'`), such as
-    `[supports.inlet]`.
+    """Support of a face of a user-supplied body, such as `[supports.inlet]` of a `'mesh'`.
 
     NAME is a face of `geometry.faces`, or one that the file names. N is the mean outward normal of
     the face, or of each of its parts, in the reference configuration; c goes around the centre of
@@ -176,7 +175,7 @@ class Supports(Table):
 
 
 class Material(Table):
-    """The tissue: an isotropic matrix (Lame constants) with a network of collagen chains.
+    """Tissue: an isotropic matrix (Lame constants) with a network of collagen chains.
 
     Its keyword arguments are the keys of `[material]` in a scene (docs/scene.md; paper, eqs. 2 to 4). Stresses are in
     `stress_unit`, lengths of chains in link lengths, `chain_density` in 1/m^3, `temperature` in kelvin.
@@ -239,7 +238,7 @@ class Material(Table):
 
     @property
     def network_modulus(self) -> float:
-        """c = omega k theta n_chn / (4 A_p), in stress_unit (1.568 Pa for the defaults)."""
+        """Network modulus c = omega k theta n_chn / (4 A_p), in stress_unit (default 1.568 Pa)."""
         pascal = BOLTZMANN_CONSTANT * self.temperature * self.chain_density / (4 * self.persistence_length)
         return self.energy_factor * pascal / STRESS_UNITS[self.stress_unit]
 
@@ -306,18 +305,12 @@ class Prestretch(Table):
 
 
 _From: Any = with_key(
-    "from",
-    float,
-    default=0.0,
-    ge=0,
-    lt=1,
-    description="Start of the layer, from the inside (0) to the outside (1).",
+    "from", float, default=0.0, ge=0, lt=1, description="Start of the layer, from the inside (0) to the outside (1)."
 )
 
 
 class NaturalLayer(_From):  # type: ignore[misc]
-    """Layer that was stretched before it was joined to the rest of the wall
-    (docs/tissue_that_lives.md)."""
+    """Layer that was stretched before it was joined to the wall (docs/tissue_that_lives.md)."""
 
     to: float = Field(default=1.0, gt=0, le=1)
     """End of the layer."""
@@ -343,8 +336,7 @@ AS_GIVEN: Literal["as-given"] = "as-given"
 
 
 class Natural(Table):
-    """Stress-free configuration of the tissue, if it is not the mesh
-    (docs/tissue_that_lives.md)."""
+    """Stress-free configuration, if it is not the mesh (docs/tissue_that_lives.md)."""
 
     opening_angle: float = Field(default=0.0, ge=0, le=180)
     """For a tube: the angle of the missing sector of a cut ring, in degrees. Fung's opening angle
@@ -376,7 +368,7 @@ class Natural(Table):
             if (layer.region is None) != (other.region is None):
                 rule = "must be set for all layers or for none"
                 yield rule, f"layers[{index}].region", layer.region
-            meet = layer.share[0] < other.share[1] and other.share[0] < layer.share[1]  # with regions all do
+            meet = layer.share[0] < other.share[1] and other.share[0] < layer.share[1]  # layers with regions all do
             if meet and layer.region == other.region:
                 yield "overlaps another layer", f"layers[{index}]", layer.region or list(layer.share)
 
@@ -590,8 +582,7 @@ _WithStart: Any = with_key(
 
 
 class Turnover(_WithStart):  # type: ignore[misc]
-    """Removal of collagen and its deposition under a stretch, if `time` is set
-    (docs/tissue_that_lives.md).
+    """Removal and deposition of collagen, if `time` is set (docs/tissue_that_lives.md).
 
     For the law `tensor`.
     """
@@ -624,8 +615,7 @@ class Turnover(_WithStart):  # type: ignore[misc]
 
     @property
     def start(self) -> float:
-        """Time from which turnover adds volume; infinite while unknown, if growth starts at
-        equilibrium."""
+        """Time from which turnover adds volume; infinite if that is an equilibrium."""
         return math.inf if self.starts_at_rest else float(getattr(self, "from"))
 
     @property
@@ -752,9 +742,8 @@ class Remodeling(Table):
         if not COUPLINGS[self.coupling].makes_a_share or share == 1 or not law.remodels or law.of_absolute_time:
             return []
         return [
-            f"remodeling.coupling = {self.coupling!r} makes {share:g} of each pass's change, and "
-            f"the law {self.law!r} does not make up for the rest: "
-            f"cells remodel at about {share:g} times the rate"
+            f"remodeling.coupling = {self.coupling!r} makes {share:g} of each pass, which the law "
+            f"{self.law!r} does not make up: cells remodel at about {share:g} times the rate"
         ]
 
     @property
@@ -849,8 +838,7 @@ _SomeRemodeling: Any = _for_regions(Remodeling, "remodeling", "kappa", "half_lif
 
 
 class RegionMaterial(_SomeMaterial):  # type: ignore[misc]
-    """Keys of `[material]` that differ in the region. The other keys of `[material]` hold for the
-    whole body.
+    """Keys of `[material]` that differ in the region. The other keys are the whole body's.
 
     With `chain_density = 0` the region has no collagen: its angles are empty, and its cells are
     constant. A region with its own parameters of an extension's matrix must name `matrix` too.
@@ -882,8 +870,7 @@ class Region(Table):
     remodeling: RegionRemodeling = RegionRemodeling()
 
     def over(self, others: Properties) -> Properties:
-        """Return the properties that hold in the region: its own keys, completed by those of the
-        body."""
+        """Return the properties in the region: its own keys, completed by the body's."""
         return Properties(
             others.material.model_copy(update=_set(self.material)),
             others.cells.model_copy(update=_set(self.cells)),
@@ -906,8 +893,7 @@ Ramp = Annotated[
 
 
 class Load(Table):
-    """Named load: `force` of cube and tendon, `pressure` and `elongation` of a tube. Omitted loads
-    are 0.
+    """Load by name: `force` of cube and tendon, `pressure` of a tube. Omitted loads are zero.
 
     A user-supplied body (shapes `'mesh'`, `'solid'`) may have further loads under names of your
     choice, each on one of its faces. docs/scene.md lists the loads of each shape.
@@ -939,9 +925,8 @@ class Load(Table):
                 yield f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None
 
     def factor(self, time: float) -> float:
-        """Return the load factor at a time: piecewise linear, constant before and after the
-        ramp."""
-        hit = next((corner for corner, _ in self.ramp if math.isclose(time, corner)), time)  # exact at its own times
+        """Return the load factor at a time: piecewise linear, constant outside the ramp."""
+        hit = next((corner for corner, _ in self.ramp if math.isclose(time, corner)), time)  # exact at the ramp's times
         times, factors = zip(*self.ramp, strict=True)
         return float(np.interp(hit, times, factors))
 
@@ -961,8 +946,7 @@ SUM_OF_WEIGHTS = 1e-9  # tolerance for the sum of case weights: rounding, and 1/
 
 
 class LoadCase(Table):
-    """Load case of a cycle, such as diastole: its fraction of the time, and its loads
-    (docs/cycles.md).
+    """Load case of a cycle, such as diastole: fraction of the time, and loads (docs/cycles.md).
 
     Every case is a state of its own, solved with the same cells. The cells follow a mean over the
     cases. The columns and fields of a run are those of the first case. The further cases have
@@ -1058,8 +1042,7 @@ class Time(Table):
         return self.tolerance is not None and not self.is_equilibrium
 
     def progress(self, number: int, time: float) -> float:
-        """Return the completed part of `number_of_steps` after a step; with adaptive steps by its
-        time."""
+        """Return how many of `number_of_steps` are done; with adaptive steps by time."""
         return time / self.step if self.chooses else number
 
     def in_words(self) -> str:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from pydantic.json_schema import JsonSchemaValue
 
-LONGEST_VALUE = 60  # characters of a value in an error
+LONGEST_VALUE = 60  # largest number of a value's characters in an error
 # Annotation of a tuple: a list of TOML is converted.
 IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
@@ -229,8 +229,7 @@ class OwnNumber(Protocol):
 
 @dataclass(frozen=True)
 class KeysOfParts(Before):
-    """Annotation of a table field, extended by the keys of the parts that the table selects
-    (`parameters`)."""
+    """Annotation of a table with additional keys of the parts that it selects (`parameters`)."""
 
     registries: Mapping[str, Mapping[str, object]]  # by the key that names the part
     optional: bool = False  # whether the keys may be omitted, as in regions
@@ -447,20 +446,14 @@ def _kind(field: FieldInfo) -> object:
 def allowed(field: FieldInfo) -> str:
     """Describe the values that a field allows, for errors and the reference of keys."""
     if listed := choices(field):
-        rule = "must be one of " if len(listed) > 1 else "must be "
-        return rule + ", ".join(shown(choice) for choice in listed)
+        return f"must be {'one of ' if len(listed) > 1 else ''}" + ", ".join(map(shown, listed))
     if isinstance(field.json_schema_extra, dict):
         return f"must be {field.json_schema_extra['allowed']}"
     if is_table(field.annotation) or get_origin(field.annotation) is dict:
         fields: dict[str, FieldInfo] = getattr(field.annotation, "model_fields", {})
         required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
-    nouns: dict[object, str] = {
-        float: "a finite number",
-        int: "an integer",
-        bool: "true or false",
-        str: "a string",
-    }
+    nouns: dict[object, str] = {float: "a finite number", int: "an integer", bool: "true or false", str: "a string"}
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
     bounds = [
         f"{word} {getattr(entry, name)}"
@@ -481,8 +474,7 @@ def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[Table]]]:
 
 
 def sections(table: type[Table], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[Table]]]:
-    """Yield dotted key, variant and class of a table and of all tables in it; NAME is a free
-    name."""
+    """Yield dotted key, variant and class of a table and its inner tables; NAME is a free name."""
     yield key, variant, table
     if (kind := table.further) is not None:
         yield from sections(kind, _joined(key, "NAME"))

@@ -76,8 +76,7 @@ def _depth_exceeds(value: object, most: int) -> bool:
 
 
 def parse_override(text: str) -> tuple[str, object]:
-    """Parse "KEY=VALUE" into dotted key and value; VALUE is TOML, a bare word or a number with a
-    unit."""
+    """Parse "KEY=VALUE"; VALUE is TOML, a bare word or a number with a unit."""
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
         raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")

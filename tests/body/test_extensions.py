@@ -323,7 +323,7 @@ def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypat
         Simulation(curved, MPI.COMM_SELF)
     with pytest.raises(
         SceneError,
-        match="^geometry.shape = 'rod': must be one of 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'solid', 'bar'$",
+        match="^geometry.shape = 'rod': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'solid', 'bar'$",
     ):
         Scene(geometry={"shape": "rod"}, time={"end": 1.0})
 
