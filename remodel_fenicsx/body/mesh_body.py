@@ -133,7 +133,8 @@ class FileBody(WithRegions, FromFile):
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"}
     )
     """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
-    `.stl`, `.obj`), which are faces under the names of their files (docs/my_own_vessel.md)."""
+    `.stl`, `.ply`, `.obj`), which are faces under the names of their files
+    (docs/my_own_vessel.md)."""
     tags: str | None = Field(
         default=None,
         min_length=1,

@@ -13,6 +13,7 @@ import itertools
 import json
 import logging
 import re
+import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -265,7 +266,11 @@ def _in_gmsh_order(kind: str, rows: Integers) -> tuple[str, Integers]:
 # ---------------------------------------------------------------- surfaces
 
 ARRAY = "array "  # prefix of the name of an array that a child transfers
-SURFACES = (".vtp", ".stl", ".obj")  # suffixes
+# Letters of Python's `struct`.
+PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+PLY_TYPES = dict(zip("char uchar short ushort int uint float double".split(), "bBhHiIfd", strict=True))
+PLY_TYPES |= dict(zip("int8 uint8 int16 uint16 int32 uint32 float32 float64".split(), "bBhHiIfd", strict=True))
+SURFACES = (".vtp", ".stl", ".ply", ".obj")  # suffixes
 
 
 class Surface(NamedTuple):
@@ -304,6 +309,67 @@ def stl(file: str) -> Arrays:
         # The file is in this process's memory.
         Path(file).write_bytes(re.sub(rb"(?<=\d),(?=\d)", b".", data))
     return _by_vtk("vtkIOGeometry", "vtkSTLReader", file)
+
+
+def ply(file: str) -> Arrays:
+    """Read the surface in a PLY file."""
+    # VTK's reader ignores arrays at points, and crashes on a truncated file.
+    head, _, body = Path(file).read_bytes().partition(b"end_header")
+    header = [line.split() for line in head.decode("ascii", "replace").splitlines() if line.strip()]
+    try:
+        order = PLY_ORDERS[next(line[1] for line in header if line[0] == "format")]
+        points, polygons = _ply_numbers(header, order, body[body.index(b"\n") + 1 :])
+        places = np.column_stack([points.pop(axis) for axis in "xyz"]).astype(np.float64)
+    except (IndexError, KeyError, StopIteration, ValueError, struct.error):
+        raise UnreadableFile("has other numbers than its header announces: is it truncated?") from None
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    surface, cells, corners = vtkPolyData(), vtkCellArray(), vtkPoints()
+    corners.SetData(numpy_to_vtk(places))
+    cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(np.array(polygons, dtype=np.int64)))
+    surface.SetPoints(corners)
+    surface.SetPolys(cells)
+    for name, values in points.items():
+        array = numpy_to_vtk(values.astype(np.float64), deep=True)
+        array.SetName(name)
+        surface.GetPointData().AddArray(array)
+    return _triangulated(surface)
+
+
+def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[dict[str, Any], list[int]]:
+    """Return point arrays by name, and polygons, each after the number of its corners."""
+    is_text, at = order == "=", 0
+    body = np.array(body.split(), dtype=np.float64).tobytes() if is_text else body
+    points: dict[str, Any] = {}
+    polygons: list[int] = []
+    starts = [*(k for k, line in enumerate(header) if line[0] == "element"), len(header)]
+    for start, end in itertools.pairwise(starts):
+        (_, element, count), lines = header[start], header[start + 1 : end]
+        properties = {
+            line[-1]: ["d" if is_text else PLY_TYPES[kind] for kind in line[1:-1] if kind != "list"]
+            for line in lines
+            if line[0] == "property"
+        }
+        if all(len(kinds) == 1 for kinds in properties.values()):
+            record = np.dtype([(name, order + kind) for name, (kind,) in properties.items()])
+            found = np.frombuffer(body, record, abs(int(count)), at) if int(count) else np.empty(0, record)
+            at += found.nbytes
+            points |= {name: found[name] for name in properties} if element == "vertex" else {}
+            continue
+        for _ in range(int(count)):
+            for name, kinds in properties.items():
+                row: tuple[Any, ...] = (1,)
+                for kind in kinds:  # the length of a list precedes it
+                    code = f"{order}{int(row[0])}{kind}"
+                    row = struct.unpack_from(code, body, at)
+                    at += struct.calcsize(code)
+                if element == "face" and name.startswith("vertex_ind"):
+                    polygons.extend((len(row), *map(int, row)))
+    if body[at:].strip():
+        raise ValueError
+    return points, polygons
 
 
 def _triangulated(data: Any) -> Arrays:

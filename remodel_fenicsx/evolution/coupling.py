@@ -87,8 +87,8 @@ class Predictor:
 
     def _goes_on(self, step: LoadStep) -> bool:
         """Whether the rates are those of the last step."""
-        rates = ((rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items())
-        return all(abs(rate - last) <= SAME_RATE * max(abs(rate), abs(last)) for rate, last in rates)
+        rates = [(rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items()]
+        return all([abs(rate - last) <= SAME_RATE * max(abs(rate), abs(last)) for rate, last in rates])
 
     def _weights(self, speeds: list[Array]) -> Array:
         """Fit the newest increments by those before them, in the sense of least squares."""

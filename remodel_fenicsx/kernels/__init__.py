@@ -113,14 +113,13 @@ class Library:
 
     def __call__(self, name: str, *arguments: Any) -> Any:
         """What a function returns. Arrays that it writes to are contiguous; None is a null pointer."""
-        return getattr(self._functions, name)(*map(self._argument, arguments))
-
-    def _argument(self, value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            kind = C_TYPES.get(value.dtype.char, "double")
-            values = np.ascontiguousarray(value, np.float64 if kind == "double" else None)
-            return self._ffi.from_buffer(f"{kind}[]", values)
-        return self._ffi.NULL if value is None else value
+        passed = [self._ffi.NULL if value is None else value for value in arguments]
+        for number, value in enumerate(arguments):
+            if isinstance(value, np.ndarray):
+                kind = C_TYPES.get(value.dtype.char, "double")
+                values = np.ascontiguousarray(value, np.float64 if kind == "double" else None)
+                passed[number] = self._ffi.from_buffer(f"{kind}[]", values)
+        return getattr(self._functions, name)(*passed)
 
 
 def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:

@@ -78,7 +78,7 @@ class Observer(Watcher):
 
     def solved(self, step: Step) -> None:
         """Measure the solved state."""
-        step.row |= dict.fromkeys((column.name for column in self.columns), np.nan)
+        step.row |= {column.name: np.nan for column in self.columns}
         self._fill(step, after_pass=False)
 
     def completed(self, step: Step) -> None:

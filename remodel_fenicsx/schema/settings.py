@@ -926,9 +926,9 @@ class Load(Table):
 
     def factor(self, time: float) -> float:
         """Return the load factor at a time: piecewise linear, constant outside the ramp."""
-        hit = next((corner for corner, _ in self.ramp if math.isclose(time, corner)), time)  # exact at the ramp's times
         times, factors = zip(*self.ramp, strict=True)
-        return float(np.interp(hit, times, factors))
+        hits = [corner for corner in times if math.isclose(time, corner)]  # exact at the ramp's times
+        return float(np.interp(hits[0] if hits else time, times, factors))
 
     @property
     def falls(self) -> bool:

@@ -65,7 +65,9 @@ def wall(*words: Any) -> int:
     return cli.main(["wall", *map(str, words)])
 
 
-@pytest.mark.parametrize(("ending", "inwards"), [("stl", 0), ("STL", 1), ("obj", 0), ("vtp", 0), ("vtp", 1)])
+@pytest.mark.parametrize(
+    ("ending", "inwards"), [("stl", 0), ("STL", 1), ("ply", 1), ("obj", 0), ("vtp", 0), ("vtp", 1)]
+)
 def test_layers_have_their_volumes_whatever_the_file(ending: str, inwards: int, tmp_path: Path) -> None:
     """Of a straight tube, whichever way its triangles look; one in three looks the other way."""
     points, triangles = tube()
@@ -111,6 +113,19 @@ def test_a_branch_is_taken_and_its_ends_are_counted(tmp_path: Path) -> None:
     assert min(volumes(path).values()) > 0
 
 
+def with_words(points: Any, cells: Any, face: str = "vertex_indices", header: str = "", tail: str = "") -> str:
+    """A PLY file as text; polygons have a number of corners each."""
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(points)}",
+        *(f"property float {c}" for c in ["x", "y", "z"]),
+    ]
+    lines += [f"element face {len(cells)}", f"property list uchar int {face}", f"{header}end_header"]
+    rows = [" ".join(map(str, row)) for row in [*points.tolist(), *([len(c), *c] for c in cells.tolist())]]
+    return "\n".join([*lines, *rows, tail])
+
+
 def as_programs_write(points: Any, triangles: Any) -> dict[str, bytes]:
     """The same surface in files of other kinds."""
     number = np.arange(len(points)).reshape(AROUND, ALONG + 1)
@@ -127,6 +142,21 @@ def as_programs_write(points: Any, triangles: Any) -> dict[str, bytes]:
     def faces(form: str, cells: Any) -> str:
         return "".join("f " + " ".join(form.format(k + 1, k % 2 + 1) for k in cell) + "\n" for cell in cells)
 
+    binary = ["ply", "format binary_big_endian 1.0", f"element vertex {len(points)}"]
+    binary += [
+        f"property {kind} {c}" for kind, c in [("double", "x"), ("float", "y"), ("double", "z"), ("uchar", "red")]
+    ]
+    binary += [
+        f"element face {len(quads)}",
+        "property uchar flags",
+        "property list uchar int vertex_index",
+        "end_header\n",
+    ]
+    records = np.zeros(len(points), ">f8, >f4, >f8, u1")
+    records["f0"], records["f1"], records["f2"] = points.T
+    polygons = np.zeros(len(quads), "u1, u1, 4>i4")
+    polygons["f1"], polygons["f2"] = 4, quads
+    edges = "element edge 1\nproperty int vertex1\nproperty int vertex2\n"
     return {
         "capitals.stl": text.upper().encode(),
         "commas.stl": text.replace(".", ",").encode(),
@@ -134,6 +164,9 @@ def as_programs_write(points: Any, triangles: Any) -> dict[str, bytes]:
             "mtllib a.mtl\nvt 0 0\nvt 1 1\nvn 0 0 1\n" + places + "usemtl a\n" + faces("{}/{}/1", quads)
         ).encode(),
         "normals.obj": ("vn 0 0 1\n" + coloured + "l 1 2\n" + faces("{}//1", triangles)).encode(),
+        "index.ply": with_words(points, triangles, "vertex_index").encode(),
+        "edge.ply": with_words(points, quads, header=edges, tail="0 1\n").encode(),
+        "binary.ply": "\n".join(binary).encode() + records.tobytes() + polygons.tobytes(),
     }
 
 
@@ -142,9 +175,10 @@ def test_files_of_many_programs_are_the_same_surface(tmp_path: Path, capsys: pyt
     files = as_programs_write(points, triangles)
     named = dict.fromkeys(["triangles", "points", "file"], points[:, 2])
     written(tmp_path / "arrays.vtp", points, triangles, **named)
+    written(tmp_path / "arrays.ply", points, triangles, **named)
     for name, text in files.items():
         (tmp_path / name).write_bytes(text)
-    for name in ("arrays.vtp", *files):
+    for name in ("arrays.vtp", "arrays.ply", *files):
         assert wall(tmp_path / name, "--thickness", 0.3, "--size", 0.5, "-o", tmp_path / f"{name}.msh") == 0
         flat = 0.5 * AROUND * np.sin(2 * np.pi / AROUND) * RADIUS**2 * LENGTH
         assert f"triangles of {name} {flat:.4g}" in capsys.readouterr().out, name
@@ -156,7 +190,7 @@ def test_elements_bend_as_the_smooth_lumen(
 ) -> None:
     """Of an ellipse, whose curvature is nine times its mean at its tips, and of a torus: pi a b L."""
     points, triangles = tube(bend)
-    file, path = written(tmp_path / "lumen.vtp", points * [wide, 1, 1], triangles), tmp_path / "vessel.msh"
+    file, path = written(tmp_path / "lumen.ply", points * [wide, 1, 1], triangles), tmp_path / "vessel.msh"
     assert wall(file, "--thickness", 0.5, "--size", 0.5, "-o", path) == 0
     said = re.search(r"thickness ([\d.]+) to 0.5 at the nodes; volume of the lumen ([\d.]+)", capsys.readouterr().out)
     assert said is not None and float(said[1]) > 0.48
@@ -219,13 +253,19 @@ def test_what_is_no_lumen_is_refused_in_one_line(
     assert list(tmp_path.iterdir()) == [file]
 
 
+WORDS = with_words(*tube())
+CUT = WORDS[: len(WORDS) * 3 // 4].encode()
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
         ("lumen.stl", b"solid nothing"), ("lumen.ply", b"ply\nformat ascii 1.0\nelement vertex 99999999999\n"),
         ("lumen.vtp", b"<!DOCTYPE x [<!ENTITY a 'b'>]><VTKFile/>"), ("lumen.obj", b"v 0 0\nf 1 2 3\n"),
+        ("more.ply", CUT), ("fewer.ply", WORDS.replace("face 2304", "face 2302").encode()),
         ("cut.stl", as_programs_write(*tube())["capitals.stl"][:5000]),
         ("corners.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 4\n"),
+        ("points.ply", WORDS.replace("\n3 0 ", "\n3 5000 ").encode()),
         ("lumen.step", b""), ("lumen.vtp", b"<VTKFile type='PolyData'><xi:include href='/etc/passwd'/></VTKFile>"),
     ],
 )  # fmt: skip
