@@ -365,7 +365,7 @@ class FileBody(WithRegions, FromFile):
             if load == "displacement" and face in moved:
                 raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
             if load == "pressure" and kind in HELD_ACROSS:
-                raise SceneError(f"{key}: its support ({kind!r}) carries all of it; must be a face that moves")
+                raise SceneError(f"{key}: its support ({kind!r}) carries the pressure; must be a face that moves")
             moved |= {face: name} if load == "displacement" else {}
 
     def hold_faces(
