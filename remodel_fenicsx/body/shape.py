@@ -10,6 +10,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
@@ -39,6 +40,10 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
     from remodel_fenicsx.fem.quadrature import Quadrature
+
+Regions = Mapping[str, Region]
+Supports = Mapping[str, Support]
+Loads = Mapping[str, Load]
 
 
 # ---------------------------------------------------------------- the columns of a history
@@ -108,6 +113,9 @@ class Column:
         """
         name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
         return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
+
+
+Columns = tuple[Column, ...]
 
 
 # ---------------------------------------------------------------- fibre angle over depth
@@ -209,8 +217,9 @@ COLUMNS: dict[str, Column] = {
 """Columns of every shape by name, after `time` and the shape's columns; scripts may add columns."""
 
 
-def _turned_over(name: str, m: Any) -> float:
-    return float(m.observer.stepper.part("turnover").mean(name))
+def _of_turnover(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
+    """Make a column of a function of `evolution.turnover.Turnover`."""
+    return Column(name, unit, meaning, lambda m: float(value(m.observer.stepper.part("turnover"))), by_case=False)
 
 
 COLUMNS_ON_REQUEST: dict[str, Column] = {
@@ -246,12 +255,11 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             by_case=False,
         ),
         *(
-            Column(
+            _of_turnover(
                 name,
                 "",
                 f"{what} of collagen over its initial value, volume mean; with remodeling.turnover",
-                partial(_turned_over, name),
-                by_case=False,
+                methodcaller("mean", name),
             )
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
         ),
@@ -262,19 +270,17 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio),
             by_case=False,
         ),
-        Column(
+        _of_turnover(
             "collagen_share",
             "",
             "volume fraction of collagen in the tissue, mean over the initial volume",
-            lambda m: m.observer.stepper.part("turnover").collagen_share(),
-            by_case=False,
+            methodcaller("collagen_share"),
         ),
-        Column(
+        _of_turnover(
             TURNOVER_POWER,
             "stress length^3 / time",
             "power that turnover releases at the row's F, without growth",
-            lambda m: m.observer.stepper.part("turnover").power(),
-            by_case=False,
+            methodcaller("power"),
         ),
         Column(
             "processor_seconds",
@@ -296,7 +302,7 @@ def columns_of(
     regions: Iterable[str] = (),
     cases: int = 1,
     held: Iterable[str] = (),
-) -> tuple[Column, ...]:
+) -> Columns:
     """Return the columns of a shape's history, with columns on request last.
 
     If default columns are requested by name, the history has only these, with time and loads.
@@ -549,8 +555,8 @@ class Shape(_Is):  # type: ignore[misc]
     """
 
     loads: ClassVar[dict[str, LoadKind]]
-    columns: ClassVar[tuple[Column, ...]]
-    columns_on_request: ClassVar[tuple[Column, ...]] = ()
+    columns: ClassVar[Columns]
+    columns_on_request: ClassVar[Columns] = ()
     angle_layers: ClassVar[dict[str, float]] = {}
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
@@ -684,16 +690,16 @@ class Shape(_Is):  # type: ignore[misc]
             On all ranks, if Gmsh fails.
         """
 
-    def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+    def build_with(self, regions: Regions, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the body with a scene's regions, if these have a geometry. Collective."""
         return self.build(mesh, comm)
 
-    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+    def region_depths(self, regions: Regions) -> dict[str, tuple[float, float]]:
         """Return start and end depth of regions that are layers; empty for other regions."""
         return {}
 
     @classmethod
-    def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
+    def region_columns_on_request(cls, name: str) -> Columns:
         """Return further columns that a scene may name for its region `name`."""
         return ()
 
@@ -729,7 +735,7 @@ class Shape(_Is):  # type: ignore[misc]
             if name in loads if loads is not None else known:
                 kind.add(self, loading, name)
 
-    def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
+    def held_faces(self, supports: Supports) -> list[str]:
         """Return the faces with supports `[supports.NAME]`, without the shape's own supports.
 
         Parameters
@@ -754,7 +760,7 @@ class Shape(_Is):  # type: ignore[misc]
         """
         return cls.loads
 
-    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+    def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
         """Check that the faces of a mesh can have these supports and loads. Collective.
 
         Parameters
@@ -770,9 +776,7 @@ class Shape(_Is):  # type: ignore[misc]
             If a face cannot, on all ranks: one line with the key.
         """
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
+    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
         """Add the supports `[supports.NAME]` of faces.
 
         Parameters
@@ -838,7 +842,7 @@ class WithRegions(Shape):
     ['tube', 'mesh', 'solid']
     """
 
-    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+    def check_regions(self, regions: Regions, mesh: Mesh) -> None:
         """Check that the body can have these regions.
 
         Parameters
@@ -885,7 +889,7 @@ def axial_dead_force(face: str) -> LoadKind:
     )
 
 
-def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
+def uniaxial_columns(top: str, length: str) -> Columns:
     """Return the columns of a body under tension along z: stretches and mean fibre angle.
 
     Parameters
@@ -935,7 +939,7 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
     )
 
 
-def cauchy_columns(*names: str) -> tuple[Column, ...]:
+def cauchy_columns(*names: str) -> Columns:
     """Return columns of the Cauchy stress, volume means.
 
     Parameters
