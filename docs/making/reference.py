@@ -53,7 +53,7 @@ def paragraphs(text: str) -> list[str]:
 
 def _allowed_in_words(field: FieldInfo) -> str:
     """What a field allows, without what stands once above all tables."""
-    words = re.sub(r"^(must be|allowed is|allowed are) ", "", allowed(field))
+    words = re.sub(r"^must be (one of )?", "", allowed(field))
     return _cell(words.replace("a finite number", "a number").replace("greater than", "above"))
 
 

@@ -1,4 +1,4 @@
-"""Bodies: meshed domains with supports and loads. Each file is one whole shape; `SHAPES` names them for scenes."""
+"""Bodies: meshed domains with supports and loads, one file a shape; `SHAPES` names them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["SHAPES", "Cube", "LoadKind", "Shape", "Tendon", "Tube"]
 
 
 class _Shapes(UserDict[str, Any]):
-    """By name, classes or their dotted names: one that no scene asks for is not imported."""
+    """Registry of shapes: classes, or their dotted names, which are imported on first access."""
 
     def __getitem__(self, name: str) -> Any:
         return resolved(super().__getitem__(name))
@@ -33,9 +33,9 @@ SHAPES = _Shapes(
         "solid": "remodel_fenicsx.body.mesh_body:Solid",
     }
 )
-"""The shapes that a scene may name; a script adds its own."""
+"""Shapes by their name in a scene; scripts may add shapes."""
 
-# a reader of files, in a process of its own, needs none of them
+# The child process that reads files needs none of these modules.
 MODULES = {
     "Cube": "body.box",
     "LoadKind": "body.shape",

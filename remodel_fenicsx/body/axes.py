@@ -1,10 +1,11 @@
-"""Directions and lengths in any body with an inner and an outer face, an inlet and outlets, by a few linear solves.
+"""Local axes, depth and station in any body with inner and outer face, inlet and outlet.
 
-1. phi is harmonic, 0 on the inner and 1 on the outer face. Its unit gradients, projected onto continuous vectors, give
-   the radial direction: raw gradients are those of plane facets, which lean by up to half of their angle.
-2. The axial direction is the smoothest field of vectors that are normal to the ends and square to the radial one.
-3. Lengths along r from the inner and the outer face give depth and thickness (Yezzi & Prince 2003); lengths along a
-   from the ends give the station.
+1. phi is harmonic, 0 on the inner and 1 on the outer face. Its unit gradients, projected onto
+continuous vectors, are the radial direction. Raw gradients are those of plane facets, which are
+inclined by up to half of their angle. 2. The axial direction is the smoothest vector field that is
+normal to the ends and perpendicular to the radial direction. 3. Lengths along r from the inner and
+the outer face give depth and thickness (Yezzi & Prince 2003); lengths along a from the ends give
+the station.
 """
 
 from __future__ import annotations
@@ -41,15 +42,17 @@ if TYPE_CHECKING:
 spatial = Late("scipy.spatial")  # few bodies need it
 Facets = NDArray[np.int32]
 
-# of 1/thickness: an element with all its nodes on one face has no gradient of phi, and 0/0 would be everywhere
+# Smallest |grad phi| over 1/thickness. An element with all its nodes on one face has no gradient of
+# phi, and its 0/0 would spread to all nodes.
 LEAST_SLOPE = 1e-6
-# weight of (a . r)^2 against |grad a|^2 times the squared thickness: 10 and 1000 differ by 0.2 degrees rms in a bend
+# Weight of (a . r)^2 relative to |grad a|^2 times the squared thickness. In a bend the axes of 10
+# and 1000 differ by 0.2 degrees (RMS).
 SQUARE_TO_RADIAL = 10.0
-TINY = 1e-12  # of a squared length of about one: no direction is divided by zero
+TINY = 1e-12  # added to a squared length of about one, against division by zero
 
 
 def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
-    """Radial and axial direction, lengths from inner and outer face, inlet and outlet: functions. Collective."""
+    """Compute radial and axial direction, and lengths from the four faces. Collective."""
     mesh, degree = domain.mesh, quadrature.element_degree
     inner, outer, starts, ends = map(domain.facets, ROLES)
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
@@ -60,24 +63,25 @@ def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     (trial, test), r, a = _arguments(stiffness.space), _unit(radial), _unit(axial)
     along_r = Positive(ufl.inner(r, ufl.grad(trial)) * ufl.inner(r, ufl.grad(test)) * dx)
     through = [_length(along_r, r, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))]
-    # Lengths along single lines, as through the wall, would differ over the section of a bend.
+    # Unlike lengths through the wall, these are not along single lines, which would differ over the
+    # section of a bend.
     along = [_length(stiffness, a, dx, facets, sign, True) for facets, sign in ((starts, 1.0), (ends, -1.0))]
     return [radial, axial, *through, *along]
 
 
 def slopes(mesh: Mesh, degree: int, dx: ufl.Measure) -> Positive:
-    """The form of harmonic functions. Collective."""
+    """Assemble the form of harmonic functions. Collective."""
     trial, test = _arguments(lagrange(mesh, degree, ()).function_space)
     return Positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
 
 
 def harmonic(stiffness: Positive, low: Facets, high: Facets) -> Function:
-    """The harmonic function that is 0 on some facets and 1 on others. Collective."""
+    """Compute the harmonic function that is 0 on some facets and 1 on others. Collective."""
     return stiffness.solve(None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)])
 
 
 def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Function:
-    """Projected unit gradients of the harmonic function."""
+    """Project the unit gradients of the harmonic function onto continuous vectors."""
     mesh, slope, (trial, test) = phi.function_space.mesh, ufl.grad(phi), _arguments(phi.function_space)
     least, way = (dolfinx.fem.Constant(mesh, number) for number in (np.float64(LEAST_SLOPE / thickness), np.zeros(3)))
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
@@ -89,7 +93,7 @@ def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Fu
 
 
 def _axial(radial: Function, dx: ufl.Measure, starts: Facets, ends: Facets, thickness: float) -> Function:
-    """The smoothest field: least integral of |grad a|^2 + k (a . r)^2 / thickness^2 with the ends' normals."""
+    """Minimise the integral of |grad a|^2 + k (a . r)^2 / thickness^2, with the ends' normals."""
     space, normal = radial.function_space, _unit(radial)
     weight = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2))
     trial, test = _arguments(space)
@@ -101,7 +105,7 @@ def _axial(radial: Function, dx: ufl.Measure, starts: Facets, ends: Facets, thic
 def _length(
     form: Positive, direction: Expr, dx: ufl.Measure, facets: Facets, sign: float, multigrid: bool = False
 ) -> Function:
-    """The function, 0 on facets, whose gradient is nearest to a direction: along it alone, or as a vector."""
+    """Compute the function, 0 on facets, whose gradient fits a direction in the form's norm."""
     test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(form.space.mesh, np.float64(sign))
     flux = factor * ufl.inner(direction, ufl.grad(test)) * dx
     return form.solve(flux, [_held(form.space, facets, 0.0)], multigrid)
@@ -122,7 +126,7 @@ def _held(space: FunctionSpace, facets: Facets, value: float) -> DirichletBC:
 
 
 def _normal_to_ends(function: Function, starts: Facets, ends: Facets) -> DirichletBC:
-    """Inward normals on the inlets, outward ones on the outlets: at nodes the mean over the facets by their area."""
+    """Prescribe inward normals on inlets and outward ones on outlets, averaged by area."""
     space, sums = function.function_space, dolfinx.fem.Function(function.function_space)
     values, layout = sums.x.array.reshape(-1, 3), space.dofmap.dof_layout
     for facets, sign in ((starts, -1.0), (ends, 1.0)):
@@ -139,11 +143,11 @@ def _normal_to_ends(function: Function, starts: Facets, ends: Facets) -> Dirichl
 
 # ---------------------------------------------------------------- facets
 def outward_areas(mesh: Mesh, facets: Facets) -> Array:
-    """Area times outward normal of the facets between their corners, (n, 3); zero for those that another rank owns."""
+    """Return area times outward normal of facets, (n, 3); zero if another rank owns the facet."""
     cells, number = cells_of(mesh, facets)
     of_facets, nodes = np.array(basix.topology(mesh.basix_cell())[2]), geometry_dofmap(mesh)[cells]
     if of_facets.shape[1] == 4:
-        of_facets = of_facets[:, [0, 1, 3, 2]]  # dolfinx does not go around
+        of_facets = of_facets[:, [0, 1, 3, 2]]  # dolfinx's order is a tensor product's
     corners = mesh.geometry.x[np.take_along_axis(nodes, of_facets[number], axis=1)]
     vectors = area_vectors(corners)
     middles = mesh.geometry.x[nodes].mean(axis=1)
@@ -153,36 +157,37 @@ def outward_areas(mesh: Mesh, facets: Facets) -> Array:
 
 
 def area(mesh: Mesh, facets: Facets) -> float:
-    """Of facets, between their corners, over all ranks. Collective."""
+    """Return the area of facets, from their corners, over all ranks. Collective."""
     local = float(np.linalg.norm(outward_areas(mesh, facets), axis=1).sum())
     return float(over_ranks(mesh.comm, local, MPI.SUM))
 
 
-# ---------------------------------------------------------------- local axes, depth and station at points
-# Local axes, depth and station at the points of any body, from the fields of `_fields`.
+# ---------------------------------------------------------------- local axes, depth and station
+# Values at the quadrature points of any body, from the fields of `_fields`.
 
 log = logging.getLogger(__name__)
 
-LEAST_RADIAL = 0.2  # length of the mean of unit gradients: below, they point all ways
-LEAST_TANGENT = 0.1  # share of the axial field that lies in the wall: below, it runs through the wall
-# of the volume: 13 forks, coarse and fine, with one element through the wall or two, had 0.03 % at most, in the crotch;
-# with half of the outer face named inner it was 0.7 % (a thick wall, fine) to 43 % (one element)
+LEAST_RADIAL = 0.2  # length of the mean unit gradient: below it there is no common direction
+LEAST_TANGENT = 0.1  # in-plane fraction of the axial field: below it the field crosses the wall
+# Largest fraction of the volume without local axes. In 13 forks, coarse and fine, with one or two
+# elements through the wall, it was 0.03 % at most, in the crotch. With half of the outer face named
+# inner it was 0.7 % (a thick wall, fine) to 43 % (one element).
 MOST_UNDEFINED = 0.01
 
 
 class UndefinedAxes(SceneError):
-    """More of the body than a few points has no local axes."""
+    """Error: the local axes are undefined in more of the body than a few points."""
 
 
 def found_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
-    """Local axes of a mesh with `ROLES`. Collective."""
+    """Compute the local axes of a mesh with the faces `ROLES`. Collective."""
     if missing := [face for face in ROLES if face not in domain.faces]:
-        raise UndefinedAxes(f"geometry.faces: the local axes of a wall need a face {', '.join(map(repr, missing))}")
+        raise UndefinedAxes(f"geometry.faces: the local axes need a face {', '.join(map(repr, missing))}")
     try:
         radial, axial, *lengths = _fields(domain, quadrature)
     except SolveStopped as stopped:
-        raise UndefinedAxes(f"geometry.faces: the local axes were not found: {stopped}") from stopped
-    PETSc.garbage_cleanup(domain.mesh.comm)  # several ranks keep matrices that nobody has any more until then
+        raise UndefinedAxes(f"geometry.faces: cannot compute local axes: {stopped}") from stopped
+    PETSc.garbage_cleanup(domain.mesh.comm)  # on several ranks unused matrices are only freed here
     fields = ufl.as_vector([*radial, *axial, *lengths])
     values = quadrature.evaluate(jit.expression(fields, quadrature.points), (len(fields),))
     axes, known = _axes(values[..., :3], values[..., 3:6])
@@ -192,11 +197,11 @@ def found_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
         words = f"undefined in {100 * share:.2g} % of the wall, first at ({x:.4g}, {y:.4g}, {z:.4g})"
         if share > MOST_UNDEFINED:
             raise UndefinedAxes(
-                f"geometry.faces: the local axes are {words}; allowed is {100 * MOST_UNDEFINED:g} %. Is there an outer "
-                "face across the wall from the inner one?"
+                f"geometry.faces: the local axes are {words}; must be at most "
+                f"{100 * MOST_UNDEFINED:g} %. Is there an outer face opposite the inner one?"
             )
         if domain.comm.rank == 0:
-            log.info("the local axes are %s; those of the nearest point are used there", words)
+            log.info("the local axes are %s; using those of the nearest point there", words)
         _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
     dofs = dof_of_node(domain.mesh, lengths[0].function_space)
@@ -206,9 +211,9 @@ def found_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
 
 
 def _axes(radial: Array, axial: Array) -> tuple[Array, Flags]:
-    """Rows c, a, r from vectors of any length, and where they are defined."""
+    """Return rows c, a, r from vectors of any length, and a mask of defined axes."""
     length, along = np.linalg.norm(radial, axis=-1), np.linalg.norm(axial, axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):  # what is undefined is filled afterwards
+    with np.errstate(invalid="ignore", divide="ignore"):  # undefined axes are filled afterwards
         r = radial / length[..., None]
         tangent = axial - np.sum(axial * r, axis=-1)[..., None] * r
         size = np.linalg.norm(tangent, axis=-1)
@@ -218,21 +223,21 @@ def _axes(radial: Array, axial: Array) -> tuple[Array, Flags]:
 
 
 def _share(first: Array, second: Array) -> Array:
-    """first / (first + second) between 0 and 1; lengths of a few points are below zero by their error."""
+    """Return first / (first + second), clipped to [0, 1]: a few lengths are slightly negative."""
     low, high = np.maximum(first, 0.0), np.maximum(second, 0.0)
     total = low + high
     return np.divide(low, total, out=np.full_like(total, 0.5), where=total > 0)
 
 
 def _first_place(quadrature: Quadrature, there: Flags) -> Array:
-    """The first marked place in space, whatever the number of ranks."""
+    """Return the first marked position, independent of the number of ranks. Collective."""
     marked = quadrature.owned(quadrature.coordinates)[quadrature.owned(there)]
     places = [place for part in of_all_ranks(quadrature.mesh.comm, marked) for place in part]
     return min(places, key=lambda place: np.round(place, 9).tolist())
 
 
 def _fill(axes: Array, known: Flags, quadrature: Quadrature) -> None:
-    """Give points without axes those of the nearest one that has some. Collective."""
+    """Copy the axes of the nearest point with axes to each point without. Collective."""
     good = quadrature.owned(known)
     own = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
     places, candidates = map(np.concatenate, zip(*of_all_ranks(quadrature.mesh.comm, own), strict=True))

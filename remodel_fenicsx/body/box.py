@@ -1,4 +1,4 @@
-"""Blocks: the unit cube, the paper's first specimen (Fig. 5), and the planar sheet of a biaxial test."""
+"""Blocks: the cube, the paper's first specimen (Fig. 5), and the sheet of a biaxial test."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class Box(Shape):
-    """A block from the origin along x, y and z, which slides on the planes x = y = z = 0."""
+    """Block from the origin along x, y and z, with symmetry planes x = y = z = 0."""
 
     face_names = ("x0", "x1", "y0", "y1", "z0", "z1")
     _counts: ClassVar[tuple[int, int, int]]
@@ -45,21 +45,21 @@ class Box(Shape):
     @property
     @abstractmethod
     def sides(self) -> dict[str, float]:
-        """By their keys: along x, y and z, or one for all."""
+        """Side lengths by their keys: along x, y and z, or one for all."""
 
     @property
     def _lengths(self) -> list[float]:
-        """Along x, y and z."""
+        """Side lengths along x, y and z."""
         return (3 * [*self.sides.values()])[:3]
 
     @property
     def axial_length(self) -> float:
-        """Along z."""
+        """Length of the block along z."""
         return self._lengths[2]
 
     @property
     def section_area(self) -> float:
-        """Across z."""
+        """Area of the section across z."""
         return self._lengths[0] * self._lengths[1]
 
     @model_validator(mode="after")
@@ -68,17 +68,19 @@ class Box(Shape):
         return self
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """So many elements along x, y and z, times the refinement; of the paper's cube one."""
+        """Mesh the block; `_counts` are the elements along x, y and z with refinement 1."""
         return box_domain(self.name, self.sides, self._lengths, self._counts, mesh, comm)
 
     def hold(self, loading: Loading) -> None:
-        """Symmetry planes x = y = z = 0."""
+        """Constrain the symmetry planes x = y = z = 0."""
         for component, face in enumerate(("x0", "y0", "z0")):
             loading.hold_face(face, component)
 
 
 class Cube(Box):
-    """A cube, pulled along z: the homogeneous body of the paper's Fig. 5. It slides on the planes x = y = z = 0.
+    """Cube under tension along z, the homogeneous body of the paper's Fig. 5.
+
+    Its faces x = 0, y = 0 and z = 0 slide in their planes.
 
     Its keyword arguments are the keys of `[geometry]`: `side` in the unit `length_unit`, or in any one unit.
 
@@ -105,13 +107,13 @@ class Cube(Box):
     _counts: ClassVar[tuple[int, int, int]] = (1, 1, 1)
 
     shape: Literal["cube"] = "cube"
-    """Which body it is."""
+    """Shape of the body."""
     side: Annotated[float, LENGTH] = Field(default=1.0, gt=0)
     """Length of an edge, in the scene's unit of length."""
 
     @property
     def sides(self) -> dict[str, float]:
-        """The one."""
+        """Length of an edge by its key."""
         return {"side": self.side}
 
 
@@ -119,12 +121,12 @@ SIDES = "xy"
 
 
 def _gradient(row: int, column: int) -> Callable[[Any], float]:
-    """Volume mean of a component of F; of the length from edge to edge where it is on the diagonal."""
+    """Return a measure: the volume mean of a component of F; a diagonal one is a length ratio."""
     return lambda m: m.quadrature.mean(m.F[..., row, column])
 
 
 def _nominal(row: int, column: int) -> Callable[[Any], float]:
-    """Volume mean of P = J sigma F^-T."""
+    """Return a measure: the volume mean of a component of P = J sigma F^-T."""
 
     def value(m: Any) -> float:
         def mean() -> Array:
@@ -145,7 +147,7 @@ def _force(side: int) -> LoadKind:
 
     return LoadKind(
         lambda shape, loading, name: loading.add_dead_force(name, f"{axis}1", side, getattr(shape, f"length_{axis}")),
-        f"force along {axis} on the edge {axis} = length_{axis}: given, its direction stays, or what the edge bears",
+        f"force along {axis} on the edge {axis} = length_{axis}: dead load, or the reaction",
         FORCE,
         value=lambda m: nominal(m) * area(m.observer.shape),
         reductions=("point",),
@@ -160,7 +162,7 @@ def _elongation(side: int) -> LoadKind:
         lambda shape, loading, name: loading.add_prescribed_elongation(
             name, f"{axis}1", side, getattr(shape, f"length_{axis}")
         ),
-        f"engineering strain along {axis}: given, or what the sheet comes to",
+        f"engineering strain along {axis}: prescribed, or the result",
         value=lambda m: stretch(m) - 1.0,
         above=-1.0,
         reductions=("point",),
@@ -169,10 +171,11 @@ def _elongation(side: int) -> LoadKind:
 
 
 class Sheet(Box):
-    """A sheet in the plane of x and y, as biaxial tests have it. It slides on the planes x = y = z = 0.
+    """Sheet in the plane of x and y, as in biaxial tests.
 
-    Along x and along y a force or an elongation may be given, or neither: then the edge is free. Lengths: 1e-6 to 1e6,
-    one up to 10,000 times the other.
+    Its faces x = 0, y = 0 and z = 0 slide in their planes. Along x and y a force or an elongation
+    may be prescribed; without either the edge is free. Lengths: 1e-6 to 1e6, one up to 10,000 times
+    the other.
 
     Its keyword arguments are the keys of `[geometry]`: lengths in the unit `length_unit`, or in any one unit.
 
@@ -196,7 +199,7 @@ class Sheet(Box):
         **{f"elongation_{axis}": _elongation(side) for side, axis in enumerate(SIDES)},
         "shear": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_shear(name),
-            "shear F_xy of the sheet, by which places move along x with y; F_yx is 0",
+            "shear F_xy of the sheet: displacement along x over y; F_yx is 0",
             reductions=("point",),
             of_one_strain=True,
         ),
@@ -205,7 +208,7 @@ class Sheet(Box):
         Column(
             "fibre_angle",
             "degrees",
-            "angle between chains and x in the reference body, mean over the volume",
+            "angle between chains and x in the reference configuration, volume mean",
             lambda m: m.quadrature.mean_of_known(m.fibre_angle),
             by_case=False,
         ),
@@ -226,10 +229,10 @@ class Sheet(Box):
     _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
     depth_in_words = ("through the sheet", "lower face", "upper face")
     angle_in_words = ("along x", "across x")
-    buckles = False  # it lies on z = 0
+    buckles = False  # the face z = 0 stays in its plane
 
     shape: Literal["sheet"] = "sheet"
-    """Which body it is."""
+    """Shape of the body."""
     length_x: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
     """Side along x."""
     length_y: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
@@ -239,11 +242,11 @@ class Sheet(Box):
 
     @property
     def sides(self) -> dict[str, float]:
-        """Along x, y and z, by their keys."""
+        """Side lengths along x, y and z, by their keys."""
         return {"length_x": self.length_x, "length_y": self.length_y, "thickness": self.thickness}
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
-        """To x."""
+        """Return the angle of the chains to x."""
         return angle_to_axis(dimensions, axes, np.array([1.0, 0.0, 0.0]))
 
 
@@ -255,16 +258,18 @@ def box_domain(
     mesh: Mesh,
     comm: MPI.Intracomm | None = None,
 ) -> Domain:
-    """A block from the origin along x, y and z, with the faces x0, x1, y0, y1, z0 and z1, meshed by Gmsh. Collective.
+    """Mesh a block from the origin along x, y and z by Gmsh. Collective.
+
+    The block has the faces x0, x1, y0, y1, z0 and z1.
 
     Parameters
     ----------
     shape
-        Name of the shape that it is a mesh of.
+        Name of the meshed shape.
     dimensions
         The shape's dimensions by name, for `Domain`.
     lengths
-        Along x, y and z, (3,), in the unit of length.
+        Side lengths along x, y and z, (3,), in the unit of length.
     counts
         Elements along x, y and z with refinement 1.
     mesh

@@ -1,7 +1,7 @@
-"""The meshed body, shared by all ranks, and its data in the order in which it was built.
+"""The meshed body, distributed over all ranks, and its data in the order of the input mesh.
 
-Gmsh draws it on rank 0 (`body.gmsh_model`); intervals and quadrilaterals, on which a part of a body stands for all of
-it, are structured meshes without Gmsh.
+Gmsh meshes it on rank 0 (`body.gmsh_model`). Intervals and quadrilaterals of reduced bodies are
+structured meshes without Gmsh.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ Marker = Callable[[Array], Flags]
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """A meshed body with named faces and regions.
+    """Meshed body with named faces and regions.
 
-    Elements and nodes have the numbers under which rank 0 gave them to dolfinx (0, 1, ... in the order of the
-    input). They do not depend on the number of ranks: what belongs to an element or a node for good is drawn and
-    written by them.
+    Elements and nodes keep the numbers with which rank 0 passed them to dolfinx (0, 1, ... in the
+    order of the input). The numbers do not depend on the number of ranks. Permanent data of an
+    element or node are drawn and written in their order.
 
     Parameters
     ----------
     mesh
-        dolfinx mesh of the reference body, distributed.
+        dolfinx mesh of the reference configuration, distributed.
     facet_tags
         dolfinx mesh tags of the boundary facets.
     faces
@@ -51,23 +51,25 @@ class Domain:
     shape
         Name of the shape (`extend.SHAPES`).
     dimensions
-        The shape's dimensions by name, in the scene's unit of length. Tendon: also `radius`, that of the outer nodes.
+        The shape's dimensions by name, in the scene's unit of length. A tendon also has `radius`,
+        the radius of the outer nodes.
     regions
-        Name of a region -> its number in `element_region`, on every rank; a body of one piece has one. A shape gives
-        them as named volumes of what it draws with Gmsh (`build_domain`), or here (`layers.Wall.marked`). Every
-        element is in one; a scene's `[regions.NAME]` names some or all of them.
+        Name of a region -> its number in `element_region`, on every rank; a body without named
+        regions has one. A shape defines regions as named volumes of its Gmsh model
+        (`build_domain`), or here (`layers.Wall.marked`). Every element is in one region; a scene's
+        `[regions.NAME]` names some or all of them.
     element_region
-        Number of each local element's region, owned ones first, then ghosts, (local elements,) int32; default: the
-        one region.
+        Number of each local element's region, owned elements first, then ghosts, (local elements,)
+        int32; default: the only region.
 
     Attributes
     ----------
     element_number
-        Number of each local element, owned ones first, then ghosts, (local elements,) int64.
+        Number of each local element, owned elements first, then ghosts, (local elements,) int64.
     node_number
-        Number of each local geometry node, owned ones first, then ghosts, (local nodes,) int64.
+        Number of each local geometry node, owned nodes first, then ghosts, (local nodes,) int64.
     number_of_elements, number_of_nodes
-        Of the whole mesh.
+        Numbers of the global mesh.
 
     Examples
     --------
@@ -86,7 +88,7 @@ class Domain:
     shape: str
     dimensions: dict[str, float]
     regions: dict[str, int] = field(default_factory=lambda: {"body": 1})
-    element_region: npt.NDArray[np.int32] = None  # type: ignore[assignment]  # then made below
+    element_region: npt.NDArray[np.int32] = None  # type: ignore[assignment]  # set below
     element_number: Integers = field(init=False)
     node_number: Integers = field(init=False)
     number_of_elements: int = field(init=False)
@@ -94,7 +96,7 @@ class Domain:
 
     def __post_init__(self) -> None:
         topology, geometry = self.mesh.topology, self.mesh.geometry
-        settle = object.__setattr__  # the dataclass is frozen: these follow from the mesh
+        settle = object.__setattr__  # the dataclass is frozen; these values follow from the mesh
         settle(self, "element_number", np.asarray(topology.original_cell_index, dtype=np.int64))
         settle(self, "node_number", np.asarray(geometry.input_global_indices, dtype=np.int64))
         settle(self, "number_of_elements", int(topology.index_map(topology.dim).size_global))
@@ -110,20 +112,21 @@ class Domain:
 
     @cached_property
     def size(self) -> float:
-        """Largest dimension that is a length: the scale for tolerances on coordinates."""
+        """Largest dimension that is a length, the scale for tolerances of coordinates."""
         return max(value for name, value in self.dimensions.items() if name != "area")
 
     def facets(self, face: str) -> npt.NDArray[np.int32]:
-        """Local facets of a named face, ascending, (n,)."""
+        """Return the local facets of a named face, ascending, (n,)."""
         return self.facet_tags.find(self.faces[face])
 
     def gather_elements(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
-        """Bring what belongs to the elements to rank 0, in input order. Collective.
+        """Gather values of the elements on rank 0, in input order. Collective.
 
         Parameters
         ----------
         values
-            One row per local element, (owned ones or more, ...): rows behind the owned ones (ghosts) are ignored.
+            One row per local element, (owned elements or more, ...). The rows after those of the
+            owned elements (ghosts) are ignored.
 
         Returns
         -------
@@ -140,12 +143,14 @@ class Domain:
         return self._gather(np.asarray(values), self.element_number[:owned])
 
     def scatter_elements(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
-        """Give every rank the rows of its elements, ghosts included: the way back of `gather_elements`. Collective.
+        """Scatter rows to the ranks of their elements, including ghosts. Collective.
+
+        This is the inverse of `gather_elements`.
 
         Parameters
         ----------
         values
-            (number_of_elements, ...) on rank 0, in input order; elsewhere it is not looked at.
+            (number_of_elements, ...) on rank 0, in input order; ignored on other ranks.
 
         Returns
         -------
@@ -157,12 +162,13 @@ class Domain:
         return np.asarray(self.comm.scatter(parts, root=0))
 
     def gather_nodes(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
-        """Bring what belongs to the geometry nodes to rank 0, in input order. Collective.
+        """Gather values of the geometry nodes on rank 0, in input order. Collective.
 
         Parameters
         ----------
         values
-            One row per local geometry node, (owned nodes or more, ...), as `mesh.geometry.x` has them.
+            One row per local geometry node, (owned nodes or more, ...), in the order of
+            `mesh.geometry.x`.
 
         Returns
         -------
@@ -178,13 +184,14 @@ class Domain:
         return self._gather(np.asarray(values), self.node_number[:owned])
 
     def gather_mesh(self) -> tuple[Array, Integers] | tuple[None, None]:
-        """The whole mesh on rank 0, in input order, the same for every number of ranks. Collective.
+        """Gather the mesh on rank 0, in input order, independent of the rank count. Collective.
 
         Returns
         -------
         points, elements
-            (number_of_nodes, 3) and (number_of_elements, nodes per element) on rank 0, None elsewhere. Within one
-            the nodes have dolfinx's (tensor product) order; `elements[:, dolfinx.cpp.io.perm_vtk(type, n)]` has VTK's.
+            (number_of_nodes, 3) and (number_of_elements, nodes per element) on rank 0, None
+            elsewhere. The nodes of an element have dolfinx's (tensor product) order;
+            `elements[:, dolfinx.cpp.io.perm_vtk(type, n)]` has VTK's.
         """
         points = self.gather_nodes(self.mesh.geometry.x)
         elements = self.gather_elements(self.node_number[compat.geometry_dofmap(self.mesh)])
@@ -204,31 +211,31 @@ class Domain:
 
 
 class SymbolicMesh(ufl.Mesh):
-    """A `ufl.Mesh` that makes its cell once."""
+    """UFL mesh that constructs its cell only once."""
 
     def __init__(self, coordinate_element: Any) -> None:
         super().__init__(coordinate_element)
         self._cell = super().ufl_cell()
 
     def ufl_cell(self) -> Any:
-        """The same cell each time."""
+        """Return the same cell object at each call."""
         return self._cell
 
 
 def symbolic_mesh(kind: str, degree: int) -> SymbolicMesh:
-    """Of the element that dolfinx's reader of Gmsh's meshes takes, too: their kernels are those of other bodies."""
+    """Return a mesh of the element of dolfinx's Gmsh reader, so that all bodies share kernels."""
     return SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, basix.LagrangeVariant.equispaced, shape=(3,)))
 
 
-# ---------------------------------------------------------------- drawn by Gmsh
+# ---------------------------------------------------------------- meshes by Gmsh
 
 
 def build_domain(
     draw: Callable[[], None], shape: str, dimensions: dict[str, float], comm: MPI.Intracomm | None = None
 ) -> Domain:
-    """Draw and mesh on rank 0, then share the mesh. Collective."""
+    """Draw and mesh a body on rank 0, then distribute the mesh. Collective."""
     comm = comm or MPI.COMM_WORLD
-    # with several threads Scotch parts the same mesh differently from run to run
+    # With several threads Scotch's partition of the same mesh differs from run to run.
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
     with ExitStack() as stack:
         model = groups = failure = None
@@ -237,11 +244,11 @@ def build_domain(
                 model = stack.enter_context(gmsh_model(shape)).model
                 draw()
                 groups = named_groups()
-            except BaseException as error:  # whatever it is, nobody waits for ever
+            except BaseException as error:  # any error must reach the other ranks, which wait
                 failure = error
         verdict = failure and f"Gmsh could not mesh the {shape}: {str(failure) or type(failure).__name__}"
         verdict, groups = comm.bcast((verdict, groups), root=0)
-        if failure is not None and not isinstance(failure, Exception):  # Ctrl-C on rank 0 stays what it is there
+        if failure is not None and not isinstance(failure, Exception):  # Ctrl-C on rank 0 stays one
             raise failure
         if groups is None:
             raise GeometryError(verdict) from failure
@@ -251,27 +258,27 @@ def build_domain(
     region[cell_tags.indices] = cell_tags.values
     drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups[0], shape, dimensions, groups[1]
     domain = Domain(*drawn, region)
-    return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # ghosts too
+    return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # with ghosts
 
 
 # ---------------------------------------------------------------- facets
 
 
 def cells_of(mesh: Mesh, facets: npt.NDArray[np.int32]) -> tuple[Integers, Integers]:
-    """The element behind each facet of the boundary, and the facet's number in it."""
+    """Return the element of each boundary facet, and the facet's number in the element."""
     topology, dimension = mesh.topology, mesh.topology.dim
     for pair in ((dimension - 1, dimension), (dimension, dimension - 1), (dimension - 1, 0)):
         topology.create_connectivity(*pair)
     to_cells = topology.connectivity(dimension - 1, dimension)
     cells = to_cells.array[to_cells.offsets[facets]].astype(np.int64)
     of_cells = topology.connectivity(dimension, dimension - 1)
-    number = of_cells.offsets[1] if len(cells) else 1  # facets of an element
+    number = of_cells.offsets[1] if len(cells) else 1  # number of an element's facets
     return cells, np.argmax(of_cells.array.reshape(-1, number)[cells] == facets[:, None], axis=1)
 
 
 def dof_of_node(mesh: Mesh, space: FunctionSpace) -> Integers:
-    """Number of the (blocked) degree of freedom at each local geometry node, (nodes,)."""
-    # the element and the geometry have the same degree: node k of an element is dof k of that element
+    """Return the (blocked) degree of freedom at each local geometry node, (nodes,)."""
+    # The space and the geometry have the same degree: node k of an element is its dof k.
     found = np.zeros(len(mesh.geometry.x), dtype=np.int64)
     found[compat.geometry_dofmap(mesh).reshape(-1)] = space.dofmap.list.reshape(-1)
     return found
@@ -279,7 +286,8 @@ def dof_of_node(mesh: Mesh, space: FunctionSpace) -> Integers:
 
 # ---------------------------------------------------------------- structured, without Gmsh
 
-# places (second direction, first one) of a quadrilateral's nodes in the order of basix: corners, edges, inside
+# Lattice indices (second direction, first direction) of a quadrilateral's nodes in basix's order:
+# corners, edges, interior.
 _QUADRILATERAL = {1: [0, 1, 2, 3], 2: [0, 2, 6, 8, 1, 3, 5, 7, 4]}
 
 
@@ -287,7 +295,7 @@ def lattice_domain(
     points: Array, counts: Sequence[int], degree: int, faces: Mapping[str, Marker], shape: str,
     dimensions: dict[str, float], comm: MPI.Intracomm | None = None,
 ) -> Domain:  # fmt: skip
-    """So many lines, or quadrilaterals along two directions, between nodes in rows of the first one. Collective."""
+    """Mesh nodes in rows by lines or quadrilaterals. Collective."""
     comm = comm or MPI.COMM_WORLD
     first, *second = (degree * np.arange(count)[:, None] + np.arange(degree + 1) for count in counts)
     kind, elements = "interval", first[:, [0, degree, *range(1, degree)]]

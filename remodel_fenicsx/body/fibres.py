@@ -1,4 +1,4 @@
-"""Files of measured fibres: VTU and XDMF by meshio, CSV. They are data: nothing in them is run or followed."""
+"""Files of measured fibres (VTU, XDMF, CSV), read as data: nothing in them is executed."""
 
 from __future__ import annotations
 
@@ -25,15 +25,17 @@ from remodel_fenicsx.system.children import LARGEST_FILE
 log = logging.getLogger(__name__)
 
 FIBRE_ENDINGS = (".vtu", ".xdmf", ".csv")
-SOLID = ("tetra", "hexa", "wedge")  # beginnings of the names of elements
-SAME_PLACE = 1e-4  # of an element: files may have 7 digits; a neighbour is a whole one away
+SOLID = ("tetra", "hexa", "wedge")  # prefixes of the names of element types
+# Largest distance of the same position, over the element size. Files may have 7 digits; the
+# neighbouring element is one element size away.
+SAME_PLACE = 1e-4
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
 GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
 OF_GROUPS = {name: tuple(f"{name}_{c}" for c in parts) for name, parts in GROUPS.items()}
 OF_ONE_COLUMN = ("element", "angle", "weight")
 OF_TABLES = (*"xyz", *OF_ONE_COLUMN, *itertools.chain(*OF_GROUPS.values()))
-# ParaView writes the number of a component, and Points for places
+# ParaView writes the number of a component, and Points for positions.
 SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
 SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_"}
 EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [f"axis_{i}_{c}" for i in (1, 2, 3) for c in "xyz"]
@@ -41,7 +43,7 @@ EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [f"axis_{i}_{c}" for i i
 
 @dataclass(frozen=True)
 class FibreFile:
-    """What a file of fibres holds."""
+    """Contents of a file of fibres."""
 
     measured: dict[str, Array]
     places: Array | None
@@ -49,33 +51,36 @@ class FibreFile:
 
     @property
     def sha256(self) -> str:
-        """Of the file, in hexadecimal digits."""
+        """SHA-256 of the file, in hexadecimal digits."""
         return hashlib.sha256(self.data).hexdigest()
 
     def rows_of(self, corners: Array, chosen: Flags) -> tuple[Integers, float | None]:
-        """The row for each element of a mesh, and how far the farthest is away; None where rows are elements."""
+        """Return the row for each element of a mesh, and the largest distance between the two.
+
+        The distance is None if the rows are the elements.
+        """
         count, centres = len(next(iter(self.measured.values()))), corners.mean(axis=1)
         sizes = 2 * np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
         if count == len(centres):
             if self.places is None or (np.abs(self.places - centres) < SAME_PLACE * sizes[:, None]).all():
                 return np.arange(count), None
         if self.places is None:
-            raise UnreadableFile(f"has {count} rows without places (x, y, z), the mesh has {len(centres)} elements")
+            raise UnreadableFile(f"has {count} rows without positions x, y, z; the mesh has {len(centres)} elements")
         rows = np.zeros(len(centres), dtype=np.int64)
         far, rows[chosen] = cKDTree(self.places).query(centres[chosen])
         if (far > sizes[chosen]).any():
             worst = (far / sizes[chosen]).argmax()
             place, size = in_place(centres[chosen][worst]), sizes[chosen][worst]
-            rule = f"nothing is measured within one element ({size:.3g}) of {place}; "
+            rule = f"has no measurement within one element ({size:.3g}) of {place}; "
             raise UnreadableFile(rule + f"the nearest is {far[worst]:.3g} away")
         return rows, float(far.max())
 
 
 def read_fibre_file(path: Path) -> FibreFile:
-    """Read measured fibres."""
+    """Read a file of measured fibres."""
     ending = path.suffix.lower()
     if ending not in FIBRE_ENDINGS:
-        raise UnreadableFile(f"allowed are files {', '.join(FIBRE_ENDINGS)}")
+        raise UnreadableFile(f"must be a file {', '.join(FIBRE_ENDINGS)}")
     try:
         if ending == ".csv":
             data = read_regular(path, LARGEST_FILE)
@@ -87,14 +92,14 @@ def read_fibre_file(path: Path) -> FibreFile:
     if (found := fault_of_fibres(measured)) is not None:
         raise UnreadableFile(found)
     if places is not None and not np.isfinite(places).all():
-        raise UnreadableFile("has places that are not finite")
+        raise UnreadableFile("has positions that are not finite")
     if "angle" in measured and (words := convention_doubt("angle", measured["angle"])):
         log.warning("%s, angle: %s", path.name, words)
     return FibreFile(measured, places, data)
 
 
 def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
-    """Columns by name: structure_tensor_xx ..., fibre_x ..., fibre_2_x ..., weight, angle; element, or x, y, z."""
+    """Read columns structure_tensor_xx, fibre_x, fibre_2_x ..., weight, angle, element, x, y, z."""
     columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
     groups: list[tuple[str, Sequence[str]]] = [
         *OF_GROUPS.items(),
@@ -120,11 +125,11 @@ def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     return {name: values[order] for name, values in measured.items()}, None if places is None else places[order]
 
 
-_NEEDED = f"needed is one of {', '.join(SOURCES)}"
+_NEEDED = f"must have one of {', '.join(SOURCES)}"
 
 
 def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
-    """Arrays of the solid elements, or else of the points; and the file."""
+    """Read arrays of the solid elements, or else of the points, their positions and the file."""
     mesh = read_exchange_file(path)
     try:
         solid = [rows for kind, rows in mesh.cells if kind.startswith(SOLID)]
@@ -147,6 +152,6 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
 
 
 def _columns(values: Array) -> Array:
-    """As (rows, columns)."""
+    """Reshape an array to (rows, columns)."""
     rows = np.asarray(values, dtype=np.float64)
     return rows.reshape(len(rows), -1)

@@ -1,4 +1,4 @@
-"""Gmsh: plane section, extrusion, named faces, curved elements, and what it can mesh. Without dolfinx."""
+"""Gmsh models: plane sections, extrusion, named faces, curved elements, limits. Without dolfinx."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.tensors import Array
 
-gmsh: Any = Late("gmsh")  # it takes 0.2 s and only rank 0 needs it
+gmsh: Any = Late("gmsh")  # the import takes 0.2 s, and only rank 0 needs it
 
-# Gmsh takes points that are closer than 1e-8 for one, and crashes on much longer or flatter bodies
+# Gmsh merges points that are closer than 1e-8, and crashes on much longer or flatter bodies.
 SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
 
 
@@ -25,7 +25,7 @@ class GeometryError(RemodelError, RuntimeError):
 
     Examples
     --------
-    Its text is one line, for whoever has asked for the mesh:
+    The text is one line:
 
     >>> from remodel_fenicsx import parts
     >>> raise parts.GeometryError("Gmsh could not mesh the tube")
@@ -36,25 +36,25 @@ class GeometryError(RemodelError, RuntimeError):
 
 
 def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
-    """What keeps a body from being meshed: the name of one of its lengths, and what is allowed."""
+    """Return the name of a length that prevents meshing, and the rule that it breaks, or None."""
     for name, length in lengths.items():
         if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:
-            return name, f"a length of {length:g} here; allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
+            return name, f"{length:g} long; must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
     smallest, largest = min(lengths, key=lambda k: lengths[k]), max(lengths, key=lambda k: lengths[k])
     if lengths[largest] <= LARGEST_LENGTH_RATIO * lengths[smallest]:
         return None
     return smallest, (
-        f"a length of {lengths[smallest]:g} is too small beside one of {lengths[largest]:g}; "
-        f"allowed is a ratio up to {LARGEST_LENGTH_RATIO:g}"
+        f"{lengths[smallest]:g} long, too small for a length of {lengths[largest]:g}; "
+        f"their ratio must be at most {LARGEST_LENGTH_RATIO:g}"
     )
 
 
 @contextmanager
 def gmsh_model(name: str) -> Iterator[Any]:
-    """A fresh, silent Gmsh model; whatever happens, Gmsh is left as it was found."""
+    """Create a new, silent Gmsh model, and restore Gmsh's previous state when the block ends."""
     foreign = gmsh.isInitialized()
     if not foreign:
-        # no ~/.gmshrc, which could change the mesh; not interruptible: Ctrl-C stays Python's
+        # A ~/.gmshrc could change the mesh. Not interruptible: Python handles Ctrl-C.
         gmsh.initialize(readConfigFiles=False, interruptible=False)
     terminal = gmsh.option.getNumber("General.Terminal")
     gmsh.option.setNumber("General.Terminal", 0)
@@ -63,7 +63,7 @@ def gmsh_model(name: str) -> Iterator[Any]:
     try:
         yield gmsh
     finally:
-        if foreign:  # a script that uses Gmsh itself keeps its models
+        if foreign:  # keep the models of a script that uses Gmsh itself
             gmsh.model.remove()
             gmsh.model.setCurrent(previous)
             gmsh.option.setNumber("General.Terminal", terminal)
@@ -72,8 +72,9 @@ def gmsh_model(name: str) -> Iterator[Any]:
 
 
 def named_groups() -> tuple[dict[str, int], dict[str, int]]:
-    """Faces and regions of the current model, which share out its volumes: their numbers by name."""
-    # dolfinx looks at these things on rank 0 only, where a failure would leave the other ranks waiting.
+    """Return the numbers of the model's faces and disjoint regions by name."""
+    # dolfinx checks these conditions only on rank 0. A failure there would leave the other ranks
+    # waiting.
     faces, regions, kinds = _groups(2), _groups(3), gmsh.model.mesh.getElements(3)[0]
     if not regions or len(kinds) != 1 or not faces:
         raise GeometryError(f"{len(regions)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
@@ -94,17 +95,20 @@ def _groups(dimension: int) -> dict[str, int]:
     return dict(zip(names, tags, strict=True))
 
 
-# ---------------------------------------------------------------- what the shapes are made of
+# ---------------------------------------------------------------- components of shapes
 def circle(radius: float, number: int, start: int = 0) -> Array:
-    """Corners of a regular polygon around the origin, (number, 2); corner `start` first, corner 0 on the x axis."""
+    """Return the corners of a regular polygon around the origin, (number, 2).
+
+    Corner `start` is the first one; corner 0 is on the x axis.
+    """
     angle = 2.0 * np.pi * (start + np.arange(number)) / number
     corners = np.column_stack((np.cos(angle), np.sin(angle)))
-    corners[np.abs(corners) < 1e-15] = 0.0  # nodes on the axes are exactly on them
+    corners[np.abs(corners) < 1e-15] = 0.0  # nodes on the axes have exact zeros
     return radius * corners
 
 
 class Point(NamedTuple):
-    """A point of the plane z = 0 that is a node of the mesh."""
+    """Point of the plane z = 0 that is a node of the mesh."""
 
     tag: int
     x: float
@@ -112,15 +116,15 @@ class Point(NamedTuple):
 
 
 def points(coordinates: Array) -> list[Point]:
-    """Points at (n, 2)."""
+    """Add points at coordinates (n, 2)."""
     pairs = [(float(x), float(y)) for x, y in coordinates]
     return [Point(gmsh.model.geo.addPoint(x, y, 0.0), x, y) for x, y in pairs]
 
 
 def line(start: Point, stop: Point, elements: int = 1) -> list[int]:
-    """Straight chain of equal curves of one element each."""
-    # So every node is given, as on the circles: the places that Gmsh finds along a curve are good to 1e-12 on straight
-    # lines and to 1e-9 on arcs only.
+    """Add a straight chain of equal curves of one element each."""
+    # Every node is prescribed, as on circles, because Gmsh's own nodes along a curve are accurate
+    # only to 1e-12 on straight lines and to 1e-9 on arcs.
     geo = gmsh.model.geo
     fraction = np.arange(1, elements)[:, None] / elements
     between = points((1.0 - fraction) * np.array(start[1:]) + fraction * np.array(stop[1:]))
@@ -132,13 +136,13 @@ def line(start: Point, stop: Point, elements: int = 1) -> list[int]:
 
 
 def polygon(corners: Sequence[Point], is_closed: bool = True) -> list[int]:
-    """Chain of straight curves of one element each; curve i starts at corner i."""
+    """Add a chain of straight curves of one element each; curve i starts at corner i."""
     chain = [*corners, corners[0]] if is_closed else corners
     return [line(start, stop)[0] for start, stop in itertools.pairwise(chain)]
 
 
 def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], element: str) -> int:
-    """Structured plane surface between four sides (each a chain of curves, a closed loop in all) and four corners."""
+    """Add a structured plane surface between four sides (chains of curves) and four corners."""
     geo = gmsh.model.geo
     surface = geo.addPlaneSurface([geo.addCurveLoop([curve for side in edges for curve in side])])
     geo.mesh.setTransfiniteSurface(surface, cornerTags=[corner.tag for corner in corners])
@@ -148,7 +152,7 @@ def block(edges: Sequence[Sequence[int]], corners: Sequence[Point], element: str
 
 
 def reverse(curves: Sequence[int]) -> list[int]:
-    """The same chain of curves, run through backwards."""
+    """Return a chain of curves in reverse direction."""
     return [-curve for curve in reversed(curves)]
 
 
@@ -156,7 +160,7 @@ def ring(
     inner: Sequence[Point], outer: Sequence[Point], inner_lines: Sequence[int], outer_lines: Sequence[int],
     spokes: Sequence[Sequence[int]], element: str,
 ) -> list[int]:  # fmt: skip
-    """Blocks between two polygons, closed ones or not, from each of the spokes to the next."""
+    """Add blocks between two open or closed polygons, from each spoke to the next."""
     blocks = len(spokes) - (len(inner) - len(inner_lines))
     part, found = len(inner_lines) // blocks, []
     for i in range(blocks):
@@ -183,7 +187,7 @@ def extrude(
     tops = [made[i - 1][1] for i, (dimension, _) in enumerate(made) if dimension == 3]
     groups = {ends[0]: list(section), ends[1]: tops}
     for name, curves in sides.items():
-        # besides the section itself, the face swept by a boundary curve is the only one that the curve bounds
+        # A boundary curve bounds only two faces: the section and the face that it sweeps.
         swept = {int(face) for curve in curves for face in gmsh.model.getAdjacencies(1, abs(curve))[0]}
         groups[name] = sorted(swept - set(section))
     for name, surfaces in groups.items():
@@ -193,7 +197,7 @@ def extrude(
 
 
 def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> None:
-    """Give the straight elements nodes between their corners, and curve them around the z axis."""
+    """Add nodes between the corners of straight elements, and curve them around the z axis."""
     if degree == 1:
         return
     mesh = gmsh.model.mesh

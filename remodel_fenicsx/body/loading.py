@@ -1,4 +1,4 @@
-"""Supports and loads of a body: boundary conditions, dead traction, follower pressure, prescribed elongation."""
+"""Supports and loads: boundary conditions, dead traction, follower pressure, elongation."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ LoadValues = dict[str, float]
 
 
 def values_of_loads(loads: Mapping[str, Load], time: float) -> LoadValues:
-    """Magnitude of every load of a scene at a time."""
+    """Return the magnitude of every load of a scene at a time."""
     return {name: load.value * load.factor(time) for name, load in loads.items()}
 
 
 class Loading:
-    """What holds and drives a body: boundary conditions, external forces, and their magnitudes by name.
+    """Supports and loads of a body: boundary conditions, external forces, and their magnitudes.
 
     Parameters
     ----------
@@ -43,18 +43,19 @@ class Loading:
     unknown
         dolfinx function of the unknowns.
     kinematics
-        What they mean.
+        Meaning of the unknowns.
 
     Attributes
     ----------
     weight
-        Volume of the body per unit of mesh, or area per unit of its faces (UFL): a factor of every term.
+        Volume of the body per unit of mesh, or area per unit of its faces (UFL), a factor of every
+        term.
     boundary_conditions
         dolfinx Dirichlet conditions.
     values
-        Present magnitude of each named load.
+        Current magnitude of each named load.
     has_caps
-        Whether a pressure inside acts on caps at the ends too: a support says so.
+        Whether an internal pressure also acts on caps at the ends; a support sets it.
 
     Examples
     --------
@@ -66,7 +67,7 @@ class Loading:
     >>> for component, face in enumerate(("x0", "y0", "z0")):
     ...     loading.hold_face(face, component)
     >>> loading.add_dead_force("force", "z1", component=2)
-    >>> loading.set({"force": 10.0})  # in the unit of stress times that of length squared
+    >>> loading.set({"force": 10.0})  # in the unit of stress times the unit of length squared
     >>> loading.values, round(loading.area("z1"), 12), len(loading.boundary_conditions)
     ({'force': 10.0}, 4.0, 3)
     """
@@ -80,49 +81,51 @@ class Loading:
         self._setters: dict[str, list[Callable[[float], None]]] = {}
         self._terms: list[Callable[[Function, Expr], ufl.Form]] = []
         self._potentials: list[Potential] = []
-        self._begins: dict[int, str] = {}  # where the strain is one number: the face from which it is counted
+        self._begins: dict[int, str] = {}  # by component of uniform strain: first constrained face
         self.has_caps = False
         self.supports: dict[str, Potential | None] = (
             {}
-        )  # by face: the potential of its springs, a function of u; None: held
+        )  # by face: the potential of its springs, a function of u; None: fixed
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
-        """u_component = 0 on a named face.
+        """Prescribe u_component = 0 on a named face.
 
         Parameters
         ----------
         face
-            Its name, of `Domain.faces`.
+            Name of the face in `Domain.faces`.
         component
             0, 1 or 2: x, y or z.
 
         Raises
         ------
         SceneError
-            Where the strain is one unknown: if a face across z is held along it, for then the body bulges.
+            If the strain is one unknown and a face is constrained laterally: the body would bulge.
         """
         if self.kinematics.uniform_unknown(self.space, component) is None:
             self._prescribe_face(face, component, self.constant(0.0))
         elif face in self.domain.faces and component != 2:
-            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: {face} is held across, so it bulges")
+            raise SceneError(
+                f"model.kinematics = {self.kinematics.name!r}: {face} " "is constrained laterally, so the body bulges"
+            )
         elif self._begins.setdefault(component, face) != face:
             self._prescribe_strain(component, self.constant(0.0))
 
     def hold_node(self, point: tuple[float, float, float], component: int) -> None:
-        """u_component = 0 at the mesh node at `point`, where the body could move as a whole.
+        """Prescribe u_component = 0 at a mesh node, if the kinematics has rigid body modes.
 
         Parameters
         ----------
         point
-            Its reference place, (3,), in the unit of length.
+            Reference position of the node, (3,), in the unit of length.
         component
             0, 1 or 2: x, y or z.
 
         Raises
         ------
         ValueError
-            If the mesh has no node there.
+            If the mesh has no node at `point`.
         """
         if not self.kinematics.moves_rigidly:
             return
@@ -136,27 +139,27 @@ class Loading:
         found = self.domain.mesh.comm.allreduce(int(np.sum(dofs[0] < owned)), MPI.SUM)
         if found != 1:
             raise ValueError(f"{found} mesh nodes at {point}: a support needs exactly one")
-        # on the sub-space's own dofs alone the value is a Constant, as for faces
+        # With the dofs of the subspace only, the value is a Constant, as for faces.
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace))
 
     def hold_facets(self, facets: NDArray[np.int32], name: str | None = None, way: Array | float = 0.0) -> None:
-        """u = magnitude times `way` on local facets, of the full displacement.
+        """Prescribe u = magnitude times `way` on local facets, for the full displacement.
 
         Parameters
         ----------
         facets
-            Their local numbers.
+            Local numbers of the facets.
         name
-            Of the load whose magnitude it is; None: u = 0.
+            Name of the load that sets the magnitude; None: u = 0.
         way
             Displacement at magnitude 1, (3,).
 
         Raises
         ------
         SceneError
-            Of kinematics that are not those of a mesh in three dimensions.
+            If the kinematics is not that of a mesh in three dimensions.
         """
-        self._check_three_dimensional("facets that are held")
+        self._check_three_dimensional("fixed facets")
         value = dolfinx.fem.Constant(self.domain.mesh, np.zeros(3, dtype=PETSc.ScalarType))
         dofs = dolfinx.fem.locate_dofs_topological(self.space, self.domain.mesh.topology.dim - 1, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
@@ -165,38 +168,43 @@ class Loading:
 
     # ------------------------------------------------------------ loads
     def add_dead_force(self, name: str, face: str, component: int, length: float | None = None) -> None:
-        """A total force on a face: constant nominal traction, force over reference area, along a coordinate axis.
+        """Add a dead load: a total force on a face along a coordinate axis.
+
+        The nominal traction is constant, force over reference area.
 
         Parameters
         ----------
         name
-            Of the load; `set` gives it a magnitude by this name. It is a force: stress times length squared.
+            Name of the load. Its magnitude (`set`) is a force: stress times length squared.
         face
-            Its name, of `Domain.faces`.
+            Name of the face in `Domain.faces`.
         component
             0, 1 or 2: x, y or z.
         length
-            Of the body across the face, in the unit of length: with it kinematics whose strain along this axis is one
-            number need no such face.
+            Length of the body across the face, in the unit of length. With it, kinematics of
+            uniform strain along this axis do not need the face.
         """
         uniform = self.kinematics.uniform_unknown(self.space, component)
         if length is not None and uniform is not None:
             dx = ufl.Measure("dx", domain=self.domain.mesh)
-            force = self.magnitude(name, length / uniform[1] / self._integral(dx))  # per number u, spread over the body
+            # The force of one unknown is distributed over the volume.
+            force = self.magnitude(name, length / uniform[1] / self._integral(dx))
             self.add_potential(lambda u: -force * u[component] * self.weight * dx)
             return
         traction, measure = self.magnitude(name, 1.0 / self.area(face)), self.surface_measure(face)
         self.add_term(lambda u, v: -traction * v[component] * self.weight * measure)
 
     def add_follower_pressure(self, name: str, face: str) -> None:
-        """A pressure on the deformed face, against its outward normal: p cof(F) N . v, with the exact linearisation.
+        """Add a follower pressure: a pressure on the deformed face, against its outward normal.
+
+        The term is p cof(F) N . v, with the exact linearisation.
 
         Parameters
         ----------
         name
-            Of the load; `set` gives it a magnitude by this name. It is a stress.
+            Name of the load. Its magnitude (`set`) is a stress.
         face
-            Its name, of `Domain.faces`.
+            Name of the face in `Domain.faces`.
         """
         pressure = self.magnitude(name)
         normal = ufl.FacetNormal(self.domain.mesh)
@@ -205,17 +213,18 @@ class Loading:
         self.add_term(lambda u, v: pressure * ufl.inner(ufl.cofac(F(u)) * normal, v) * self.weight * measure)
 
     def add_cavity_pressure(self, name: str, face: str) -> None:
-        """A pressure in the cavity inside a face and two plane caps across z, on the deformed face and on the caps.
+        """Add the pressure of a cavity between a face and two plane caps across z.
 
-        Its potential is -p V with the volume V = -1/2 integral of (x e_x + y e_y) . cof(F) N over the face: the caps,
-        across which z alone changes, add nothing to it.
+        The pressure acts on the deformed face and on the caps. Its potential is -p V with the
+        volume V = -1/2 integral of (x e_x + y e_y) . cof(F) N over the face. The caps, whose
+        normals are along z, do not contribute to V.
 
         Parameters
         ----------
         name
-            Of the load; `set` gives it a magnitude by this name. It is a stress.
+            Name of the load. Its magnitude (`set`) is a stress.
         face
-            Its name, of `Domain.faces`.
+            Name of the face in `Domain.faces`.
         """
         pressure, normal, measure = self.magnitude(name), ufl.FacetNormal(self.domain.mesh), self.surface_measure(face)
 
@@ -228,46 +237,46 @@ class Loading:
         self.add_potential(potential)
 
     def add_axial_force(self, name: str) -> None:
-        """A force on the ends along z, of kinematics whose length is an unknown (`FreeLength`); others lack it."""
+        """Add a force on the ends along z if the length is an unknown (`FreeLength`)."""
         change = getattr(self.kinematics, "change_of_length", None)
         if change is None:
             return
         dx = ufl.Measure("dx", domain=self.domain.mesh)
-        # spread over the body: the change of the length has no place
+        # The force is distributed over the volume, because the change of length has no position.
         force = self.magnitude(name, 1.0 / self._integral(dx))
         self.add_potential(lambda u: -force * change(u) * self.weight * dx)
 
     def add_prescribed_shear(self, name: str) -> None:
-        """F_xy = magnitude of kinematics whose strain is the same everywhere.
+        """Prescribe F_xy = magnitude for kinematics of uniform strain.
 
         Parameters
         ----------
         name
-            Of the load; `set` gives it a magnitude by this name. It is a number.
+            Name of the load. Its magnitude (`set`) is a number without unit.
 
         Raises
         ------
         SceneError
-            Of other kinematics.
+            If the kinematics has no uniform shear.
         """
         shear = self.kinematics.shear()
         if shear is None:
-            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for a prescribed shear is 'point'")
+            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: " "must be 'point' for a prescribed shear")
         self._take(name, shear, 1.0)
 
     def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
-        """u_component = elongation * length on a face: the engineering strain of the whole length.
+        """Prescribe u_component = elongation * length on a face, the engineering strain.
 
         Parameters
         ----------
         name
-            Of the load; `set` gives it a magnitude by this name. It is a number: 0.1 is 10 % longer.
+            Name of the load. Its magnitude (`set`) is a number without unit: 0.1 is 10 % longer.
         face
-            Its name, of `Domain.faces`.
+            Name of the face in `Domain.faces`.
         component
             0, 1 or 2: x, y or z.
         length
-            The reference length, in the unit of length.
+            Reference length, in the unit of length.
         """
         strain = self.kinematics.uniform_strain(component)
         if strain is not None:
@@ -284,25 +293,26 @@ class Loading:
         displacement: Callable[[float, Array], Array],
         components: Sequence[int] = (0, 1, 2),
     ) -> None:
-        """u = displacement(magnitude, places) on a face: any function of the magnitude, a rotation say.
+        """Prescribe u = displacement(magnitude, X) on a face, such as a rotation.
 
         Parameters
         ----------
         name
-            Of the load; `set` gives it a magnitude by this name.
+            Name of the load, whose magnitude `set` sets.
         face
-            Its name, of `Domain.faces`.
+            Name of the face in `Domain.faces`.
         displacement
-            Function of the magnitude and of reference places (n, 3) that returns displacements (n, 3).
+            Function of the magnitude and of reference positions X (n, 3) that returns displacements
+            (n, 3).
         components
-            Those that are prescribed, of 0, 1 and 2: x, y and z; the others are free.
+            Prescribed components, from 0, 1 and 2: x, y and z. Other components are free.
 
         Raises
         ------
         SceneError
-            Of kinematics that are not those of a mesh in three dimensions.
+            If the kinematics is not that of a mesh in three dimensions.
         """
-        self._check_three_dimensional("displacements that are prescribed")
+        self._check_three_dimensional("prescribed displacements")
         facets = self.domain.facets(face)
         for component in components:
             subspace = self.kinematics.subspace(self.space, component)
@@ -313,49 +323,49 @@ class Loading:
             self.follow(name, _setter(value, dofs[1], component, displacement))
 
     def follow(self, name: str, setter: Callable[[float], None]) -> None:
-        """From now on call a function with each new magnitude of a load: what follows it in a way of its own.
+        """Register a function that is called with each new magnitude of a load.
 
         Parameters
         ----------
         name
-            Of the load.
+            Name of the load.
         setter
-            Called with its magnitude, now with zero.
+            Function of the magnitude. It is called immediately with zero.
         """
         self._setters.setdefault(name, []).append(setter)
         self.values[name] = 0.0
         setter(0.0)
 
     def add_term(self, term: Callable[[Function, Expr], ufl.Form]) -> None:
-        """Any other load, as a term of the residual: minus its virtual work.
+        """Add any load as a term of the residual, minus its virtual work.
 
         Parameters
         ----------
         term
-            Function of the unknown and of the virtual displacement, a 3-vector, that returns a UFL form:
-            ``lambda u, v: -ufl.inner(b, v) * dx`` is a body force b per reference volume. Its derivative with respect
-            to the unknown enters the tangent.
+            Function of the unknown and of the virtual displacement, a 3-vector, that returns a UFL
+            form: ``lambda u, v: -ufl.inner(b, v) * dx`` is a body force b per reference volume.
+            The derivative with respect to the unknown enters the tangent.
         """
         self._terms.append(term)
 
     def add_potential(self, potential: Potential) -> None:
-        """Any other load, as its potential: a function of the unknown that returns a UFL form."""
+        """Add any load as its potential, a function of the unknown that returns a UFL form."""
         self._potentials.append(potential)
 
     def magnitude(self, name: str, scale: float = 1.0) -> Constant:
-        """A Constant that is the named load's present magnitude times `scale`: what a term is made of."""
+        """Return a Constant that follows the load's magnitude times `scale`, for terms."""
         constant = self.constant(0.0)
         self._take(name, constant, scale)
         return constant
 
     def surface_measure(self, face: str) -> ufl.Measure:
-        """Measure over a named face of the mesh; times `weight` it is one over the body's face."""
+        """Return the measure over a face of the mesh; `weight` makes it the body's."""
         measure = ufl.Measure("ds", domain=self.domain.mesh, subdomain_data=self.domain.facet_tags)
         degree = field_degree(self.space)
         return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
 
     def measure_alone(self, face: str) -> ufl.Measure:
-        """As `surface_measure`, for forms of this face alone: they have the kernel of the same form of another face."""
+        """Return `surface_measure` for forms of one face, which share their kernels."""
         mesh, facets = self.domain.mesh, self.domain.facets(face)
         ones = np.ones(len(facets), dtype=np.int32)
         tags = dolfinx.mesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
@@ -363,7 +373,7 @@ class Loading:
         return measure(1, metadata={"quadrature_degree": 2 * field_degree(self.space)})
 
     def external_residual(self, test: ufl.Argument) -> ufl.Form | None:
-        """Minus the virtual work of the external forces, a UFL form; None without loads on faces or volumes."""
+        """Return minus the external virtual work, a UFL form, or None without loads."""
         virtual = self.kinematics.displacement(test)
         terms = [term(self.unknown, virtual) for term in self._terms]
         potentials = self.residual_of_potentials(test)
@@ -371,17 +381,18 @@ class Loading:
         return sum(terms) if terms else None
 
     def residual_of_potentials(self, test: ufl.Argument) -> ufl.Form | None:
-        """The part of it that has a potential: springs, of own bodies; None where there is none."""
+        """Return the residual of the loads with a potential, such as springs, or None."""
         terms = [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
         return sum(terms) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:
-        """Give the named loads new magnitudes.
+        """Set the magnitudes of named loads.
 
         Parameters
         ----------
         values
-            Magnitude of each load by name, in its unit: of a pressure stress, of a force stress times length squared.
+            Magnitude of each load by name. A pressure has the unit of stress, a force that of
+            stress times length squared.
 
         Raises
         ------
@@ -396,21 +407,21 @@ class Loading:
             self.values[name] = float(value)
 
     def area(self, face: str) -> float:
-        """Reference area of a named face."""
+        """Return the reference area of a named face. Collective."""
         return self._integral(self.measure_alone(face))
 
     # ------------------------------------------------------------ inside
     def _integral(self, measure: ufl.Measure) -> float:
-        """Volume or area of the body."""
+        """Return the volume or area of the body over a measure. Collective."""
         local = dolfinx.fem.assemble_scalar(jit.form(self.constant(1.0) * self.weight * measure))
         return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
 
     def constant(self, value: float) -> Constant:
-        """A number as an argument of kernels, so that another one compiles nothing."""
+        """Return a number as an argument of kernels, so that another value needs no compilation."""
         return dolfinx.fem.Constant(self.domain.mesh, PETSc.ScalarType(value))
 
     def _take(self, name: str, constant: Constant, scale: float | Array) -> None:
-        """From now on the constant is the named load's magnitude times `scale`."""
+        """Set a constant to the load's magnitude times `scale`, now and at each change."""
 
         def set_value(magnitude: float) -> None:
             constant.value = magnitude * scale
@@ -419,7 +430,7 @@ class Loading:
 
     def _check_three_dimensional(self, what: str) -> None:
         if not self.kinematics.three_dimensional:
-            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: allowed for {what} is 'full'")
+            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: must be 'full' for {what}")
 
     def _prescribe_strain(self, component: int, value: Constant) -> None:
         number, _ = self.kinematics.uniform_unknown(self.space, component)
@@ -437,7 +448,7 @@ class Loading:
 def _setter(
     value: Function, dofs: NDArray[np.int32], component: int, displacement: Callable[[float, Array], Array]
 ) -> Callable[[float], None]:
-    """Gives one component of the values on a face to a function of its own space."""
+    """Return a function that sets one component of the values on a face for a magnitude."""
     places = value.function_space.tabulate_dof_coordinates()[dofs]
 
     def set_values(magnitude: float) -> None:

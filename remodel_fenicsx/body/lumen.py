@@ -1,4 +1,7 @@
-"""From the surface of a lumen to the mesh of a wall: layers of prisms along its normals, as tetrahedra of degree 2."""
+"""Mesh of a wall from the surface of a lumen: layers of prisms along its normals.
+
+The prisms become tetrahedra of degree 2.
+"""
 
 from __future__ import annotations
 
@@ -34,20 +37,25 @@ from remodel_fenicsx.system.files import write_new
 from remodel_fenicsx.system.terminal import announce
 
 
-LARGE_SURFACE = 200_000  # triangles of which Gmsh divides 6,000 a second
-SHARP = 60.0  # degrees between two triangles from which on Gmsh keeps an edge between them
-HOLLOW = 1e-6  # of an area to the power of 1.5: a tube of that volume is 80,000 times longer than wide
-SMOOTHINGS = 50  # of the normals where a wall would fold over: more change no corner that is still there
+LARGE_SURFACE = 200_000  # triangles; Gmsh remeshes 6,000 a second
+SHARP = 60.0  # degrees between two triangles from which Gmsh keeps their edge
+# Smallest volume over area^1.5. A tube of this volume is 80,000 times longer than wide.
+HOLLOW = 1e-6
+SMOOTHINGS = 50  # passes over the normals if a wall folds; more do not change the remaining folds
 MOST_THROUGH = 100  # elements through the wall
-MOST_RADII, LEAST_RADII = 3.0, 2e-3  # of a wall: arterioles that are contracted have 2, the widest aneurysms 0.02
-LEAST_ROOM = 0.5  # of the thickness: an outer face that is nearer to the lumen lies in another part of the wall
-EDGES = ([0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3])  # of a tetrahedron, in the order of its further nodes
+# Wall thickness over the lumen's radius: 2 in contracted arterioles, 0.02 in the widest aneurysms.
+MOST_RADII, LEAST_RADII = 3.0, 2e-3
+# Smallest distance of the outer face from the lumen, over the thickness. A closer face lies in
+# another part of the wall.
+LEAST_ROOM = 0.5
+# Edges of a tetrahedron, in the order of its mid-edge nodes.
+EDGES = ([0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3])
 
 
 def read_surface(path: Path) -> Surface:
-    """The surface of a file; its ending is one of `SURFACES`."""
+    """Read a surface from a file whose suffix is in `SURFACES`."""
     if path.suffix.lower() not in SURFACES:
-        raise SceneError(f"{path}: allowed is a file that ends with {', '.join(SURFACES)}")
+        raise SceneError(f"{path}: must be a file {', '.join(SURFACES)}")
     try:
         surface, _ = triangles_of(path)
     except (OSError, UnreadableFile) as error:
@@ -55,48 +63,51 @@ def read_surface(path: Path) -> Surface:
     return oriented(surface, str(path))
 
 
-# ---------------------------------------------------------------- what a surface is
+# ---------------------------------------------------------------- surfaces
 
 
 def oriented(surface: Surface, name: str) -> Surface:
-    """The surface with all normals out of the lumen, whatever the file has; refused where it is none of a lumen."""
+    """Return the surface with all normals out of the lumen, and check that it bounds one."""
     mesh = polygons(surface.points, surface.triangles)
     kinds = {"boundary_edges": False, "feature_edges": False, "manifold_edges": False}
     if (odd := mesh.extract_feature_edges(non_manifold_edges=True, **kinds)).n_cells:
         place = in_place(odd.cell_centers().points[0])
-        raise SceneError(f"{name}: three triangles or more meet in one edge, at {place}; a lumen has two")
+        raise SceneError(f"{name}: three or more triangles share an edge at {place}; must be two")
     if not mesh.n_open_edges:
-        raise SceneError(f"{name}: the surface is closed; cut its ends open, where the vessel goes on")
+        raise SceneError(f"{name}: the surface is closed; cut the ends of the vessel open")
     if (parts := mesh.connectivity()["RegionId"].max() + 1) > 1:
-        raise SceneError(f"{name}: has {parts} parts that do not touch; allowed is one lumen")
+        raise SceneError(f"{name}: has {parts} disconnected parts; must be one lumen")
     normals = mesh.compute_normals(point_normals=False, split_vertices=False, auto_orient_normals=False)
     points, triangles = surface.points, normals.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
     volume, area = _signed_volume(points, triangles), np.linalg.norm(area_vectors(points[triangles]), axis=1).sum()
     if abs(volume) <= HOLLOW * area**1.5:
-        raise SceneError(f"{name}: the surface is flat, it encloses no lumen")
+        raise SceneError(f"{name}: the surface is flat and encloses no lumen")
     if volume < 0:
         triangles = triangles[:, ::-1]
     return Surface(points, triangles, surface.arrays)
 
 
 def _signed_volume(points: Array, triangles: Integers) -> float:
-    """Inside of the triangles and flat caps on their openings."""
+    """Return the volume inside the triangles and flat caps on their openings."""
     places = points[triangles]
     sides = np.einsum("ni,ni->", places.mean(axis=1), area_vectors(places)) / 3
     return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim in rims(triangles)))
 
 
 def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
-    """The surface with triangles of a size, by Gmsh, rounded, and the nearest corner before of each of its own."""
+    """Remesh the surface by Gmsh with triangles of a size, rounded.
+
+    Also return the nearest corner of the given surface for each new corner.
+    """
     from scipy.spatial import cKDTree
 
     numbers = io.BytesIO()
     np.savez(numbers, points=surface.points, triangles=surface.triangles, size=size)
-    try:  # a process of its own: Gmsh hears no signals
+    try:  # in a child process, because Gmsh ignores signals
         found = made_apart(numbers.getvalue(), "the surface", f"{__name__}:by_gmsh")
     except UnreadableFile as error:
         reason = str(error).removeprefix(DAMAGED)
-        raise SceneError(f"--size {size:g}: Gmsh could not divide the surface so: {reason}") from error
+        raise SceneError(f"--size {size:g}: Gmsh could not remesh the surface: {reason}") from error
     points, triangles = found["points"], found["triangles"]
     on_rims = np.isin(np.arange(len(points)), np.concatenate(rims(triangles)))
     divided = Surface(rounded(surface, points, on_rims), triangles, {})
@@ -104,7 +115,7 @@ def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
 
 
 def by_gmsh(file: str) -> dict[str, Any]:
-    """In the child process: points and triangles of a size, of those in a file."""
+    """Remesh the triangles of a file to a size, in the child process."""
     with np.load(file) as read, gmsh_model("wall") as gmsh:
         count, corners = len(read["points"]), read["triangles"].ravel() + 1
         gmsh.model.addDiscreteEntity(2, 1)
@@ -121,10 +132,10 @@ def by_gmsh(file: str) -> dict[str, Any]:
 
 
 def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
-    """Places near a surface on the smooth one through its corners, square to their normals; those of rims on its rims.
+    """Project positions near a surface to the smooth surface through its corners, rims to its rims.
 
-    Phong's tessellation with the factor 1/2, which is exact where the surface is a parabola: T. Boubekeur and M. Alexa,
-    Phong tessellation (2008).
+    The smooth surface is perpendicular to the corners' normals: Phong tessellation with the factor
+    1/2, exact for parabolas. T. Boubekeur and M. Alexa, Phong tessellation (2008).
     """
     rims_of_it = rims(surface.triangles)
     normals, found = _normals(surface, rims_of_it), np.empty_like(places)
@@ -140,13 +151,13 @@ def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
 
 
 def nearest(points: Array, simplices: Integers, places: Array) -> tuple[Integers, Array]:
-    """Which of the edges or triangles is the nearest of each place, and where."""
+    """Return the index of the nearest edge or triangle to each position, and the nearest point."""
     found: Any = polygons(points, simplices).find_closest_cell(places, return_closest_point=True)
     return found
 
 
 def polygons(points: Array, simplices: Integers) -> Any:
-    """Edges or triangles, as VTK has them."""
+    """Return edges or triangles as VTK's polygons."""
     import pyvista
 
     cells: Any = np.insert(simplices, 0, simplices.shape[1], axis=1).ravel()
@@ -157,7 +168,7 @@ def polygons(points: Array, simplices: Integers) -> Any:
 
 
 class GrownWall(NamedTuple):
-    """Tetrahedra of degree 2 with the numbers of their layers, and triangles of degree 2 of each face by name."""
+    """Tetrahedra of degree 2 with layer numbers, and the triangles of degree 2 of each face."""
 
     points: Array
     tetrahedra: Integers
@@ -167,7 +178,10 @@ class GrownWall(NamedTuple):
 
 
 def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[str, float], through: int) -> GrownWall:
-    """Prisms outwards of a surface, bent as the given one: thickness (points,), of which each layer has its share."""
+    """Extrude prisms from a surface outwards, curved as the given one, by a thickness (points,).
+
+    Each layer has its fraction of the thickness.
+    """
     ends, counts = np.cumsum([0.0, *layers.values()]), shared_out([*layers.values()], max(through, len(layers)))
     levels = Wall((*layers,), (*ends,), counts).nodes(1) / ends[-1]
     openings = rims(surface.triangles)
@@ -183,7 +197,7 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
         normals = _around(surface, normals[surface.triangles].sum(axis=1), openings)
     else:
         place = points[tetrahedra[folded][0]].mean(axis=0)
-        raise SceneError(f"--thickness: too thick: the wall folds over at {in_place(place)}, where the lumen is hollow")
+        raise SceneError(f"--thickness: too thick: the wall folds at {in_place(place)}, " "where the lumen is concave")
     _check_room(surface.points, points[-size:], thickness)
     of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(surface.triangles))
     faces = {"inner": surface.triangles, "outer": surface.triangles + size * (len(levels) - 1)}
@@ -194,7 +208,7 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
     rim_edges, key = np.sort(np.concatenate(openings), axis=1), [len(points), 1]
     keys = np.unique(np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2) @ key)
     pairs = np.column_stack(np.divmod(keys, len(points)))
-    # below each lies a corner of the surface, twice the same, or an edge of it
+    # Below each pair lies a corner of the surface, twice the same, or an edge.
     below, row = np.unique(np.sort(pairs % size, axis=1) @ key, return_inverse=True)
     ends = np.column_stack(np.divmod(below, len(points)))
     feet, is_edge = surface.points[ends].mean(axis=1), ends[:, 0] != ends[:, 1]
@@ -213,7 +227,7 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
 
 
 def _straightened(points: Array, tetrahedra: Integers) -> int:
-    """Give elements straight edges that are twisted by bent ones, until none is; how many edges these are."""
+    """Straighten edges of inverted elements until none is left; return the number of edges."""
     done: set[int] = set()
     body: Any = SimpleNamespace(kind="tetrahedron", degree=2, points=points, cells=tetrahedra[:, ORDERS["tetra10"]])
     while True:
@@ -242,43 +256,43 @@ def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
 
 
 def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
-    """Refuse a wall that reaches into another part of itself, or of the lumen."""
+    """Check that the wall does not reach into another part of itself or of the lumen."""
     from scipy.spatial import cKDTree
 
     distance, _ = cKDTree(inner).query(outer)
     if (crossed := distance < LEAST_ROOM * thickness).any():
         place = outer[int(np.argmax(crossed))]
-        raise SceneError(f"--thickness: too thick: the wall meets another part of the vessel at {in_place(place)}")
+        raise SceneError(f"--thickness: too thick: the wall intersects the vessel at {in_place(place)}")
 
 
-# ---------------------------------------------------------------- what the command does
+# ---------------------------------------------------------------- the command
 
 
 def write_wall(
     surface: Path, path: Path, thickness: str | None, layers: Sequence[str], size: float, through: int
 ) -> list[str]:
-    """Make the mesh of a wall and write it, a new file; what is in it, in lines."""
+    """Write the mesh of a wall to a new file, and return lines that describe it."""
     if path.suffix.lower() != ".msh":
-        raise SceneError(f"-o {path}: allowed is a file that ends with .msh")
+        raise SceneError(f"-o {path}: must be a file .msh")
     if path.exists():
-        raise SceneError(f"-o {path}: is there already; nothing is overwritten")
+        raise SceneError(f"-o {path}: already exists; nothing is overwritten")
     if not 0.0 < size < np.inf:
-        raise SceneError("--size: allowed is a number above 0")
+        raise SceneError("--size: must be a positive number")
     if not 1 <= through <= MOST_THROUGH:
-        raise SceneError(f"--through: allowed is a whole number from 1 to {MOST_THROUGH}")
+        raise SceneError(f"--through: must be an integer from 1 to {MOST_THROUGH}")
     shares, read = _thicknesses(layers), read_surface(surface)
     area = np.linalg.norm(area_vectors(read.points[read.triangles]), axis=1).sum()
-    number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # of equilateral triangles
+    number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # for equilateral triangles
     if number > LARGEST_MESH:
-        raise SceneError(f"--size {size:g}: makes about {number:.2g} tetrahedra; at most {LARGEST_MESH:g} are made")
+        raise SceneError(f"--size {size:g}: about {number:.2g} tetrahedra; must be at most {LARGEST_MESH:g}")
     depth, radius = _thickness(thickness, shares, read), 2 * _signed_volume(read.points, read.triangles) / area
     _check_units(radius, size, depth)
     if len(read.triangles) > LARGE_SURFACE:
-        announce(f"{surface}: {len(read.triangles)} triangles are divided again, which takes minutes")
+        announce(f"{surface}: remeshing {len(read.triangles)} triangles takes minutes")
     found, near = remeshed(read, size)
     wall = grown(found, read, depth[near], shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
-        raise SceneError(f"--layers {min(taken)}=...: a face has this name; choose another one for the layer")
+        raise SceneError(f"--layers {min(taken)}=...: a face has this name; rename the layer")
     names = list(shares) or ["wall"]
     of_names = {2: {name: number for number, name in enumerate(wall.faces, 1)}}
     of_names[3] = {name: number for number, name in enumerate(names, len(wall.faces) + 1)}
@@ -288,26 +302,27 @@ def write_wall(
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))
     nodes = np.unique(outer)
     between = np.linalg.norm(wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1)
-    # of parabolas: chords of half the length leave a quarter of what they leave out
+    # Richardson extrapolation for parabolas: chords of half the length have a quarter of the error.
     coarse, fine = (_signed_volume(wall.points, face) for face in (inner[:, :3], _halved(inner)))
     lines = [
         f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, {max(through, len(names))} through the wall",
         f"thickness {between.min():.4g} to {between.max():.4g} at the nodes; volume of the lumen "
-        f"{(4 * fine - coarse) / 3:.5g}, of the flat triangles of {surface.name} {radius * area / 2:.5g}",
+        f"{(4 * fine - coarse) / 3:.5g}, of the flat triangles in {surface.name} "
+        f"{radius * area / 2:.5g}",
         f"faces {', '.join(wall.faces)}; " + (f"regions {', '.join(names)}" if shares else "one region"),
     ]
     if wall.straight:
-        lines.append(f"{wall.straight} edges are straight: bent as the surface they would twist elements")
+        lines.append(f"{wall.straight} edges are straight: curved ones would invert elements")
     return lines
 
 
 def _halved(face: Integers) -> Integers:
-    """Four triangles for each of degree 2."""
+    """Split each triangle of degree 2 into four triangles."""
     return face[:, [0, 3, 5, 3, 1, 4, 5, 4, 2, 3, 4, 5]].reshape(-1, 3)
 
 
 def _check_units(radius: float, size: float, thickness: Array) -> None:
-    """Refuse lengths that no vessel has beside the mean radius of its lumen."""
+    """Check that the lengths are plausible for a vessel of this mean radius of the lumen."""
     for option, length in (("--thickness", thickness.max()), ("--thickness", thickness.min()), ("--size", size)):
         if length > MOST_RADII * radius or (option == "--thickness" and length < LEAST_RADII * radius):
             raise SceneError(
@@ -317,32 +332,32 @@ def _check_units(radius: float, size: float, thickness: Array) -> None:
 
 
 def _thicknesses(said: Sequence[str]) -> dict[str, float]:
-    """Thickness by name."""
+    """Parse the thickness of each layer, by name."""
     found: dict[str, float] = {}
     for text in said:
         name, _, number = text.partition("=")
         if not name.isidentifier() or name in found or (value := _positive(number)) is None:
-            raise SceneError(f"--layers {text}: allowed is NAME=THICKNESS, each name once, from the lumen outwards")
+            raise SceneError(f"--layers {text}: must be NAME=THICKNESS, each name once, from the lumen outwards")
         found[name] = value
     return found
 
 
 def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) -> Array:
-    """At the points, (n,): a number, an array of the file, or the sum of the layers."""
+    """Return the thickness at the points, (n,): a number, an array, or the layers' sum."""
     whole = sum(layers.values())
     if said is None and not layers:
-        raise SceneError("--thickness: missing; a number in the unit of the surface, an array of it, or --layers")
+        raise SceneError("--thickness: missing; must be a number or an array of the surface; or set --layers")
     value = _positive(said or "")
     if said is None or value is not None:
         number = value or whole
         if layers and not np.isclose(number, whole):
-            raise SceneError(f"--thickness {said}: the layers come to {whole:g}; leave one of both out")
+            raise SceneError(f"--thickness {said}: the sum of --layers is {whole:g}; omit one")
         return np.full(len(surface.points), number)
     if said not in surface.arrays:
         known = ", ".join(surface.arrays) or "none"
-        raise SceneError(f"--thickness {said}: allowed is a number above 0, or an array at the points: {known}")
+        raise SceneError(f"--thickness {said}: must be a positive number, or an array at the points: {known}")
     if not ((surface.arrays[said] > 0) & np.isfinite(surface.arrays[said])).all():
-        raise SceneError(f"--thickness {said}: this array has values that are not above 0, or not finite")
+        raise SceneError(f"--thickness {said}: values of the array must be positive and finite")
     return surface.arrays[said]
 
 

@@ -1,4 +1,4 @@
-"""Bodies of one's own: the mesh of a file with named faces, of a vessel or of anything without a lumen."""
+"""User-supplied bodies: the mesh of a file with named faces, of a vessel or of a solid."""
 
 from __future__ import annotations
 
@@ -55,10 +55,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that leave a face no motion along its normal
+HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that prevent motion along the normal
 ON_FACES: dict[str, Callable[[str], LoadKind]] = {
     "pressure": lambda face: LoadKind(_by_hold_faces, f"pressure on the deformed face {face}", STRESS),
-    "displacement": lambda face: LoadKind(_by_hold_faces, f"way of the face {face} along its normal, outwards", LENGTH),
+    "displacement": lambda face: LoadKind(
+        _by_hold_faces, f"displacement of the face {face} along its outward normal", LENGTH
+    ),
 }
 Names = tuple[str | int, ...]
 _ENTRY: JsonDict = {"type": ["string", "integer"]}
@@ -69,11 +71,11 @@ _GROUPS: JsonDict = {
 
 
 def _by_hold_faces(shape: Any, loading: Any, name: str) -> None:
-    """A part of the supports."""
+    """Do nothing: `hold_faces` adds the load with the supports."""
 
 
 def _faces(value: Any) -> Any:
-    """Names or numbers, one or a list, as tuples."""
+    """Validate names or numbers, one or a list, as tuples."""
     if not isinstance(value, Mapping):
         raise fault("must be a table: names or numbers of the file's faces or volumes, as in inner = 3")
     found = {}
@@ -90,7 +92,7 @@ Groups = Annotated[dict[str, Names], BeforeValidator(_faces), Field(json_schema_
 
 
 def _files(value: Any) -> list[str]:
-    """Paths of a mesh and of its surfaces, of one or a list; nothing where they are none."""
+    """Return the paths of a mesh and its surfaces, from one path or a list, or an empty list."""
     mesh, *surfaces = value if isinstance(value, (list, tuple)) and value else [value]
     are_files = _ends_with(mesh, READERS) and all(_ends_with(one, SURFACES) for one in surfaces)
     return [mesh, *surfaces] if are_files else []
@@ -105,14 +107,14 @@ def _file(value: Any) -> Any:
     if not files:
         mesh, surfaces = ", ".join(READERS), ", ".join(SURFACES)
         raise fault(
-            f"must be the path of a mesh ({mesh}), relative to the scene's folder; in a list, what follows the mesh "
-            f"must be paths of its surfaces ({surfaces})"
+            f"must be the path of a mesh ({mesh}), relative to the scene's folder, or a list of it "
+            f"and paths of its surfaces ({surfaces})"
         )
     return tuple(files) if files[1:] else files[0]
 
 
 def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys with surfaces that faces give as files, inner = { file = "lumen.vtp" }, after the mesh."""
+    """Add surfaces that faces name as files, inner = { file = "lumen.vtp" }, to the key `file`."""
     faces, file = geometry.get("faces", {}), geometry.get("file")
     files, found = file if isinstance(file, (list, tuple)) else [file], {}
     for face, one in faces.items() if isinstance(faces, Mapping) else ():
@@ -122,7 +124,7 @@ def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _numbers(key: str, entries: Names, names: Mapping[str, int], groups: Integers) -> list[int]:
-    """Numbers in the file of what a scene gives as a face or a region, by name or number."""
+    """Return the file's numbers of a face's or region's entries, names or numbers."""
     there = {*distinct(groups)} - {0}
     found = [names.get(entry, 0) if isinstance(entry, str) else int(entry) for entry in entries]
     for entry, number in zip(entries, found, strict=True):
@@ -135,7 +137,7 @@ def _numbers(key: str, entries: Names, names: Mapping[str, int], groups: Integer
 
 
 class FileBody(WithRegions, FromFile):
-    """A body whose mesh, faces and regions are those of a file."""
+    """Body with the mesh, faces and regions of a file."""
 
     supported_faces = None
     thickness_in_words: ClassVar[str] = "cube root of the volume"
@@ -144,18 +146,19 @@ class FileBody(WithRegions, FromFile):
         json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"}
     )
     """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
-    `.stl`, `.ply`, `.obj`), faces by the names of their files (docs/my_own_vessel.md, Meshes of your own)."""
+    `.stl`, `.ply`, `.obj`), which are faces under the names of their files
+    (docs/my_own_vessel.md)."""
     tags: str | None = Field(
         default=None,
         min_length=1,
-        description="Of a file that is not by Gmsh: the array of whole numbers that tells the faces and volumes apart. "
-        "Default: the first of " + ", ".join(f"`{name}`" for name in TAGS) + " that is there.",
+        description="For files not in Gmsh's format: the integer array that numbers faces and "
+        "volumes. Default: the first of " + ", ".join(f"`{name}`" for name in TAGS) + " in the file.",
         json_schema_extra={"allowed": "the name of an array"},
     )
     file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
         default=None, json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))}
     )
-    """Unit of the numbers in the file, where it differs from `length_unit`."""
+    """Unit of the numbers in the file, if it differs from `length_unit`."""
     faces: Groups = {}
     """Names of faces, each with the name or number of a face in the file, or a list of them:
     `inner`, `outer`, `inlet` and `outlet` where the file has other names, and more for supports
@@ -164,13 +167,13 @@ class FileBody(WithRegions, FromFile):
     """Names of regions, each with the name or number of a volume in the file, or a list of
     them. Default: the names in the file."""
     open_boundary: bool = False
-    """Whether parts of the boundary may belong to no face. Without it such a part is taken for
-    a hole and refused."""
+    """Whether parts of the boundary may belong to no face. Otherwise such a part is rejected as a
+    hole."""
     sha256: str | None = Field(
         default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
     )
-    """SHA-256 of the file, of several files together. A scene as run has it, and refuses
-    others."""
+    """SHA-256 of the file, or of several files together. The scene that a run stores has it, and
+    rejects other files."""
 
     @model_validator(mode="before")
     @classmethod
@@ -185,14 +188,14 @@ class FileBody(WithRegions, FromFile):
 
     @classmethod
     def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """The keys as they were read, with the place of the file."""
+        """Return the keys as read, with the absolute paths of the files."""
         found = _together(geometry)
         places = [str(folder.absolute() / file) for file in _files(found.get("file"))]
         return found | ({"file": places} if places else {})
 
     @classmethod
     def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Element and degree of the file, where the scene does not say them."""
+        """Return defaults with the file's element and degree, unless the scene sets both."""
         mesh, files = own.get("mesh", {}), _files(_together(own["geometry"]).get("file"))
         if not files or (isinstance(mesh, Mapping) and "element" in mesh and "degree" in mesh):
             return cls.defaults
@@ -204,7 +207,7 @@ class FileBody(WithRegions, FromFile):
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
 
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """The file under its own name beside the scene as run, which has its SHA-256."""
+        """Return the file under its own name, to store with the scene, and its SHA-256."""
         file = self._read()
         kept = {self._name: file.data, **file.surfaces}
         names = [*kept] if file.surfaces else self._name
@@ -216,17 +219,17 @@ class FileBody(WithRegions, FromFile):
 
     @property
     def number_of_elements(self) -> int:  # type: ignore[override]
-        """Of the file."""
+        """Number of elements in the file."""
         return len(self._mesh().cells)
 
     def check_size(self, mesh: Mesh) -> None:
-        """Edges are halved, as often as asked for."""
+        """Check that the refinement is a power of 2, because edges are halved."""
         if mesh.refinement & (mesh.refinement - 1):
             raise fault("must be a power of 2: the elements of a file are halved", "mesh.refinement", mesh.refinement)
 
     # ------------------------------------------------------------ mesh
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """The file's own mesh, split where the scene says so."""
+        """Build the mesh of the file, refined as the scene requests. Collective."""
         from mpi4py import MPI
 
         from remodel_fenicsx.body.mesh_domain import shared
@@ -234,13 +237,13 @@ class FileBody(WithRegions, FromFile):
         return shared(partial(self.checked, mesh), comm or MPI.COMM_WORLD, self.name)
 
     def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, mesh_faces.Boundary, dict[str, int]]:
-        """The mesh, its boundary, and its regions' numbers by name; on rank 0."""
+        """Return the mesh, its boundary, and the numbers of its regions by name, on rank 0."""
         file = self._mesh()
         scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
         file = replace(file, points=scale * file.points)
         extent = float(np.ptp(file.points, axis=0).max())
         if not SMALLEST_LENGTH <= extent <= LARGEST_LENGTH:
-            limits = f"allowed are {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, geometry.length_unit)"
+            limits = f"must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, length_unit)"
             raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
         try:
             boundary = self.boundary(file)
@@ -256,15 +259,17 @@ class FileBody(WithRegions, FromFile):
         return file, boundary, self._regions(file)
 
     def _refined(self, file: MeshFile, mesh: Mesh) -> tuple[MeshFile, mesh_faces.Boundary]:
-        """With smaller elements, or those of degree 2."""
+        """Return the mesh with smaller elements, or with elements of degree 2, and its boundary."""
         if file.degree != 1:
             asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}: {self._name}"
-            raise SceneError(f"{asked} has elements of degree {file.degree}: they are taken as they are")
+            raise SceneError(f"{asked} has elements of degree {file.degree}, which are not refined")
         if (number := len(file.cells) * mesh.refinement**3) > LARGEST_MESH:
-            raise SceneError(f"mesh.refinement = {mesh.refinement}: {number} elements; at most {LARGEST_MESH} are made")
+            raise SceneError(
+                f"mesh.refinement = {mesh.refinement}: {number} elements; " f"must be at most {LARGEST_MESH}"
+            )
         file = refined(file, mesh.refinement, mesh.degree)
-        words = "the faces of the body stay plane as in the file"
-        log.info("split into %d elements of degree %d; %s", len(file.cells), file.degree, words)
+        text = "split into %d elements of degree %d; the faces stay plane as in the file"
+        log.info(text, len(file.cells), file.degree)
         return file, self.boundary(file)
 
     def _read(self) -> MeshFile:
@@ -281,12 +286,12 @@ class FileBody(WithRegions, FromFile):
         return SceneError(f"geometry.file = {shown(self._name)}: {rule}")
 
     def _asked(self, face: str) -> Any:
-        """As the scene says it, or by default."""
+        """Return the scene's entry of a face, or the default."""
         entry: Names = self.faces.get(face, (face,))
         return entry[0] if len(entry) == 1 else list(entry)
 
     def boundary(self, file: MeshFile) -> mesh_faces.Boundary:
-        """With the faces of the body, and further named ones of the file under their own names."""
+        """Return the boundary with the body's faces, and the file's further named faces."""
         names, found = file.names[2], file.facet_groups
         asked = {face: (face,) for face in self.face_names} | self.faces
         groups = {face: _numbers(f"faces.{face}", entries, names, found) for face, entries in asked.items()}
@@ -305,7 +310,7 @@ class FileBody(WithRegions, FromFile):
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
 
     def _mesh(self) -> MeshFile:
-        """That of the file: volumes of one region under one number, without others that have the same elements."""
+        """Return the file's mesh with one number a region, without duplicate elements."""
         file = self._read()
         if not self.regions:
             return file
@@ -324,31 +329,31 @@ class FileBody(WithRegions, FromFile):
         )
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
-        """Refuse faces that cannot be those of the body. On rank 0."""
+        """Check that the faces can be those of the body, on rank 0."""
 
     # ------------------------------------------------------------ supports
     def supports_of(self, supports: Supports) -> dict[str, Support]:
-        """Those of a scene, and others that the body has where it says nothing."""
+        """Return the supports of the scene, completed by the body's default supports."""
         return dict(supports)
 
     def hold(self, loading: Loading) -> None:
-        """By its faces alone (`hold_faces`)."""
+        """Do nothing: only `hold_faces` supports the body."""
 
     @classmethod
     def loads_on(cls, faces: Mapping[str, OnFace]) -> dict[str, LoadKind]:
-        """Loads on faces beside its own; `hold_faces` adds them."""
+        """Return the body's loads and those on faces, which `hold_faces` adds."""
         return cls.loads | {name: ON_FACES[on.kind](on.face) for name, on in faces.items()}
 
     def fills(self, regions: Collection[str]) -> bool:
-        """Whether they are all volumes of the file."""
+        """Return whether the regions are all volumes of the file."""
         return bool(regions) and set(self._regions(self._mesh())) <= set(regions)
 
     def held_faces(self, supports: Supports) -> list[str]:
-        """All but those that are free."""
+        """Return the names of all faces with a support other than 'free'."""
         return [face for face, support in self.supports_of(supports).items() if support.kind != "free"]
 
     def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
-        """Whether they are there, the body cannot move as a whole, and no support takes all of a pressure."""
+        """Check that the faces exist, no rigid motion is free, and loads fit the supports."""
         for name in supports:
             if name not in domain.faces:
                 raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
@@ -372,12 +377,10 @@ class FileBody(WithRegions, FromFile):
                     raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
                 moved[face] = name
             elif kind in HELD_ACROSS:
-                raise SceneError(
-                    f"{key}: its support ({kind!r}) takes all of the pressure; allowed are faces that move"
-                )
+                raise SceneError(f"{key}: its support ({kind!r}) carries the pressure; must be a face that moves")
 
     def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
-        """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective."""
+        """Add the scene's and default supports, and pressures on faces. Collective."""
         from remodel_fenicsx.body.mesh_domain import GUIDE, add_support
 
         domain: Any = loading.domain
@@ -399,11 +402,11 @@ class FileBody(WithRegions, FromFile):
                 loading.add_follower_pressure(name, on.face)
 
 
-NODES_AT_A_DEPTH = 1e-3  # layers of nodes of a regular mesh have their depth to 1e-4
+NODES_AT_A_DEPTH = 1e-3  # tolerance of depth; nodes of a layer in a regular mesh agree to 1e-4
 
 
 def _at(face: str, m: Any) -> Flags:
-    """Elements that have a facet on a face."""
+    """Mark the elements that have a facet on a face."""
     from remodel_fenicsx.body.domain import cells_of
 
     found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
@@ -412,7 +415,7 @@ def _at(face: str, m: Any) -> Flags:
 
 
 def _middle(m: Any) -> Flags:
-    """Elements that are half-way through the wall; there are some in every mesh."""
+    """Mark the elements at mid-wall; every mesh has some."""
     from remodel_fenicsx.fem.compat import geometry_dofmap
 
     depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
@@ -420,21 +423,22 @@ def _middle(m: Any) -> Flags:
 
 
 def _mean_over(elements: Callable[[Any], Flags]) -> AngleOf:
-    """The mean over elements that are looked for once."""
+    """Return the mean over elements, which are selected once."""
     return lambda m, values: m.quadrature.mean_of_known(values, m.tool(elements, lambda: elements(m)))
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
     "inner": ("with a facet on the inner face", _mean_over(partial(_at, "inner"))),
-    "middle": ("half-way through the wall", _mean_over(_middle)),
+    "middle": ("at mid-wall", _mean_over(_middle)),
     "outer": ("with a facet on the outer face", _mean_over(partial(_at, "outer"))),
 }
 
 
 class WalledMesh(Walled):
-    """A body with a wall whose local axes are found on its mesh.
+    """Body with a wall whose local axes are computed on its mesh.
 
-    Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
+    The faces "inner" and "outer" are opposite across the wall; "inlet" and "outlet" bound its
+    length.
     """
 
     columns: ClassVar[Columns] = angle_columns(MEANS_ON_A_MESH)
@@ -444,27 +448,27 @@ class WalledMesh(Walled):
     defaults = {"cells": {"axes": "local"}}
 
     def log_of_radii(self, wall: Any) -> float | None:
-        """Faces are as their radii; None if the wall does not go around."""
-        area = getattr(wall, "area", None)  # of a mesh from a file; a drawn one knows no areas
+        """Return the logarithm of the faces' area ratio, or None for an open wall."""
+        area = getattr(wall, "area", None)  # only a mesh from a file has it
         ratio = area("outer") / area("inner") if area is not None else 0.0
         return math.log(ratio) if ratio > 1.0 else None
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
-        """Found on the mesh by a few linear solves. Collective."""
+        """Compute the local axes on the mesh by a few linear solves. Collective."""
         from remodel_fenicsx.body.axes import found_axes
 
         return found_axes(domain, quadrature)
 
     def depth(self, coordinates: Array) -> Array:
-        """No function of the place: where it was not recorded all is one layer."""
+        """Return zero: unrecorded depth is unknown, so that all is one layer."""
         return np.zeros(coordinates.shape[:-1])
 
 
 class MeshBody(WalledMesh, Unloads, FileBody):
-    """A body of your own from a mesh file: a vessel with an inner and an outer face and ends.
+    """User-supplied mesh of a vessel with an inner and an outer face and ends.
 
-    The file is data: it is read, and never run. Its elements are tetrahedra or hexahedra,
-    all of one kind. A run keeps a copy of the file.
+    The file is read as data and never executed. Its elements are tetrahedra or hexahedra, all of
+    one type. A run stores a copy of the file.
     """
 
     loads = {
@@ -484,7 +488,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         Column(
             "lumen_volume",
             "length^3",
-            "volume inside the deformed inner face, closed by flat caps; empty where it encloses none",
+            "volume inside the deformed inner face, closed by flat caps; empty if it encloses none",
             lambda m: m.lumen_volume(),
         ),
         *WalledMesh.columns,
@@ -502,29 +506,30 @@ class MeshBody(WalledMesh, Unloads, FileBody):
     thickness_in_words = "mean thickness of the wall"
 
     shape: Literal["mesh"] = "mesh"
-    """Which body it is."""
+    """Shape of the body."""
 
     def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
-        """Whether inner and outer have each other's names."""
+        """Check that inner and outer are not swapped, and warn of a wall of one element."""
         inner, outer = boundary.area("inner"), boundary.area("outer")
         if inner > outer:
             words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
             raise SceneError(f"geometry.faces.inner = {shown(self._asked('inner'))}: {words}")
         if mesh_faces.through_the_wall(boundary):
             log.warning(
-                "the wall is one element thick in places: bending, and how the fibre angle changes through it, are "
-                "lost there; try mesh.refinement = 2"
+                "the wall is one element thick in places, which resolves neither bending nor the "
+                "fibre angle over depth; set mesh.refinement = 2"
             )
 
     def supports_of(self, supports: Supports) -> dict[str, Support]:
-        """Inlet and outlet are guided."""
+        """Return the supports of the scene; by default inlet and outlet are guided."""
         return {"inlet": Support(), "outlet": Support()} | dict(supports)
 
 
 class Solid(FileBody):
-    """A body of your own from a mesh file, without a lumen: a gel between posts, a patch, a tendon of any shape.
+    """User-supplied mesh without a lumen: a gel between posts, a patch, a tendon of any shape.
 
-    Its faces have any names; each that is held has a table `[supports.NAME]`. Directions are those of x, y and z.
+    Its faces have any names. Each supported face has a table `[supports.NAME]`. Directions are x, y
+    and z.
     """
 
     loads = {}
@@ -532,7 +537,7 @@ class Solid(FileBody):
         Column(
             "fibre_angle",
             "degrees",
-            "angle between chains and the axis `geometry.axis` in the reference body, mean over the volume",
+            "angle between chains and `geometry.axis` in the reference configuration, volume mean",
             lambda m: m.quadrature.mean_of_known(m.fibre_angle),
         ),
         Column("volume", "length^3", "deformed volume", lambda m: m.quadrature.integral(np.linalg.det(m.F))),
@@ -542,28 +547,28 @@ class Solid(FileBody):
     depth_in_words = ("in the body", "", "")
 
     shape: Literal["solid"] = "solid"
-    """Which body it is."""
+    """Shape of the body."""
     axis: Literal["x", "y", "z"] = "x"
-    """The axis to which fibre angles are measured."""
+    """Axis from which fibre angles are measured."""
 
     def fibre_angle(self, dimensions: Any, axes: Any, local: Any) -> Any:
-        """To `axis`."""
+        """Return the angle of the chains to `axis`."""
         return angle_to_axis(dimensions, axes, np.eye(3)["xyz".index(self.axis)])
 
     def depth(self, coordinates: Any) -> Any:
-        """The body is one layer."""
+        """Return zero: the body is one layer."""
         return np.zeros(coordinates.shape[:-1])
 
     station = depth
 
 
-# ---------------------------------------------------------------- split meshes, and elements of degree 2, by Gmsh
-# Gmsh's numbers of elements and facets of degree 1
+# ---------------------------------------------------------------- refined meshes by Gmsh
+# Gmsh's numbers of the element and facet types of degree 1.
 SPLIT = {"tetrahedron": {3: 4, 2: 2}, "hexahedron": {3: 5, 2: 3}}
 
 
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
-    """A mesh of plane elements, split into halves along each edge, as often as asked for."""
+    """Halve the edges of a mesh of plane elements `log2(refinement)` times, and set the degree."""
     with gmsh_model("file") as gmsh:
         model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
         for dimension, rows, groups in ((3, file.cells, file.cell_groups), (2, file.facets, file.facet_groups)):

@@ -1,4 +1,4 @@
-"""The mesh of an own body on all ranks: read and checked on the first, with what its faces are."""
+"""Mesh of a user-supplied body on all ranks, with its faces and supports."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshDomain(Domain):
-    """A domain that knows more of its faces."""
+    """Domain with the connected parts, normals and rims of its faces."""
 
     boundary: Boundary
     part_tags: MeshTags
     rims: list[Integers]
 
     def of_parts(self, face: str, name: str) -> Function:
-        """`normal` or `centre` of each part of a face, as a function that is constant on the elements beside it."""
+        """Return `normal` or `centre` of a face's parts, constant on each adjacent element."""
         found = dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, ("DG", 0, (3,))))
         values, dofs = found.x.array.reshape(-1, 3), found.function_space.dofmap.list.reshape(-1)
         for part, facets in self.facets_of_parts(face):
@@ -53,24 +53,25 @@ class MeshDomain(Domain):
         return found
 
     def facets_of_parts(self, face: str) -> list[tuple[Face, NDArray[np.int32]]]:
-        """The parts of a face with their local facets."""
+        """Return the parts of a face with their local facets."""
         parts = enumerate(self.boundary.faces)
         return [(part, self.part_tags.find(number)) for number, part in parts if part.name == face]
 
     def area(self, face: str) -> float:
-        """Of a named face, with plane facets."""
+        """Return the area of a named face, with plane facets."""
         return self.boundary.area(face)
 
     @property
     def thickness(self) -> float:
-        """Mean thickness of the wall: twice the volume over the areas of its faces; without them of a cube."""
+        """Mean thickness of the wall from volume and face areas; without them a cube's side."""
         volume, area = self.boundary.volume, self.area("inner") + self.area("outer")
         return 2 * volume / area if area else float(np.cbrt(volume))
 
     def length(self) -> float:
-        """Of the body from inlet to outlet: volume over the integral of |grad psi|, psi harmonic from 0 to 1."""
-        # In a bend psi goes with the angle: the mean of |grad psi| is that at the distance at which the mean of 1/R is,
-        # the line of the sections' centres. Collective; 0 for a body without one of the two.
+        """Compute the length from inlet to outlet, or 0 for a body without either. Collective."""
+        # The length is the volume over the integral of |grad psi|, with psi harmonic from 0 to 1.
+        # In a bend psi is proportional to the angle. The mean of |grad psi| is that on the line of
+        # the sections' centres, where 1/R has its mean.
         if not {"inlet", "outlet"} <= set(self.faces):
             return 0.0
         mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
@@ -85,9 +86,9 @@ class MeshDomain(Domain):
 def shared(
     read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm, shape: str = "mesh"
 ) -> MeshDomain:
-    """What rank 0 reads, on all ranks. Collective."""
+    """Distribute the mesh that rank 0 reads. Collective."""
     found = agreed(comm, lambda: read() if comm.rank == 0 else None)
-    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # as in `domain`
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # see `domain.build_domain`
     told = cells = groups = None
     points: Array = np.empty((0, 3))
     if found is not None:
@@ -112,7 +113,7 @@ def shared(
 
 
 def _tags_of_facets(mesh: Mesh, corners: Integers, values: Integers) -> MeshTags:
-    """Tags of the facets with these corners, as rank 0 numbered the nodes. Collective."""
+    """Tag the facets with these corners, in rank 0's numbering of nodes. Collective."""
     dimension, here = mesh.topology.dim - 1, slice(None) if mesh.comm.rank == 0 else slice(0)
     for other in (0, dimension + 1):
         mesh.topology.create_connectivity(dimension, other)
@@ -122,18 +123,20 @@ def _tags_of_facets(mesh: Mesh, corners: Integers, values: Integers) -> MeshTags
 
 
 # ---------------------------------------------------------------- supports of faces
-GUIDE = (
-    1000.0  # default stiffness over (lambda + 2 mu) / thickness: radii of the paper's tube within 2e-5 of exact ones
-)
-PARALLEL = 1e-3  # radians between normals: what a mesh in single precision has
-LEAST_TANGENTIAL = 0.5  # measured with ends held: 0 has one or two negative eigenvalues, 0.3 and 1 have none
-STILL = 1e-8  # smallest eigenvalue over the largest below which nothing holds a rigid motion
+# Default stiffness over (lambda + 2 mu) / thickness. The radii of the paper's tube are within 2e-5
+# of the exact ones.
+GUIDE = 1000.0
+PARALLEL = 1e-3  # radians between parallel normals of a mesh in single precision
+# Measured with fixed ends: with 0 there are one or two negative eigenvalues, with 0.3 and 1 none.
+LEAST_TANGENTIAL = 0.5
+STILL = 1e-8  # eigenvalue over the largest one, below which a rigid motion is unconstrained
 
 
 def add_support(
     loading: Loading, face: str, support: Support, stiffness: float, moves: tuple[str, float] | None
 ) -> None:
-    """Hold a face, which a load may move along its normal: its name, and how far at magnitude 1."""
+    """Support a face; `moves` is the load that moves a 'held' or guided face, and its scale."""
+    # `moves` is the name of a load, and the displacement along the normal at magnitude 1.
     if support.kind == "held":  # u = d N
         for part, facets in loading.domain.facets_of_parts(face):  # type: ignore[attr-defined]
             loading.hold_facets(facets, *((moves[0], moves[1] * part.normal) if moves else ()))
@@ -150,16 +153,16 @@ def add_support(
 
 
 def _density(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Callable[[Expr], Expr]:
-    """What a face's springs store over half of their stiffness."""
+    """Return a function of u: the energy density of springs over half their stiffness."""
     domain: Any = loading.domain
-    if support.kind == "elastic":  # (u . N)^2 + s |u - (u . N) N|^2, N of the place
+    if support.kind == "elastic":  # (u . N)^2 + s |u - (u . N) N|^2, with the local N
         share, across = loading.constant(support.tangential), ufl.FacetNormal(domain.mesh)
         return lambda u: share * ufl.inner(u, u) + (1 - share) * ufl.inner(u, across) ** 2
     normal, way = domain.of_parts(face, "normal"), loading.magnitude(*moves) if moves else 0.0
     if support.kind == "sliding":
         return lambda u: (ufl.inner(u, normal) - way) ** 2
     around = ufl.cross(normal, ufl.SpatialCoordinate(domain.mesh) - domain.of_parts(face, "centre"))
-    # a Constant: a number in the kernel would be another kernel for each mesh
+    # With a number instead of a Constant every mesh would need a kernel of its own.
     squared = ufl.inner(around, around) + loading.constant(1e-24 * domain.size**2)
     return lambda u: (ufl.inner(u, normal) - way) ** 2 + ufl.inner(u, around) ** 2 / squared
 
@@ -168,34 +171,34 @@ def _density(loading: Loading, face: str, support: Support, moves: tuple[str, fl
 
 
 def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
-    """Refuse supports that leave the body free to move as a whole, or, where it is elongated, to evade that."""
+    """Check that no rigid motion is free, and that an elongation strains the body."""
     if free := free_motions(domain.boundary.faces, supports):
         kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
-        raise SceneError(f"supports ({kinds}): they leave the body free to move, in {free} of 6 rigid motions")
+        raise SceneError(f"supports ({kinds}): {free} of 6 rigid motions are unconstrained")
     sliding = [
         part for part in domain.boundary.faces if supports.get(part.name, Support(kind="free")).kind == "sliding"
     ]
     if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
         raise SceneError(
-            "loads.elongation: both ends slide and are not parallel, so the elongation would only shift the body, "
-            "held by the pressure on its ends; allowed with an end that is 'guided' or 'held'"
+            "loads.elongation: both ends slide and are not parallel, so the elongation would only "
+            "shift the body; one end must be 'guided' or 'held'"
         )
     for name, support in supports.items():
         warn_of_twist(name, support, domain.comm)
 
 
 def warn_of_twist(name: str, support: Support, comm: MPI.Intracomm) -> None:
-    """Say so where springs may turn a body about its axis."""
+    """Warn if springs may let a growing wall twist about its axis."""
     if support.kind == "elastic" and support.tangential < LEAST_TANGENTIAL and comm.rank == 0:
         log.warning(
-            "supports.%s.tangential = %g: springs that hardly hold a wall across their direction push it sideways "
-            "once it has grown, and it twists; with %g and more no wall has twisted",
+            "supports.%s.tangential = %g: a wall that has grown may twist, because the springs "
+            "hardly resist motion across their direction; with %g or more no wall has twisted",
             name, support.tangential, LEAST_TANGENTIAL,
         )  # fmt: skip
 
 
 def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
-    """How many rigid motions of the body no support holds: of the 6 x 6 matrix of the supports over them."""
+    """Return the number of rigid motions that no support constrains."""
     everywhere = np.concatenate([part.places for part in parts])
     middle = everywhere.mean(axis=0)
     size = float(np.linalg.norm(everywhere - middle, axis=1).max())
@@ -203,11 +206,12 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
     for part in parts:
         support = supports.get(part.name)
         if support is not None and support.kind != "free":
-            # halfway to the corners, exact on triangles: a single one is held against turns too. Springs along N alone
-            # are taken at the middles: around a tube they would hold its facets, but nothing of the round body
+            # The points are halfway between midpoint and corners, exact on triangles, so that a
+            # single facet also constrains rotations. Springs along N only are taken at the
+            # midpoints: around a tube they would constrain the facets, but not the round body.
             share = 0.0 if support.kind == "elastic" and not support.tangential else 0.5
             for places in np.swapaxes((1 - share) * part.places[:, None] + share * part.corners, 0, 1):
-                # displacements (facets, 6, 3) of the unit motions along and about the axes
+                # Displacements (facets, 6, 3) of unit motions along and about the axes.
                 turns = np.cross(np.eye(3)[None], (places - middle)[:, None] / size)
                 motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
                 held = _held_directions(support, part, places)
@@ -217,7 +221,7 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
 
 
 def _held_directions(support: Support, part: Face, places: Array) -> Array:
-    """What a support holds at a place of each facet of a part, as projections (facets, 3, 3)."""
+    """Return a support's constraint at a position of each facet of a part, (facets, 3, 3)."""
     share = {"held": 1.0, "elastic": support.tangential}.get(support.kind, 0.0)
     normals = part.normals if support.kind == "elastic" else np.broadcast_to(part.normal, places.shape)
     found: Array = share * np.eye(3) + (1 - share) * np.einsum("fi,fj->fij", normals, normals)

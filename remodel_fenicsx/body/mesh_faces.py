@@ -1,4 +1,4 @@
-"""Faces of a mesh of one's own: which facets they have, their normals and rims, and whether they bound one body."""
+"""Faces of user-supplied meshes: facets, normals and rims, and checks that they bound one body."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from remodel_fenicsx.model.tensors import Array, Flags, Integers, det
 log = logging.getLogger(__name__)
 dolfinx, basix = Late("dolfinx"), Late("basix")
 
-# corners of the facets of an element and of the edges around a facet, in Gmsh's order; the normals point outwards
+# Corners of the facets of an element, in Gmsh's order, counterclockwise seen from outside.
 FACETS = {
     "tetrahedron": ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)),
     "hexahedron": ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
 }
-FLAT = 1e-12  # of the mean |det J| of the elements: below it one has no volume
+FLAT = 1e-12  # det J over the mean |det J| up to which an element is degenerate
 ROLES = ("inner", "outer", "inlet", "outlet")  # faces of a vessel
-NOT_AROUND = 0.5  # length of the mean normal of a face that has a direction: that of a half sphere
+NOT_AROUND = 0.5  # smallest mean unit normal of a face with a direction: that of a half sphere
 Groups = Mapping[str, Sequence[int]]
 
 
 class FaceError(UnreadableFile):
-    """A fault of one face, under its name."""
+    """Error in one face, with the name of the face."""
 
     def __init__(self, face: str, rule: str):
         super().__init__(rule)
@@ -39,7 +39,7 @@ class FaceError(UnreadableFile):
 
 
 class Face:
-    """A connected part of a named face: its facets, and their corners, (facets, 3 or 4, 3)."""
+    """Connected part of a named face: its facets, and their corners, (facets, 3 or 4, 3)."""
 
     def __init__(self, name: str, facets: Integers, corners: Array):
         vectors = area_vectors(corners)
@@ -48,13 +48,13 @@ class Face:
         self.places, self.normals = corners.mean(axis=1), vectors / sizes[:, None]
         self.normal = mean / max(float(np.linalg.norm(mean)), 1e-300)
         self.centre = sizes @ self.places / self.area
-        # 1 of a plane part, 0 of one that goes around
+        # 1 for a plane part, 0 for a closed one
         self.flatness = float(np.linalg.norm(self.normals.mean(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Boundary:
-    """What bounds a body: facets, the elements behind them, and the names of their faces or ""."""
+    """Boundary of a body: facets, the elements behind them, and the names of their faces or ""."""
 
     facets: Integers
     cell: Integers
@@ -63,20 +63,20 @@ class Boundary:
     volume: float
 
     def parts(self, name: str) -> list[Face]:
-        """The connected parts of a named face."""
+        """Return the connected parts of a named face."""
         return [face for face in self.faces if face.name == name]
 
     def area(self, name: str) -> float:
-        """Of a named face."""
+        """Return the area of a named face."""
         return sum(face.area for face in self.parts(name))
 
     def goes_around(self, name: str) -> bool:
-        """Whether a part of a named face has no direction."""
+        """Return whether a part of a named face has no mean normal."""
         return min(face.flatness for face in self.parts(name)) < NOT_AROUND
 
 
 def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Groups = MappingProxyType({})) -> Boundary:
-    """Find the named faces on the boundary of the one body that a file holds, and others where they are faces."""
+    """Find the named faces on a body's boundary, and the other groups that are faces."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
     owner = np.full(len(facets), "", dtype=object)
@@ -88,9 +88,9 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Gro
             if row is not None and owner[row] in ("", name):
                 continue
             if name in others:
-                log.info("face %r of the file is inside, or shares facets with others: left out", name)
+                log.info("face %r of the file ignored: inside, or shares facets with others", name)
                 break
-            words = "has facets that are no facets of its elements"
+            words = "has facets that belong to no element"
             if row is not None:
                 words = f"shares facets with the face {owner[row]!r}"
             elif key in as_rows(np.sort(twice, axis=1)):
@@ -101,8 +101,8 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Gro
     bare = owner == ""
     if bare.any() and not open_boundary:
         where, share = in_place(places[bare][0].mean(axis=0)), bare.sum()
-        rule = f"{share} of {len(bare)} facets of the boundary are in no face of geometry.faces, the first at {where}"
-        raise UnreadableFile(rule + "; if that is meant: geometry.open_boundary = true")
+        rule = f"{share} of {len(bare)} boundary facets are in no face, first at {where}"
+        raise UnreadableFile(rule + "; add them to geometry.faces, or set geometry.open_boundary = true")
     faces = []
     for name in (*groups, *others):
         rows = np.flatnonzero(owner == name)
@@ -114,21 +114,21 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Gro
 
 
 def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flags:
-    """Which elements or facets of other groups are also in groups of these numbers, (rows,)."""
+    """Mark the elements or facets of other groups that are also in these groups, (rows,)."""
     chosen = np.isin(groups, list(numbers))
     _, which = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
     return ~chosen & np.isin(which.reshape(-1), which.reshape(-1)[chosen])
 
 
 def through_the_wall(boundary: Boundary) -> bool:
-    """Whether an element has facets on the inner and on the outer face."""
+    """Return whether an element has facets on the inner and on the outer face."""
     inner, outer = (boundary.cell[boundary.owner == name] for name in ("inner", "outer"))
     return bool(np.isin(inner, outer).any())
 
 
 def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
-    """The closed lines in which a face ends, each as nodes of its edges, (edges, 2 or 3: start, end, middle)."""
-    # They run so that the normal of a flat cap on one points out of what the face encloses.
+    """Return the closed lines that bound a face, as edges (edges, 2 or 3: start, end, middle)."""
+    # The normal of a flat cap on such a line points out of the enclosed region.
     there = boundary.owner == face
     lines = rims(boundary.facets[there])
     if file.degree == 1:
@@ -140,7 +140,7 @@ def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
 
 
 def rims(facets: Integers) -> list[Integers]:
-    """The closed lines in which facets end, each as its edges (n, 2), as the facets go along them."""
+    """Return the closed lines that bound facets, as edges (n, 2) in the direction of the facets."""
     edges = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
     _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     alone = np.sort(first[count == 1])
@@ -149,7 +149,7 @@ def rims(facets: Integers) -> list[Integers]:
 
 
 def cap_volume(points: Array, rim: Integers) -> float:
-    """Of the cone between the origin and a flat cap on a closed line of straight or parabolic edges."""
+    """Return the volume of the cone between the origin and a flat cap on a line of edges."""
     a, b = points[rim[:, 0]], points[rim[:, 1]]
     m = points[rim[:, 2]] if rim.shape[1] == 3 else (a + b) / 2
     vector = (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6  # area times normal
@@ -157,7 +157,7 @@ def cap_volume(points: Array, rim: Integers) -> float:
 
 
 def components(rows: Integers, nodes: int) -> Integers:
-    """Number of the connected part of each row, which share nodes; (rows,)."""
+    """Return the number of each row's connected component, (rows,)."""
     from scipy.sparse import coo_array, csgraph
 
     first = np.repeat(rows[:, :1], rows.shape[1], axis=1)
@@ -166,12 +166,12 @@ def components(rows: Integers, nodes: int) -> Integers:
     return np.asarray(label[rows[:, 0]], dtype=np.int64)
 
 
-# ---------------------------------------------------------------- inside
+# ---------------------------------------------------------------- internals
 
 
 def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
-    """Facets of the boundary with normals outwards, the elements behind them, and the facets between two elements."""
-    signs = _checked_signs(file)  # elements may be numbered as in a mirror
+    """Return boundary facets oriented outwards, the elements behind them, and interior facets."""
+    signs = _checked_signs(file)  # elements may have the order of a mirror image
     local = np.array(FACETS[file.kind])
     facets = file.corners[:, local].reshape(-1, local.shape[1])
     _, first, inverse, count = np.unique(
@@ -188,18 +188,17 @@ def _facets(file: MeshFile) -> tuple[Integers, Integers, Integers]:
 
 
 def _checked_signs(file: MeshFile) -> Array:
-    """Of det J of each element; refused is what is not one body of elements that have a volume, none twice."""
+    """Return the sign of det J of each element; raise unless they form one valid body."""
     ordered = np.sort(file.corners, axis=1)
     _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
-        rule = "is there twice: in two named volumes?"
-        raise UnreadableFile(f"element {file.cell_numbers[first[count > 1][0]]} {rule}")
+        raise UnreadableFile(f"element {file.cell_numbers[first[count > 1][0]]} is duplicated: in two named volumes?")
     extent = np.ptp(file.points, axis=0).max()
     if extent == 0:
-        raise UnreadableFile("all nodes are at one place")
+        raise UnreadableFile("all nodes coincide")
     bodies = len(distinct(components(file.corners, len(file.points))))
     if bodies > 1:
-        raise UnreadableFile(f"{bodies} bodies that have no node in common; allowed is one (in Gmsh: BooleanFragments)")
+        raise UnreadableFile(f"{bodies} bodies without common nodes; must be one (in Gmsh: BooleanFragments)")
     determinants = jacobian_determinants(file)
     signs: Array = np.sign(determinants.mean(axis=1))
     bad = np.flatnonzero((determinants * signs[:, None]).min(axis=1) <= FLAT * np.abs(determinants).mean())
@@ -207,14 +206,14 @@ def _checked_signs(file: MeshFile) -> Array:
         cell = int(bad[0])
         where = in_place(file.points[file.corners[cell]].mean(axis=0))
         raise UnreadableFile(
-            f"element {file.cell_numbers[cell]} at {where} is twisted or flat: its volume is not above zero "
-            f"everywhere in it ({len(bad)} such element{'s' if len(bad) > 1 else ''})"
+            f"element {file.cell_numbers[cell]} at {where} is inverted or degenerate: its Jacobian "
+            f"is not positive ({len(bad)} such element{'s' if len(bad) > 1 else ''})"
         )
     return signs
 
 
 def jacobian_determinants(file: MeshFile) -> Array:
-    """det J at the quadrature points of each element, (elements, points)."""
+    """Return det J at the quadrature points of each element, (elements, points)."""
     kind = basix.CellType[file.kind]
     points, _ = basix.make_quadrature(kind, 2 * file.degree)
     element = basix.create_element(basix.ElementFamily.P, kind, file.degree, basix.LagrangeVariant.gll_warped)
@@ -226,13 +225,16 @@ def jacobian_determinants(file: MeshFile) -> Array:
 
 
 def node_order(file: MeshFile) -> Integers:
-    """dolfinx's order of an element's nodes, as places in Gmsh's."""
+    """Return dolfinx's order of an element's nodes, as indices into Gmsh's order."""
     kind = getattr(dolfinx.mesh.CellType, file.kind)
     return np.asarray(dolfinx.cpp.io.perm_gmsh(kind, file.cells.shape[1]), dtype=np.int64)
 
 
 def area_vectors(places: Array) -> Array:
-    """Area times normal of facets at (facets, 3 or 4, 3): half the cross product of two edges, or of the diagonals."""
+    """Return area times normal of facets (facets, 3 or 4, 3): half the cross product of two edges.
+
+    For quadrilaterals it is half the cross product of the diagonals.
+    """
     if places.shape[1] == 3:
         return np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]) / 2
     return np.cross(places[:, 2] - places[:, 0], places[:, 3] - places[:, 1]) / 2

@@ -1,7 +1,7 @@
-"""Meshes of one's own, as VTK and meshio read them in a child process with limits: nothing in a file is ever run.
+"""User-supplied mesh files, read by VTK and meshio in a child process with limits, never executed.
 
-Gmsh itself runs a file that is a script under whatever name, so it never sees one. What meshio passes over in silence
-in Gmsh's own format, MSH 2.2 and 4.1 as text, is refused here:
+Gmsh executes a script under any file name, so it never gets one. meshio silently ignores some
+faults in Gmsh's own format, MSH 2.2 and 4.1 as text. This module rejects them:
 https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format.
 """
 
@@ -31,23 +31,24 @@ from remodel_fenicsx.system.children import DAMAGED, read_guarded
 
 log = logging.getLogger(__name__)
 
-# by meshio's names of types of elements
+# By meshio's names of element types.
 VOLUMES = {
     "tetra": ("tetrahedron", 1),
     "hexahedron": ("hexahedron", 1),
     "tetra10": ("tetrahedron", 2),
     "hexahedron27": ("hexahedron", 2),
 }
-FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of facets
+FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}
 WEDGE = "wedge"
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27, wedges of 6"
-# by Gmsh's numbers of types of elements
+# By Gmsh's numbers of element types.
 GMSH_KINDS = {
     15: "vertex", 1: "line", 8: "line3", 2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
     4: "tetra", 11: "tetra10", 5: "hexahedron", 12: "hexahedron27", 6: WEDGE,
 }  # fmt: skip
-# Gmsh's order of nodes, as places in VTK's, which meshio has
-# https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering, https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron)
+# Gmsh's order of nodes, as indices into VTK's, which meshio uses:
+# https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering,
+# https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron).
 ORDERS = {
     "tetra10": (0, 1, 2, 3, 4, 5, 6, 7, 9, 8),
     "hexahedron27": (
@@ -58,7 +59,7 @@ ORDERS = {
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """What a mesh file holds."""
+    """Contents of a mesh file."""
 
     points: Array
     cells: Integers
@@ -82,12 +83,12 @@ class MeshFile:
 
     @property
     def corners(self) -> Integers:
-        """Of the elements, (elements, 4 or 8)."""
+        """Corners of the elements, (elements, 4 or 8)."""
         return self.cells[:, : 4 if self.kind == "tetrahedron" else 8]
 
 
 class Block(NamedTuple):
-    """Elements of one type, by meshio's name: their groups, and rows of their nodes in Gmsh's order."""
+    """Elements of one type (meshio's name): groups, and rows of nodes in Gmsh's order."""
 
     kind: str
     groups: Integers
@@ -95,18 +96,18 @@ class Block(NamedTuple):
 
 
 def as_rows(table: Integers) -> list[tuple[int, ...]]:
-    """Rows of a table as tuples."""
+    """Return the rows of a table as tuples."""
     listed: Any = table.tolist()
     return [tuple(row) for row in listed]
 
 
 def in_place(point: Array) -> str:
-    """A place in words."""
+    """Format the coordinates of a point."""
     return "(" + ", ".join(f"{number:.4g}" for number in point) + ")"
 
 
 def distinct(values: Integers) -> list[int]:
-    """Different ones of a list of numbers, in its order."""
+    """Return the distinct numbers of an array, in its order."""
     listed: Any = values.tolist()
     return list(dict.fromkeys(listed))
 
@@ -114,13 +115,14 @@ def distinct(values: Integers) -> list[int]:
 # ---------------------------------------------------------------- files, by VTK and meshio
 
 READERS = {f".{kind}": f"{__name__}:arrays_{kind}" for kind in ("msh", "vtu", "vtk", "xdmf")}
-READERS[".msh"] = f"gmsh {READERS['.msh']}"  # imported before reading begins, for it looks into other files then
+# The child imports gmsh before it is limited to the file, because the import opens other files.
+READERS[".msh"] = f"gmsh {READERS['.msh']}"
 _FORMAT = re.compile(rb"\$MeshFormat\s+(2\.2|4\.1) 0 \d+\s+\$EndMeshFormat")
 _SECTION = re.compile(rb"^\$(\w+)\s*?\n(.*?)^\$End\1\b", re.DOTALL | re.MULTILINE)
 _OLD_TAGS = re.compile(rb"(?m)^[ \t]*\d+([ \t]+\d+[ \t]+\d+[ \t]+(\d+)[ \t]+)\d+(?=[ \t])")
 SAVED_OTHERWISE = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
 TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
-"""Arrays of numbers of faces and volumes: as meshio, VMTK and Medit call them."""
+"""Names of the array of face and volume numbers in meshio, VMTK and Medit."""
 
 
 Arrays = dict[str, NDArray[Any]]
@@ -128,7 +130,7 @@ Blocks = list[tuple[str, Integers]]
 
 
 class ExchangeFile(NamedTuple):
-    """What such a file holds: types of the elements with their rows of nodes, arrays over all, and the file itself."""
+    """Contents of an exchange file: element types with nodes, arrays, and the bytes."""
 
     points: Array
     cells: Blocks
@@ -139,7 +141,7 @@ class ExchangeFile(NamedTuple):
 
 
 def read_exchange_file(path: Path) -> ExchangeFile:
-    """Read one; its ending is one of `READERS`."""
+    """Read a file whose suffix is in `READERS`."""
     ending = path.suffix.lower()
     try:
         arrays, data = read_guarded(path, READERS[ending])
@@ -148,16 +150,16 @@ def read_exchange_file(path: Path) -> ExchangeFile:
         raise UnreadableFile(f"{error}{SAVED_OTHERWISE if is_exchanged else ''}") from None
     names, points, *others = arrays.values()
     (kinds, of_points, of_cells, groups), rest = json.loads(names.tobytes()), iter(others)
-    cells = [*zip(kinds, rest, strict=False)]  # each takes its share of the rest
+    cells = [*zip(kinds, rest, strict=False)]  # each zip consumes its part of the iterator
     data_of_points, data_of_cells = (dict(zip(one, rest, strict=False)) for one in (of_points, of_cells))
     return ExchangeFile(points, cells, data_of_points, data_of_cells, groups, data)
 
 
-# what the child calls, without the modules of other formats
+# Functions that the child calls. It does not import the modules of other formats.
 
 
 def arrays_xdmf(file: str) -> Arrays:
-    """Those of a file in XDMF."""
+    """Read the arrays of an XDMF file."""
     mesh = importlib.import_module("meshio.xdmf").read(file)
     cells = [_in_gmsh_order(block.type, block.data) for block in mesh.cells]
     of_cells = {name: np.concatenate(values) for name, values in mesh.cell_data.items()}
@@ -167,7 +169,8 @@ def arrays_xdmf(file: str) -> Arrays:
 def _read_by_vtk(module: str, reader: str, file: str, is_surface: bool = True) -> Any:
     made = getattr(importlib.import_module(f"vtkmodules.{module}"), reader)()
     if is_surface:
-        made.AddObserver("WarningEvent", lambda *_: None)  # of colours behind the places of an OBJ, say
+        # VTK warns, for example, of colours after the coordinates of an OBJ file.
+        made.AddObserver("WarningEvent", lambda *_: None)
     made.SetFileName(file)
     for read_all in ("ReadAllScalarsOn", "ReadAllVectorsOn", "ReadAllTensorsOn", "ReadAllFieldsOn"):
         getattr(made, read_all, lambda: None)()
@@ -176,7 +179,7 @@ def _read_by_vtk(module: str, reader: str, file: str, is_surface: bool = True) -
 
 
 def _of_vtk(module: str, reader: str, file: str) -> Arrays:
-    """By VTK itself, as meshio would have them."""
+    """Read the arrays of a file by VTK, in meshio's form."""
     from meshio._vtk_common import vtk_to_meshio_type
     from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
 
@@ -199,23 +202,23 @@ arrays_vtk = partial(_of_vtk, "vtkIOLegacy", "vtkUnstructuredGridReader")
 
 
 def arrays_msh(file: str) -> Arrays:
-    """Those of a file by Gmsh, where elements of several groups are there several times."""
+    """Read the arrays of a file by Gmsh; elements of several groups appear several times."""
     data = Path(file).read_bytes()
     version = _FORMAT.match(data)
     if version is None:  # Gmsh would run a script
-        raise UnreadableFile("is no mesh by Gmsh in format 2.2 or 4.1 as text (in Gmsh: Mesh.Binary = 0)")
+        raise UnreadableFile("is not a Gmsh mesh in format 2.2 or 4.1 as text (in Gmsh: Mesh.Binary = 0)")
     if rest := _SECTION.sub(b"", data).split():
         words = b" ".join(rest[:9])[:40].decode("ascii", "replace")
-        raise UnreadableFile(f"has {words!r} outside of its sections: is it cut off?")
+        raise UnreadableFile(f"has {words!r} outside of its sections: is it truncated?")
     is_old, number, sections = version[1] == b"2.2", itertools.count(1), dict(_SECTION.findall(data))
-    # lines of a section for each number at its head: Gmsh passes over what is not announced
+    # Numbers of lines in a section for each number in its head. Gmsh ignores further lines.
     for name, lines in {"Nodes": (1, 2), "Elements": (1, 1), "Entities": (1, 1, 1, 1)}.items():
         head, *rows = sections.get(name.encode(), b"0").strip().splitlines()
         if len(rows) != sum(count * int(number) for count, number in zip(lines, head.split(), strict=False)):
             raise UnreadableFile(f"has other {name.lower()} than ${name} announces")
-    if is_old:  # its elements have groups of their own, not by the parts of the body, and an order
+    if is_old:  # its elements have their own groups, independent of entities, and an order
         data = _OLD_TAGS.sub(lambda found: b"%d%b%b" % (next(number), found[1], found[2]), data)
-        Path(file).write_bytes(data)  # in this process' memory
+        Path(file).write_bytes(data)  # the file is in this process's memory
     with gmsh_model("file"):
         gmsh.merge(file)
         groups = gmsh.model.getPhysicalGroups()
@@ -226,12 +229,12 @@ def arrays_msh(file: str) -> Arrays:
 
 
 def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
-    """Nodes of Gmsh's current model by their numbers, and its elements, those of several groups several times."""
+    """Return the nodes of Gmsh's current model by number, and its elements, once for each group."""
     model, found = gmsh.model, dict[str, list[Any]]()
     tags, places, _ = model.mesh.getNodes()
     order = np.argsort(tags)
     for dimension, entity in model.getEntities():
-        if model.getType(dimension, entity).startswith("Ghost"):  # of other parts of the mesh
+        if model.getType(dimension, entity).startswith("Ghost"):  # copies from other partitions
             continue
         groups: list[int] = [*model.getPhysicalGroupsForEntity(dimension, entity)]
         for kind, numbers, nodes in zip(*model.mesh.getElements(dimension, entity), strict=True):
@@ -249,7 +252,7 @@ def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
 def as_arrays(
     points: Array, cells: Blocks, point_data: Arrays, cell_data: Arrays, group_names: Sequence[object] = ()
 ) -> Arrays:
-    """An `ExchangeFile` as the child hands it over: its names, and its arrays in their order."""
+    """Return an `ExchangeFile` as the child transfers it: names, and arrays in their order."""
     names = [[kind for kind, _ in cells], [*point_data], [*cell_data], group_names]
     arrays = [points, *(rows for _, rows in cells), *point_data.values(), *cell_data.values()]
     listed = {str(number): values for number, values in enumerate(arrays)}
@@ -262,16 +265,16 @@ def _in_gmsh_order(kind: str, rows: Integers) -> tuple[str, Integers]:
 
 # ---------------------------------------------------------------- surfaces
 
-ARRAY = "array "  # before the name of an array that a child hands over
-# letters of Python's struct
+ARRAY = "array "  # prefix of the name of an array that a child transfers
+# Letters of Python's `struct`.
 PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_TYPES = dict(zip("char uchar short ushort int uint float double".split(), "bBhHiIfd", strict=True))
 PLY_TYPES |= dict(zip("int8 uint8 int16 uint16 int32 uint32 float32 float64".split(), "bBhHiIfd", strict=True))
-SURFACES = (".vtp", ".stl", ".ply", ".obj")  # endings
+SURFACES = (".vtp", ".stl", ".ply", ".obj")  # suffixes
 
 
 class Surface(NamedTuple):
-    """Triangles whose normals point out of the lumen, and arrays of numbers at their corners."""
+    """Triangles whose normals point out of the lumen, and numerical arrays at their corners."""
 
     points: Array
     triangles: Integers
@@ -279,16 +282,16 @@ class Surface(NamedTuple):
 
 
 def triangles_of(path: Path) -> tuple[Surface, bytes]:
-    """The triangles of a file, whichever way they look, and the file."""
+    """Read the triangles of a file, in any orientation, and the file's bytes."""
     try:
         found, data = read_guarded(path, f"{__name__}:{path.suffix[1:].lower()}")
     except UnreadableFile as error:
-        raise UnreadableFile(f"{error}; save it again, in ParaView as VTP or binary STL") from None
+        raise UnreadableFile(f"{error}; save it again in ParaView, as VTP or binary STL") from None
     points, triangles = found.pop("points").astype(np.float64), found.pop("triangles").astype(np.int64)
     return Surface(points, triangles, {name.removeprefix(ARRAY): values for name, values in found.items()}), data
 
 
-# ---------------------------------------------------------------- the child
+# ---------------------------------------------------------------- in the child process
 
 
 def _by_vtk(module: str, reader: str, file: str) -> Arrays:
@@ -300,15 +303,17 @@ obj = partial(_by_vtk, "vtkIOGeometry", "vtkOBJReader")
 
 
 def stl(file: str) -> Arrays:
-    """As text with decimal commas too."""
+    """Read an STL file, as text also with decimal commas."""
     data = Path(file).read_bytes()
     if b"\0" not in data:
-        Path(file).write_bytes(re.sub(rb"(?<=\d),(?=\d)", b".", data))  # in this process' memory
+        # The file is in this process's memory.
+        Path(file).write_bytes(re.sub(rb"(?<=\d),(?=\d)", b".", data))
     return _by_vtk("vtkIOGeometry", "vtkSTLReader", file)
 
 
 def ply(file: str) -> Arrays:
-    """Not by VTK, whose reader leaves arrays at points out, and crashes where a file is cut off."""
+    """Read the surface in a PLY file."""
+    # VTK's reader ignores arrays at points, and crashes on a truncated file.
     head, _, body = Path(file).read_bytes().partition(b"end_header")
     header = [line.split() for line in head.decode("ascii", "replace").splitlines() if line.strip()]
     try:
@@ -316,7 +321,7 @@ def ply(file: str) -> Arrays:
         points, polygons = _ply_numbers(header, order, body[body.index(b"\n") + 1 :])
         places = np.column_stack([points.pop(axis) for axis in "xyz"]).astype(np.float64)
     except (IndexError, KeyError, StopIteration, ValueError, struct.error):
-        raise UnreadableFile("has other numbers than its header announces: is it cut off?") from None
+        raise UnreadableFile("has other numbers than its header announces: is it truncated?") from None
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
@@ -334,7 +339,7 @@ def ply(file: str) -> Arrays:
 
 
 def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[dict[str, Any], list[int]]:
-    """Arrays at the points by name, and polygons, each with the number of its corners before them."""
+    """Return point arrays by name, and polygons, each after the number of its corners."""
     is_text, at = order == "=", 0
     body = np.array(body.split(), dtype=np.float64).tobytes() if is_text else body
     points: dict[str, Any] = {}
@@ -356,7 +361,7 @@ def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[
         for _ in range(int(count)):
             for name, kinds in properties.items():
                 row: tuple[Any, ...] = (1,)
-                for kind in kinds:  # before a list stands its length
+                for kind in kinds:  # the length of a list precedes it
                     code = f"{order}{int(row[0])}{kind}"
                     row = struct.unpack_from(code, body, at)
                     at += struct.calcsize(code)
@@ -368,7 +373,7 @@ def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[
 
 
 def _triangulated(data: Any) -> Arrays:
-    """Triangles of polygons and strips, with corners at one place as one, and arrays of a number at each point."""
+    """Return triangles of polygons and strips with merged corners, and scalar point arrays."""
     from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
     from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkTriangleFilter
 
@@ -379,13 +384,13 @@ def _triangulated(data: Any) -> Arrays:
     if not cells:
         raise UnreadableFile("has no triangles or other polygons")
     if min(each.min() for each in cells) < 0 or max(each.max() for each in cells) >= data.GetNumberOfPoints():
-        raise UnreadableFile("has polygons with corners that are not there")
+        raise UnreadableFile("has polygons with missing corners")
     if not np.isfinite(numbers(points.GetData())).all():
         raise UnreadableFile("has points whose coordinates are not finite")
     triangles, merged = vtkTriangleFilter(), vtkCleanPolyData()
     triangles.SetInputData(data)
     merged.SetInputConnection(triangles.GetOutputPort())
-    merged.SetTolerance(0.0)  # two corners at one place leave a line, which is passed over
+    merged.SetTolerance(0.0)  # a triangle with two equal corners becomes a line, which is ignored
     merged.Update()
     found = merged.GetOutput()
     if not found.GetNumberOfPolys():
@@ -398,18 +403,18 @@ def _triangulated(data: Any) -> Arrays:
 
 
 def vtk_arrays(data: Any) -> Arrays:
-    """Arrays of points or cells by name."""
+    """Return the arrays of points or cells by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
 
     found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
     return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
 
 
-# ---------------------------------------------------------------- meshes
+# ---------------------------------------------------------------- meshes of bodies
 
 
 def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()) -> MeshFile:
-    """Read a mesh file, with its faces in files of their own, each under the name of its file."""
+    """Read a mesh file, with faces from surface files, each under the name of its file."""
     try:
         stats = [file.stat() for file in (path, *surfaces)]
         if any(file.is_dir() for file in (path, *surfaces)):
@@ -427,7 +432,7 @@ def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tu
     mesh = read_exchange_file(path)
     points = np.asarray(mesh.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise UnreadableFile(f"its nodes have {points.shape[-1]} coordinates; needed are three")
+        raise UnreadableFile(f"its nodes have {points.shape[-1]} coordinates; must have three")
     names: dict[int, dict[str, int]] = {2: {}, 3: {}}
     for dimension, number, name in mesh.group_names:
         names.setdefault(dimension, {})[name] = number
@@ -440,17 +445,17 @@ def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tu
     return found
 
 
-SAME_NODE = 1e-3  # of the shortest side of a triangle: files may have 7 digits
+SAME_NODE = 1e-3  # distance of equal nodes over a triangle's shortest side; files have 7 digits
 
 
 def _with_surface(file: MeshFile, path: Path) -> MeshFile:
-    """The mesh with the triangles of a surface for a face, whose corners are nodes of it."""
+    """Add the triangles of a surface to a mesh as a face; their corners must be nodes."""
     from scipy.spatial import cKDTree  # most meshes are one file
 
     if file.kind != "tetrahedron":
-        raise UnreadableFile(f"{path.name}: surfaces are of triangles, so the mesh must be of tetrahedra")
+        raise UnreadableFile(f"{path.name}: a surface of triangles needs a mesh of tetrahedra")
     if path.stem in file.names[2]:
-        raise UnreadableFile(f"{path.name}: there is a face {path.stem!r} already; give the surface another name")
+        raise UnreadableFile(f"{path.name}: face {path.stem!r} already exists; rename the surface")
     try:
         surface, data = triangles_of(path)
     except UnreadableFile as error:
@@ -461,9 +466,7 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
     if far.any():
         where = f"at {in_place(corners[far][0])}, the nearest is {away[far][0]:.3g} away"
         rule = f"{where}: is it the surface of this mesh, in its unit?"
-        raise UnreadableFile(
-            f"{path.name}: {far.sum()} corners of triangles are no nodes of the mesh, the first {rule}"
-        )
+        raise UnreadableFile(f"{path.name}: {far.sum()} triangle corners are not nodes of the mesh, the first {rule}")
     number = 1 + max([*distinct(file.facet_groups), *file.names[2].values()], default=0)
     return replace(
         file,
@@ -476,7 +479,7 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
 
 
 def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> Integers:
-    """Numbers of faces and volumes; 0 where there are none, if there may be none."""
+    """Return the numbers of faces and volumes, or zeros if the file has none and needs none."""
     arrays, count = mesh.cell_data, sum(len(rows) for _, rows in mesh.cells)
     name = next((name for name in ((asked,) if asked else TAGS) if name in arrays), None)
     if name is None and asked is None and may_be_none:
@@ -485,19 +488,20 @@ def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> Integers:
         wanted = repr(asked) if asked else " or ".join(map(repr, TAGS))
         there = ", ".join(map(repr, arrays)) or "none"
         raise UnreadableFile(
-            f"has no array {wanted} with the numbers of faces and volumes (geometry.tags); it has {there}"
+            f"has no array {wanted} with the numbers of faces and volumes (geometry.tags); " f"it has {there}"
         )
     numbers = np.asarray(arrays[name], dtype=np.float64)
     if numbers.size != count or not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any():
-        raise UnreadableFile(f"the array {name!r} has no whole number for each element")
+        raise UnreadableFile(f"the array {name!r} must have an integer for each element")
     return numbers.reshape(-1).astype(np.int64)
 
 
-# ---------------------------------------------------------------- what all lead to
+# ---------------------------------------------------------------- elements of all formats
 
 
-# a wedge as seen from each of its corners, and its tetrahedra from its smallest one; J. Dompierre et al., How to
-# subdivide pyramids, prisms and hexahedra into tetrahedra (1999): diagonals begin at the smallest corner of a face
+# Orders of a wedge's nodes that begin at each corner, and its tetrahedra in the order that begins
+# at its smallest corner. J. Dompierre et al., How to subdivide pyramids, prisms and hexahedra into
+# tetrahedra (1999): the diagonal of a face begins at its smallest corner.
 _SEEN = np.array(
     [
         (0, 1, 2, 3, 4, 5),
@@ -512,7 +516,7 @@ _SPLIT = np.array([[(0, 1, 2, 4), (0, 4, 2, 5), (0, 4, 5, 3)], [(0, 1, 2, 5), (0
 
 
 def split_wedges(nodes: Integers) -> Integers:
-    """Three tetrahedra for each wedge (n, 6), which go round as it does, (n, 3, 4)."""
+    """Split each wedge (n, 6) into three tetrahedra of the same orientation, (n, 3, 4)."""
     rows = np.arange(len(nodes))
     seen = nodes[rows[:, None], _SEEN[nodes.argmin(axis=1)]]
     other = np.minimum(seen[:, 1], seen[:, 5]) < np.minimum(seen[:, 2], seen[:, 4])
@@ -520,17 +524,18 @@ def split_wedges(nodes: Integers) -> Integers:
 
 
 def split_quads(nodes: Integers) -> Integers:
-    """Two triangles for each quadrilateral (n, 4) that fit wedges beside it, (2 n, 3)."""
+    """Split each quadrilateral (n, 4) into two triangles that fit adjacent wedges, (2 n, 3)."""
     turned = np.where((nodes.argmin(axis=1) % 2 == 1)[:, None], np.roll(nodes, -1, axis=1), nodes)
     return turned[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def _split(points: Array, block: Block) -> Block:
-    """Wedges of boundary layers, and quadrilaterals beside them."""
+    """Split wedges of boundary layers, and the quadrilaterals next to them."""
     if block.kind == WEDGE:
         found = split_wedges(block.nodes)
         sides = points[found[:, :, 1:]] - points[found[:, :, :1]]
-        turned = np.linalg.det(sides).sum(axis=1) < 0  # all of a wedge or none: one that is twisted stays so
+        # All tetrahedra of a wedge are reordered or none, so that an invalid wedge stays invalid.
+        turned = np.linalg.det(sides).sum(axis=1) < 0
         found[turned] = found[turned][:, :, [0, 2, 1, 3]]
         return Block("tetra", np.repeat(block.groups, 3), found.reshape(-1, 4))
     if block.kind == "quad":
@@ -539,24 +544,24 @@ def _split(points: Array, block: Block) -> Block:
 
 
 def _numbered(blocks: list[Block]) -> Iterator[tuple[Integers, Block]]:
-    """Each with the numbers of its elements, from 1 in the order of the file."""
+    """Yield each block with the numbers of its elements, from 1 in the order of the file."""
     starts = np.cumsum([1, *(len(block.nodes) for block in blocks)])
     for start, block in zip(starts, blocks, strict=False):
         yield np.arange(start, start + len(block.nodes)), block
 
 
 def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int]], data: bytes) -> MeshFile:
-    """What a file of any kind holds."""
+    """Check points and blocks of elements, and return them as a `MeshFile`."""
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
-        raise UnreadableFile(f"a node is at {tuple(points[bad][0].tolist())}: its place must be finite")
+        raise UnreadableFile(f"a node is at {tuple(points[bad][0].tolist())}: coordinates must be finite")
     for number, block in _numbered(blocks):
         if block.kind not in (*VOLUMES, *FACET_CORNERS, WEDGE) and not block.kind.startswith(("vertex", "line")):
-            raise UnreadableFile(f"elements of type {block.kind!r}; allowed are {ALLOWED_ELEMENTS}")
+            raise UnreadableFile(f"elements of type {block.kind!r}; must be {ALLOWED_ELEMENTS}")
         if (lost := ((block.nodes < 0) | (block.nodes >= len(points))).any(axis=1)).any():
-            raise UnreadableFile(f"element {number[lost][0]} has a node that is not there")
+            raise UnreadableFile(f"element {number[lost][0]} has a missing node")
     if any(block.kind == WEDGE and len(block.nodes) for block in blocks):
-        log.info("wedges are split into three tetrahedra each, quadrilaterals of faces into two triangles")
+        log.info("each wedge is split into three tetrahedra, each quadrilateral into two triangles")
         blocks = [_split(points, block) for block in blocks]
     solid = [(number, block) for number, block in _numbered(blocks) if block.kind in VOLUMES]
     kinds = sorted({VOLUMES[block.kind] for _, block in solid if len(block.nodes)})
@@ -564,13 +569,13 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
         raise UnreadableFile("no elements of a volume; in Gmsh: a physical volume, and Mesh 3D")
     if len(kinds) > 1:
         listed = " and ".join(f"{kind} of degree {degree}" for kind, degree in kinds)
-        raise UnreadableFile(f"elements of several types: {listed}; allowed is one")
+        raise UnreadableFile(f"elements of several types: {listed}; must be of one type")
     kind, degree = kinds[0]
     corners = 3 if kind == "tetrahedron" else 4
     flat = [block for block in blocks if FACET_CORNERS.get(block.kind) == corners]
     facets = np.concatenate([np.empty((0, corners), dtype=np.int64), *(block.nodes[:, :corners] for block in flat)])
     cells = np.concatenate([block.nodes for _, block in solid])
-    used, rows = np.unique(cells, return_inverse=True)  # Gmsh also writes nodes that no element of the body has
+    used, rows = np.unique(cells, return_inverse=True)  # Gmsh also writes nodes without elements
     row_of = np.full(len(points), -1, dtype=np.int64)
     row_of[used] = np.arange(len(used))
     return MeshFile(
@@ -589,7 +594,7 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
 
 
 def gmsh_text(points: Array, blocks: Iterable[Block], names: Mapping[int, Mapping[str, int]]) -> str:
-    """A mesh as the text of a Gmsh file, format 2.2; nodes have the numbers 1, 2, ... in their order."""
+    """Format a mesh as a Gmsh file, format 2.2, with nodes numbered 1, 2, ... in their order."""
     numbers = {kind: number for number, kind in GMSH_KINDS.items()}
     groups = [f'{dimension} {number} "{name}"' for dimension, by in names.items() for name, number in by.items()]
     places = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points]

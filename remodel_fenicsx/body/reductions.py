@@ -1,7 +1,7 @@
-"""Which kinematics a scene allows: rules with reasons, and the cheapest kinematics that none of them objects to.
+"""Selection of the kinematics of a scene: rules with reasons, and the cheapest exact kinematics.
 
-A rule is a function of a scene that returns why a reduced kinematics would be wrong for it, or None. Every shape names
-its own (`Shape.reductions`).
+A rule is a function of a scene that returns why a reduced kinematics would be wrong for the scene,
+or None. Every shape lists its own rules (`Shape.reductions`).
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------- whole bodies for pictures
-# Whole bodies for pictures, from the meshes of reductions: extended, revolved or mirrored.
-#  Meshes are points (n, 3) and the corners of the elements (m, 2, 4 or 8) in VTK's order.
+# Whole bodies are the meshes of reductions, extruded, revolved or mirrored. A mesh is points (n, 3)
+# and the corners of the elements (m, 2, 4 or 8) in VTK's order.
 
 Body = tuple[Array, Integers]
 
-ROUND, LONG = 16, 12  # elements around and along, the paper's of its artery
+ROUND, LONG = 16, 12  # elements around and along, as in the paper's artery
 
 
 def _swept(levels: Array, elements: Integers) -> Body:
-    """Elements of one more dimension between the same mesh at places (levels, nodes, 3)."""
+    """Connect the same mesh at positions (levels, nodes, 3) by elements of one more dimension."""
     near = np.arange(len(levels) - 1)[:, None, None] * levels.shape[1] + elements
     far = near + levels.shape[1]
     found = np.concatenate([near, far[..., ::-1] if elements.shape[1] == 2 else far], axis=-1)
@@ -56,20 +56,21 @@ def _swept(levels: Array, elements: Integers) -> Body:
 
 
 def _between(low: Array, high: Array) -> Array:
-    """Places of a mesh at `LONG` + 1 levels, (levels, nodes, 3)."""
+    """Interpolate the positions of a mesh at `LONG` + 1 levels, (levels, nodes, 3)."""
     share = np.linspace(0.0, 1.0, LONG + 1)[:, None, None]
     return (1.0 - share) * low + share * high
 
 
 def extended(points: Array, lines: Integers, length: float) -> Body:
-    """Quadrilaterals of lines across z, from z = 0 to the length."""
+    """Extrude lines across z to quadrilaterals, from z = 0 to the length."""
     low = points * [1.0, 1.0, 0.0]
     return _swept(_between(low, low + [0.0, 0.0, length]), lines)
 
 
 def revolved(points: Array, quadrilaterals: Integers) -> Body:
-    """Hexahedra around the z axis of quadrilaterals in the half-plane y = 0, x before z."""
-    angles = -2 * np.pi * np.arange(ROUND + 1)[:, None] / ROUND  # the volumes of VTK's hexahedra are positive
+    """Revolve quadrilaterals in the half-plane y = 0 around the z axis to hexahedra."""
+    # Negative angles make the volumes of VTK's hexahedra positive; quadrilaterals have x before z.
+    angles = -2 * np.pi * np.arange(ROUND + 1)[:, None] / ROUND
     radii, z = points[:, 0], np.broadcast_to(points[:, 2], (ROUND + 1, len(points)))
     return _swept(np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1), quadrilaterals)
 
@@ -78,44 +79,44 @@ _MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}  # order of the corne
 
 
 def mirrored_twice(points: Array, elements: Integers) -> Body:
-    """The quarter x > 0, y > 0 and its images in the planes x = 0 and y = 0; nodes on the planes are shared."""
+    """Mirror the quarter x > 0, y > 0 in the planes x = 0 and y = 0, with shared nodes."""
     signs = np.array([(1.0, 1.0, 1.0), (-1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, 1.0)])
-    ways = elements, elements[:, _MIRRORED[elements.shape[1]]]  # so that all volumes are positive
+    ways = elements, elements[:, _MIRRORED[elements.shape[1]]]  # keeps all volumes positive
     every = [ways[number % 2] + number * len(points) for number in range(4)]
     return _shared((signs[:, None] * points).reshape(-1, 3), np.concatenate(every))
 
 
 def _shared(points: Array, elements: Integers) -> Body:
-    """Nodes at one place become one."""
+    """Merge nodes at the same position."""
     places = np.rint(points / (1e-7 * np.abs(points).max())).astype(np.int64)
     _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
     return points[first], np.ravel(number)[elements]
 
 
 def divided_along(points: Array, hexahedra: Integers) -> Body:
-    """One layer of hexahedra from a bottom to a top face across z, in `LONG` layers."""
+    """Divide one layer of hexahedra from a bottom to a top face across z into `LONG` layers."""
     low, high = (points[hexahedra[:, side].ravel()] for side in (slice(4), slice(4, 8)))
     return _swept(_between(low, high), np.arange(len(low)).reshape(-1, 4))
 
 
 def box(*sides: float) -> Body:
-    """A block from the origin along x, y and z, one element."""
+    """Return a block of one element from the origin along x, y and z."""
     section = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
     points = np.array([(*place, z) for z in (0.0, 1.0) for place in section])
     return points * sides, np.arange(8)[None]
 
 
 def cylinder(radius: float, length: float) -> Body:
-    """About z, from z = 0 to the length: wedges, as hexahedra with one edge on the axis."""
+    """Return a cylinder about z of hexahedra with one edge on the axis."""
     return revolved(*extended(np.array([(0.0, 0.0, 0.0), (radius, 0.0, 0.0)]), np.array([[0, 1]]), length))
 
 
-# ---------------------------------------------------------------- what of a body buckles
+# ---------------------------------------------------------------- buckling
 
 
 @dataclass(frozen=True)
 class Strut:
-    """A body along z that thrust may bend."""
+    """Model of a body along z as a column that axial compression may buckle."""
 
     length: float
     end_factor: float
@@ -125,7 +126,7 @@ class Strut:
 
 
 class ReducedScene(Protocol):
-    """What reductions ask of a scene."""
+    """Protocol of the scene that reductions use."""
 
     geometry: Any
     mesh: Mesh
@@ -152,33 +153,34 @@ POINTS = {
     ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
     ("hexahedron", 1): 8, ("hexahedron", 2): 27, ("tetrahedron", 1): 1, ("tetrahedron", 2): 4,
 }  # fmt: skip
-POINTS_OF_THE_REST = 60.0  # what a step costs whatever the mesh, in quadrature points of hexahedra
+POINTS_OF_THE_REST = 60.0  # a step's cost independent of the mesh, in points of hexahedra
 
 
 @dataclass(frozen=True)
 class Reduction:
-    """A kinematics that is exact for some scenes of a shape.
+    """Kinematics that is exact for some scenes of a shape.
 
     Attributes
     ----------
     build
-        The mesh, from the scene and the communicator.
+        Function of the scene and the communicator that returns the mesh.
     elements
-        How many elements it has, from the scene.
+        Function of the scene that returns the number of elements.
     rules
-        Why it may be wrong.
+        Rules that return why the kinematics is wrong for a scene.
     turn
-        Q (n, 3, 3) for places X (n, 3) of the body: Q^T X lies in, or beside, the part that stands for it.
+        Function of positions X (n, 3) of the body that returns Q (n, 3, 3): Q^T X lies in the part
+        that represents the body, or next to it.
     whole
-        Function of the shape and of the places (nodes, 3) and corners of the reduction's mesh: the whole body for
-        reports (`body.whole`); None: they show none.
+        Function of the shape and of the positions (nodes, 3) and corners of the reduction's mesh
+        that returns the whole body for reports (`body.whole`). With None reports show no body.
     in_the_mean
-        Why it is right only for means over many seeds, as rules say it: then it is taken where a scene names it, and
-        `auto` leaves it.
+        Rules that return why the kinematics is right only for means over many seeds. A scene may
+        then name it, but `auto` does not select it.
 
     Examples
     --------
-    Those of the tube, the cheapest first:
+    Reductions of the tube, the cheapest first:
 
     >>> from remodel_fenicsx.parts import Tube
     >>> {name: len(reduction.rules) for name, reduction in Tube.reductions.items()}
@@ -195,15 +197,16 @@ class Reduction:
 
 @dataclass(frozen=True)
 class Choice:
-    """A kinematics for a scene."""
+    """Kinematics of a scene, and the objections to each reduction."""
 
     name: str
     objections: dict[str, list[str]]
 
 
 def choice(scene: ReducedScene) -> Choice:
-    """The scene's kinematics, or the cheapest that it allows where it leaves the choice."""
-    # Under loads that press it chooses none that is reduced: what buckles leaves the symmetry.
+    """Return the scene's kinematics, or with 'auto' the cheapest one that the scene allows."""
+    # Under compressive loads no reduction is selected, because a body that buckles leaves the
+    # symmetry.
     reductions = scene.geometry.reductions  # the cheapest first
     found = {name: objections(scene, name) for name in reductions}
     if scene.model.kinematics != AUTO:
@@ -215,7 +218,7 @@ def choice(scene: ReducedScene) -> Choice:
 
 
 def objections(scene: ReducedScene, name: str) -> list[str]:
-    """Why a kinematics would be wrong for a scene; nothing if it is right."""
+    """Return the reasons why a kinematics would be wrong for a scene; none if it is right."""
     if not KINEMATICS[name].reduced:
         return []
     shape = scene.geometry
@@ -233,20 +236,20 @@ def _reasons(rules: Sequence[Rule], scene: ReducedScene) -> list[str]:
 
 
 def is_for_means(scene: ReducedScene, name: str) -> bool:
-    """Whether a kinematics, where it is allowed, is right for means over many seeds alone."""
+    """Return whether an allowed kinematics is right only for means over many seeds."""
     reductions = scene.geometry.reductions
     return name in reductions and bool(_reasons(reductions[name].in_the_mean, scene))
 
 
 def only_for_means(scene: ReducedScene) -> list[str]:
-    """Why the scene's own kinematics is right for means over many seeds alone, in words; nothing where it is exact."""
+    """Return why the scene's own kinematics is right only for means over seeds; none if exact."""
     name, reductions = scene.model.kinematics, scene.geometry.reductions
     reasons = _reasons(reductions[name].in_the_mean, scene) if name in reductions else []
     return [f"{name!r}: {reason}" for reason in reasons]
 
 
 def for_means(scene: ReducedScene) -> str:
-    """The cheapest kinematics with the body's means over many seeds of random cells; `auto` where there is none."""
+    """Return the cheapest kinematics that is right for means over many random seeds, or `auto`."""
     if threats(scene):
         return AUTO
     found = (name for name in scene.geometry.reductions if is_for_means(scene, name) and not objections(scene, name))
@@ -254,7 +257,7 @@ def for_means(scene: ReducedScene) -> str:
 
 
 def explained(scene: ReducedScene) -> list[str]:
-    """The choice in words: why nothing cheaper, what it cannot show."""
+    """Describe the choice: why nothing cheaper is allowed, and what the kinematics cannot show."""
     made = choice(scene)
     lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}"]
     for name, reasons in made.objections.items():
@@ -265,8 +268,8 @@ def explained(scene: ReducedScene) -> list[str]:
     lines += only_for_means(scene)
     if KINEMATICS[made.name].reduced and (swinging := _leaves_symmetry(scene)):
         lines.append(
-            f"{made.name!r} is the symmetric solution; with {swinging} the full body leaves it after a while, because "
-            "the pass over-corrects (docs/theory.md, Stability of the pass)"
+            f"{made.name!r} is the symmetric solution; with {swinging} the full body leaves it "
+            "after a while, because the pass overshoots (docs/theory.md, Stability of the pass)"
         )
     cannot = ", which this one cannot show" if KINEMATICS[made.name].reduced else ""
     return [
@@ -276,7 +279,7 @@ def explained(scene: ReducedScene) -> list[str]:
 
 
 def threats(scene: ReducedScene) -> list[str]:
-    """What may make a body buckle, in words: loads below zero (compression, suction)."""
+    """Describe loads that may buckle the body: negative ones, which are compression or suction."""
     if not scene.geometry.reductions or not scene.geometry.buckles:
         return []
     smallest = [
@@ -285,18 +288,18 @@ def threats(scene: ReducedScene) -> list[str]:
         for name, load in case.loads.items()
     ]
     pressing = dict.fromkeys(f"loads.{name}" for name, value in smallest if value < 0)
-    return [f"{' and '.join(pressing)} press"] if pressing else []
+    return [f"{' and '.join(pressing)} below zero"] if pressing else []
 
 
 def elements(scene: ReducedScene, name: str) -> int:
-    """How many hexahedra, or elements of fewer dimensions, a kinematics has."""
+    """Return the number of hexahedra, or of elements of fewer dimensions, of a kinematics."""
     if KINEMATICS[name].reduced:
         return scene.geometry.reductions[name].elements(scene)
     return scene.geometry.number_of_elements * scene.mesh.refinement**3
 
 
 def too_many_elements(scene: ReducedScene) -> str:
-    """What is allowed where a body, or the part that stands for it, has too many elements; nothing elsewhere."""
+    """Return the limit of the refinement if the mesh has too many elements, or an empty string."""
     name, refinement = choice(scene).name, scene.mesh.refinement
     if (number := elements(scene, name)) <= LARGEST_MESH:
         return ""
@@ -306,7 +309,7 @@ def too_many_elements(scene: ReducedScene) -> str:
 
 
 def step_cost(scene: ReducedScene, name: str) -> float:
-    """Of a step, in that of one point of a hexahedron; a rough figure from the number of quadrature points."""
+    """Estimate the cost of a step from its quadrature points; 1 is a point of a hexahedron."""
     kinematics, mesh = KINEMATICS[name], scene.mesh
     element, number = kinematics.element(mesh.element), elements(scene, name)
     if element == "tetrahedron":
@@ -315,7 +318,7 @@ def step_cost(scene: ReducedScene, name: str) -> float:
 
 
 def _leaves_symmetry(scene: ReducedScene) -> str:
-    """What of a scene makes the full body leave the symmetric solution, in words."""
+    """Return the key and value that make the full body leave the symmetric solution, or nothing."""
     remodeling = scene.remodeling
     if remodeling.coupling != "staggered" or scene.geometry.axis_kinds == ("global",):
         return ""
@@ -324,15 +327,15 @@ def _leaves_symmetry(scene: ReducedScene) -> str:
     return f"remodeling.law = {remodeling.law!r}" if LAWS[remodeling.law].over_corrects else ""
 
 
-# ---------------------------------------------------------------- where the body's places are in the reduction
+# ---------------------------------------------------------------- rotations to the reduction
 def about_z(places: Array) -> Array:
-    """x, y, z become the radial, circumferential and axial direction."""
+    """Return rotations of x, y, z to the radial, circumferential and axial direction."""
     circumferential, axial, radial = np.moveaxis(cylindrical_axes(places), -2, 0)
     return np.stack([radial, circumferential, axial], axis=-1)
 
 
 def mirrored(places: Array) -> Array:
-    """The quarter x > 0, y > 0 becomes each of the four."""
+    """Return reflections of the quarter x > 0, y > 0 to the quarter of each position."""
     signs = np.where(places < -1e-9 * np.abs(places).max(), -1.0, 1.0)
     signs[:, 2] = 1.0
     return signs[:, :, None] * np.eye(3)
@@ -340,66 +343,66 @@ def mirrored(places: Array) -> Array:
 
 # ---------------------------------------------------------------- rules
 def same_cells(scene: ReducedScene) -> str | None:
-    """Random or measured cells are other ones in every element."""
+    """Require cells that are equal in all elements, neither random nor measured."""
     return unmeasured_cells(scene) or drawn_once(scene)
 
 
 def unmeasured_cells(scene: ReducedScene) -> str | None:
-    """A file gives the cells of all elements."""
-    return "cells.fibres gives other cells to each element" if scene.measured_cells else None
+    """Require cells that do not come from a file."""
+    return "cells.fibres has different cells in each element" if scene.measured_cells else None
 
 
 def drawn_once(scene: ReducedScene) -> str | None:
-    """Random cells are other ones in every element."""
+    """Require random cells to be drawn for one element only."""
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if not scene.has_random_cells or (number == 1 and scene.mesh.element == "hexahedron"):
         return None
-    return f"cells.initial = 'random' draws other cells for each of {number} elements"
+    return f"cells.initial = 'random' draws different cells for each of {number} elements"
 
 
 def symmetric_law(scene: ReducedScene) -> str | None:
-    """A law that turns axes to one of two sides leaves the symmetry of body and loads."""
+    """Require a law that keeps the symmetry of body and loads."""
     law = scene.remodeling.law
-    return None if LAWS[law].keeps_symmetry else f"remodeling.law = {law!r} may turn axes out of planes of symmetry"
+    return None if LAWS[law].keeps_symmetry else f"remodeling.law = {law!r} may break the symmetry"
 
 
 def round_about_z(scene: ReducedScene) -> str | None:
-    """Cells that are the same in every half-plane through the z axis."""
+    """Require cells that are equal in every half-plane through the z axis."""
     axes = scene.cells.axes
     if axes == "cylindrical" or (axes == "global" and all(a == b == 0 for a, b, _ in _dimensions(scene))):
         return None
-    return f"cells.axes = {axes!r}: the tube is not round, along x it differs from along the diagonal"
+    return f"cells.axes = {axes!r}: cells along x and along the diagonal differ"
 
 
 def symmetric_planes(scene: ReducedScene) -> str | None:
-    """Cells whose mirror images in x = 0 and y = 0 are cells of the body."""
+    """Require cells whose mirror images in x = 0 and y = 0 are cells of the body."""
     axes = scene.cells.axes
     return None if axes in ("cylindrical", "global") else f"cells.axes = {axes!r} may have no planes of symmetry"
 
 
 def homogeneous(scene: ReducedScene) -> str | None:
-    """Cells that are the same everywhere, and stay so."""
+    """Require cells that are equal everywhere, and stay equal."""
     axes, lengths = scene.cells.axes, _dimensions(scene)
     if len(lengths) > 1:
-        return "regions may make cells, and stress, that are not the same everywhere"
+        return "with regions, cells and stress may not be homogeneous"
     if axes == "global":
         return None
     if axes != "cylindrical":
-        return f"cells.axes = {axes!r} may make cells that are not the same everywhere"
-    # passes give dimensions to ranks: with l1 = l3 != l2 the cells would differ after the first one
+        return f"cells.axes = {axes!r}: the cells may not be homogeneous"
+    # A pass sorts the dimensions. With l1 = l3 != l2 the cells would differ after the first pass.
     ((first, second, third),) = lengths
     stays = first == third and (second == first or not LAWS[scene.remodeling.law].remodels)
-    return None if stays else "cells.axes = 'cylindrical' makes cells, and stress, that are not the same everywhere"
+    return None if stays else "cells.axes = 'cylindrical': cells and stress are not homogeneous"
 
 
 def free_ends(scene: ReducedScene) -> str | None:
-    """Ends that move radially as all other sections do."""
+    """Require ends that move radially as all other sections."""
     ends = scene.supports.ends
-    return None if ends in ("free", "closed") else f"supports.ends = {ends!r}: the sections are not alike"
+    return None if ends in ("free", "closed") else f"supports.ends = {ends!r}: sections differ"
 
 
 def known_loads(name: str) -> Rule:
-    """Loads that the kinematics of this name has."""
+    """Return the rule that a scene has only loads that a kinematics can apply."""
 
     def rule(scene: ReducedScene) -> str | None:
         kinds = scene.geometry.loads
@@ -410,5 +413,5 @@ def known_loads(name: str) -> Rule:
 
 
 def _dimensions(scene: ReducedScene) -> list[tuple[float, ...]]:
-    """l1, l2, l3 of the first cell at the start, of each region."""
+    """Return the initial l1, l2, l3 of the first cell of each region."""
     return [tuple(map(float, properties.cells.dimensions(1)[0])) for properties in scene.properties().values()]

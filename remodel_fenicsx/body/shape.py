@@ -1,4 +1,7 @@
-"""What a body is: keys, mesh, supports, loads, columns, fibre angle; one file and one line in `body.SHAPES` each."""
+"""Shapes of bodies: keys, mesh, supports, loads, columns and fibre angle, one file each.
+
+`body.SHAPES` lists them.
+"""
 
 from __future__ import annotations
 
@@ -44,35 +47,38 @@ Loads = Mapping[str, Load]
 
 
 # ---------------------------------------------------------------- the columns of a history
-# Those of every shape, those on request, and which a scene has.
+# Columns of every shape, columns on request, and the columns of a scene.
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of history.csv.
+    """Column of a run's history.csv.
 
     Attributes
     ----------
     name
         As in the file's first row.
     unit
-        In words, for the documentation: "stress", "length", "degrees", "" for none.
+        Name of the unit in the documentation: "stress", "length", "degrees", "" for none.
     meaning
-        One sentence.
+        Description in one sentence.
     value
-        Its value from a `results.columns.Measurement`.
+        Function of a `results.columns.Measurement` that returns the value.
     after_pass
-        Whether it is known only when the cells have remodeled; all others belong to the solved state.
+        Whether the value is known only after the remodeling pass. All other values belong to the
+        solved state.
     extreme
-        Whether it is the largest or smallest value of the body: of random cells it goes with their number.
+        Whether the value is a maximum or minimum over the body. With random cells it depends on
+        their number.
     by_case
-        Whether it has another value in each load case: what belongs to the cells or to the step as a whole has not.
+        Whether the value differs between load cases. Values of the cells or of the complete step do
+        not.
     of_one_tissue
-        Whether a body with regions has it not.
+        Whether the column is missing for bodies with regions.
 
     Examples
     --------
-    A column of every shape; a scene's history then has it:
+    A column for every shape, which a scene's history then contains:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> from remodel_fenicsx.extend import COLUMNS, Column
@@ -95,15 +101,15 @@ class Column:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w .@+-]+", self.name):
-            raise ValueError(f"column {self.name!r}: its name must be of letters, digits, spaces and _ . + - @")
+            raise ValueError(f"column {self.name!r}: must consist of letters, digits, spaces and _ . + - @")
 
     def of_case(self, number: int) -> Column:
-        """The same of another load case; the first one is 1.
+        """Return this column for another load case.
 
         Parameters
         ----------
         number
-            Of the load case, from 1.
+            Number of the load case, from 1.
         """
         name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
         return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
@@ -112,13 +118,13 @@ class Column:
 Columns = tuple[Column, ...]
 
 
-# ---------------------------------------------------------------- the fibre angle through a body, whatever the mesh
+# ---------------------------------------------------------------- fibre angle over depth
 PROFILE_PLACES = 9
 PROFILE = tuple(f"angle_profile_{number}" for number in range(PROFILE_PLACES))
 
 
 def profile_weights(depth: Array) -> Array:
-    """Hat functions about equally spaced depths from 0 to 1, along one more axis; their sum is one."""
+    """Return hat functions about equal depths from 0 to 1, on a new axis; they sum to one."""
     return np.maximum(
         0.0, 1.0 - np.abs(np.asarray(depth)[..., None] * (PROFILE_PLACES - 1) - np.arange(PROFILE_PLACES))
     )
@@ -133,8 +139,8 @@ _PROFILE_COLUMNS = tuple(
     Column(
         name,
         "degrees",
-        f"mean reference fibre angle near {number}/{PROFILE_PLACES - 1} of the way through the wall of a tube, or "
-        "along z in a cube or tendon",
+        f"mean reference fibre angle near normalised depth {number}/{PROFILE_PLACES - 1} in "
+        "the wall of a tube, or along z in a cube or tendon",
         partial(_profile, number),
         by_case=False,
     )
@@ -142,11 +148,11 @@ _PROFILE_COLUMNS = tuple(
 )
 
 
-# ---------------------------------------------------------------- of regions
+# ---------------------------------------------------------------- columns of regions
 
 
 def columns_of_region(name: str) -> tuple[Column, Column]:
-    """What a history says of each region of a scene."""
+    """Return the history's columns for one region of a scene."""
     return (
         Column(
             f"fibre_angle_{name}",
@@ -165,9 +171,9 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
     )
 
 
-# ---------------------------------------------------------------- which a history has
+# ---------------------------------------------------------------- columns of a history
 def _of_work(name: str, meaning: str) -> Column:
-    """What the solver did in the step."""
+    """Return a column of the solver's work in the step."""
     return Column(name, "", meaning, lambda m: getattr(m.step.work, name), by_case=False)
 
 
@@ -178,7 +184,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "max_chain_extension",
             "",
-            "largest r/L of all chains, below 1; 0 where the chain law has no limit",
+            "largest r/L of all chains, below 1; 0 if the chain law has no limit",
             lambda m: m.step.extension.max_chain_extension,
             extreme=True,
         ),
@@ -192,7 +198,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "stored_energy",
             "stress length^3",
-            "integral of W, where 0 is a matrix at rest without chains; those of the unloaded start have eq. (1) at r0",
+            "integral of W, 0 for an undeformed matrix without chains; at r0 chains have eq. (1)",
             lambda m: m.equilibrium.stored_energy(),
         ),
         Column(
@@ -202,13 +208,13 @@ COLUMNS: dict[str, Column] = {
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),
-        _of_work("newton_iterations", "Newton iterations of the step, of failed attempts too"),
-        _of_work("linear_iterations", "iterations of the linear solver, of failed attempts too"),
-        _of_work("substeps", "number of solves that made up the step"),
+        _of_work("newton_iterations", "Newton iterations of the step, including failed attempts"),
+        _of_work("linear_iterations", "iterations of the linear solver, including failed attempts"),
+        _of_work("substeps", "number of solves in the step"),
         Column("seconds", "s", "wall time of the step", lambda m: m.step.seconds, after_pass=True),
     )
 }
-"""Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
+"""Columns of every shape by name, after `time` and the shape's columns; scripts may add columns."""
 
 
 def _of_turnover(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
@@ -222,14 +228,15 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "pass_residual",
             "squared link length",
-            "distance of the cells from those of their own stress: largest norm of A_pass - A",
+            "distance of the cells from equilibrium with their stress: largest norm of A_pass - A",
             lambda m: m.observer.stepper.remodeling.distance(),
             after_pass=True,
         ),
         Column(
             "time_error",
             "degrees",
-            "estimated error in time (docs/theory.md, Error-controlled steps); always there with `time.tolerance`",
+            "estimated time discretisation error (docs/theory.md, Error-controlled steps); "
+            "always present with `time.tolerance`",
             lambda m: m.step.time_error,
             after_pass=True,
         ),
@@ -243,7 +250,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "asleep_share",
             "",
-            "share of the volume that does not remodel, below remodeling.threshold",
+            "inactive fraction of the volume, below remodeling.threshold",
             lambda m: m.observer.stepper.remodeling.asleep_share(),
             by_case=False,
         ),
@@ -251,7 +258,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             _of_turnover(
                 name,
                 "",
-                f"{what} of the collagen over that at the start, volume mean; with remodeling.turnover",
+                f"{what} of collagen over its initial value, volume mean; with remodeling.turnover",
                 methodcaller("mean", name),
             )
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
@@ -259,33 +266,33 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "growth",
             "",
-            "volume of the tissue free of stress over that at the start; mean over the volume at the start",
+            "stress-free volume of the tissue over its initial value; mean over the initial volume",
             lambda m: m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio),
             by_case=False,
         ),
         _of_turnover(
             "collagen_share",
             "",
-            "share of the tissue's volume that is collagen, mean over the volume at the start",
+            "volume fraction of collagen in the tissue, mean over the initial volume",
             methodcaller("collagen_share"),
         ),
         _of_turnover(
             TURNOVER_POWER,
             "stress length^3 / time",
-            "power that turnover releases at the F of the row, without growth",
+            "power that turnover releases at the row's F, without growth",
             methodcaller("power"),
         ),
         Column(
             "processor_seconds",
             "s",
-            "processor time of the first rank in the step",
+            "CPU time of rank 0 in the step",
             lambda m: m.step.processor_seconds,
             after_pass=True,
         ),
         *_PROFILE_COLUMNS,
     )
 }
-"""Columns that a scene may name in `output.columns`; a script adds its own."""
+"""Columns that a scene may name in `output.columns`; scripts may add columns."""
 
 
 def columns_of(
@@ -296,42 +303,44 @@ def columns_of(
     cases: int = 1,
     held: Iterable[str] = (),
 ) -> Columns:
-    """The columns of a shape's history, in the order of the file, those on request last.
+    """Return the columns of a shape's history, with columns on request last.
 
-    Where some of the others are requested too, only they are there, with time and loads.
+    If default columns are requested by name, the history has only these, with time and loads.
 
     Parameters
     ----------
     shape
-        Of the body.
+        Shape of the body.
     requested
-        Names that a scene's `output.columns` gives.
+        Names in a scene's `output.columns`.
     loads
-        The loads that there are by name, or their names; default: all of the shape's. The column of one that frees the
-        length of the body is on request where it is not among them.
+        The scene's loads by name, or their names; default: all loads of the shape. The column of a
+        load that makes the body's length an unknown is on request if the load is not among them.
     regions
         Names of the scene's regions.
     cases
-        Number of its load cases: what differs in them has a column for each.
+        Number of load cases. Columns that differ between cases exist for each case.
     held
-        Names of its faces with supports (`Shape.held_faces`).
+        Names of the faces with supports (`Shape.held_faces`).
 
     Returns
     -------
     tuple of Column
-        In the order of the file.
+        Columns in the order of the file.
 
     Raises
     ------
     KeyError
-        If a column that is requested does not exist.
+        If a requested column does not exist.
 
     Examples
     --------
     >>> from remodel_fenicsx import parts
-    >>> [column.name for column in parts.columns_of(parts.Cube(side=1.0))][:5]
+    >>> columns = parts.columns_of(parts.Cube(side=1.0))
+    >>> [column.name for column in columns][:5]
     ['time', 'force', 'mean_stretch', 'min_stretch', 'max_stretch']
-    >>> [column.name for column in parts.columns_of(parts.Cube(side=1.0), requested=["mean_stretch"])]
+    >>> columns = parts.columns_of(parts.Cube(side=1.0), requested=["mean_stretch"])
+    >>> [column.name for column in columns]
     ['time', 'force', 'mean_stretch']
     """
     kinds = shape.loads_on(faces_of(loads) if isinstance(loads, Mapping) else {})
@@ -355,7 +364,7 @@ def columns_of(
 def columns_on_request(
     shape: Shape | type[Shape], regions: Iterable[str] = (), held: Iterable[str] = ()
 ) -> dict[str, Column]:
-    """Columns by name that a history of this shape has only where a scene names them."""
+    """Return the columns of this shape's history that a scene must name, by name."""
     of_regions = [column for name in regions for column in shape.region_columns_on_request(name)]
     of_supports = [
         Column(f"support_force_{face}", "force", SUPPORT_FORCE.format(face), partial(_support_force, face))
@@ -366,7 +375,7 @@ def columns_on_request(
     return COLUMNS_ON_REQUEST | {column.name: column for column in found}
 
 
-SUPPORT_FORCE = "force by which the support of the face `{}` pulls the body, along the mean outward normal of the face"
+SUPPORT_FORCE = "force of the support on the face `{}`, along the face's mean outward normal"
 
 
 def _support_force(face: str, m: Any) -> float:
@@ -375,32 +384,33 @@ def _support_force(face: str, m: Any) -> float:
 
 @dataclass(frozen=True)
 class LoadKind:
-    """A load that a shape knows, named once.
+    """Registry entry of a load of a shape.
 
     Attributes
     ----------
     add
-        Adds it to a body's loading: add(shape, loading, name).
+        Function that adds the load to a body's loading: add(shape, loading, name).
     meaning
-        One sentence for the documentation, the column's too.
+        Description in one sentence, also for the column.
     dimension
-        Of its value; None for a number.
+        Dimension of the value; None for a number without unit.
     column
-        Name of its column; default: its own.
+        Name of the load's column; default: the name of the load.
     above
-        Values must be greater than this.
+        Exclusive lower bound of values.
     reductions
-        Names of the reduced kinematics that have it.
+        Names of the reduced kinematics that can apply the load.
     value
-        What its column shows; default: the load's magnitude.
+        Function of a measurement that returns the column's value; default: the load's magnitude.
     frees_length
-        Whether the body's length is an unknown where a scene has it. Elsewhere its column is there on request.
+        Whether the load makes the body's length an unknown. In scenes without the load its column
+        is on request.
     area
-        Of a force: the reference area that carries it, from the shape.
+        For a force: function of the shape that returns the reference area that carries it.
     instead_of
-        Name of another load that a scene may have in its place, not beside it.
+        Name of another load that the load excludes.
     of_one_strain
-        Whether it is a strain of the whole body, for kinematics whose strain is the same everywhere.
+        Whether the load is a strain of the whole body, for kinematics of uniform strain.
 
     Examples
     --------
@@ -434,25 +444,25 @@ class LoadKind:
     of_one_strain: bool = False
 
     def column_name(self, name: str) -> str:
-        """Of its column, for the load of this name."""
+        """Return the name of the column for the load of this name."""
         return self.column or name
 
     def make_column(self, name: str) -> Column:
-        """Its column, for the load of this name."""
+        """Return the column for the load of this name."""
         unit = self.dimension.name if self.dimension else ""
         value = self.value or (lambda m: float(m.step.loads.get(name, 0.0)))
         return Column(self.column_name(name), unit, self.meaning, value)
 
 
 class End(NamedTuple):
-    """A way to hold a body.
+    """Supports of a body's ends.
 
     Attributes
     ----------
     hold
-        Function of shape and loading.
+        Function of shape and loading that adds the supports.
     frees_length
-        Whether the body's length is an unknown then.
+        Whether the supports make the body's length an unknown.
 
     Examples
     --------
@@ -469,47 +479,51 @@ _Is: Any = with_key(
     "is",
     Literal["unloaded", "loaded"],
     default="unloaded",
-    description="What the geometry describes: the body without loads, or (a tube, a body of your own) the one "
-    "under the loads at the end of their ramps; the unloaded body is found first (docs/tissue_that_lives.md).",
+    description="State of the geometry: without loads, or (tube, user-supplied body) under the loads "
+    "at the end of their ramps; the unloaded body is then computed (docs/tissue_that_lives.md).",
 )
 
 
 class Shape(_Is):  # type: ignore[misc]
-    """A body of a scene. Its fields are the keys of `[geometry]`; `shape: Literal["name"] = "name"` is one of them.
+    """Body of a scene.
+
+    The fields are the keys of `[geometry]`, among them `shape: Literal["name"] = "name"`.
 
     Attributes
     ----------
     loads
-        Loads by name; a script may add its own.
+        Loads by name; scripts may add loads.
     columns
-        Columns of the history beside those of the loads.
+        Columns of the history in addition to those of the loads.
     columns_on_request
-        Further ones that a scene may name in `output.columns`.
+        Further columns that a scene may name in `output.columns`.
     angle_layers
-        Columns of the fibre angle that are means over one layer of elements, each with the layer's `depth`.
+        Columns of the fibre angle that are means over one layer of elements, with the layer's
+        `depth`.
     axis_kinds
-        What `cells.axes` may be (`model.local_axes.AXES`).
+        Values of `cells.axes` (`model.local_axes.AXES`).
     number_of_elements
-        Hexahedra of the mesh with refinement 1.
+        Number of hexahedra of the mesh with refinement 1.
     face_names
-        Names of the faces that supports, loads and columns refer to.
+        Names of the faces for supports, loads and columns.
     reductions
-        What is cheaper than the displacement in three dimensions and exact for some scenes, by name of the kinematics,
-        the cheapest first.
+        Reductions by name of the kinematics, the cheapest first. Each is exact for some scenes and
+        cheaper than the displacement in three dimensions.
     buckles
-        Whether loads that press may bend it.
+        Whether compressive loads may buckle the body.
     ends
-        How the body may be held, by what `supports.ends` says: an `End` each.
+        Supports of the ends, an `End` for each value of `supports.ends`.
     depth_in_words
-        What `depth` goes through, where it is 0 and where it is 1.
+        Labels of `depth`: its direction, its value 0, and its value 1.
     angle_in_words
-        Where a fibre angle of 0 degrees and one of 90 point.
+        Labels of the directions of fibre angles of 0 and 90 degrees.
     constant_fields
-        Of `settings.CONSTANT_FIELDS`, those that `output.fields = true` stands for too.
+        Fields of `settings.CONSTANT_FIELDS` that `output.fields = true` includes.
     defaults
-        Defaults of other tables that this shape changes, under the keys of preset and scene.
+        Defaults of other tables that this shape changes, below those of preset and scene.
     supported_faces
-        Faces that `[supports.NAME]` may put on springs, as in what surrounds the body; None: any face, held in any way.
+        Faces for which `[supports.NAME]` may define springs, as for surrounding tissue. With None
+        every face may have any support.
 
     Raises
     ------
@@ -518,7 +532,7 @@ class Shape(_Is):  # type: ignore[misc]
 
     Examples
     --------
-    The keys of a new body; tests/body/test_extensions.py has one whole, with mesh, supports and loads:
+    The keys of a new body; tests/body/test_extensions.py has a complete one with mesh and loads:
 
     >>> from typing import Annotated, Literal
     >>> from pydantic import Field
@@ -528,7 +542,7 @@ class Shape(_Is):  # type: ignore[misc]
     ...     length: Annotated[float, LENGTH] = Field(default=4.0, gt=0, description="Length along z.")
     ...
     ...     def build(self, mesh, comm=None):
-    ...         raise NotImplementedError("here a script makes a mesh and returns a Domain")
+    ...         raise NotImplementedError("a script builds a mesh here and returns a Domain")
     ...
     ...     def hold(self, loading):
     ...         loading.hold_face("z0", component=2)
@@ -557,12 +571,12 @@ class Shape(_Is):  # type: ignore[misc]
     supported_faces: ClassVar[tuple[str, ...] | None] = ()
 
     shape: str
-    """Which body it is."""
+    """Shape of the body."""
     length_unit: LengthUnit = None
 
     @property
     def is_loaded(self) -> bool:
-        """Whether the geometry is that under the loads."""
+        """Whether the geometry is the loaded configuration."""
         return bool(getattr(self, "is") == "loaded")
 
     @property
@@ -577,57 +591,59 @@ class Shape(_Is):  # type: ignore[misc]
 
     @property
     def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
-        """Ratios of lengths, which tell numbers in different units: key, words, ratio, decades where bodies have it."""
+        """Ratios of lengths that reveal wrong units: key, label, ratio, usual decades."""
         return ()
 
     def log_of_radii(self, wall: Any) -> float | None:
-        """ln(r_o/r_i) of a wall, of one on a mesh from areas `wall.area(face)`; None where it is not known."""
+        """Return ln(r_o/r_i) of a wall, from `wall.area(face)` on a mesh, or None."""
         return None
 
     def strut(self, ends: str) -> reduced.Strut | None:
-        """What of the body buckles under thrust, held as `supports.ends` says; None if nothing bends it."""
+        """Return the column that compression may buckle, or None if nothing bends it."""
         return None
 
     def axes_at(self, coordinates: Array) -> Array:
-        """Local axes at places (..., 3), rows circumferential, axial, radial: here y, z, x, axial along the load.
+        """Return local axes at positions (..., 3) as rows circumferential, axial, radial.
+
+        By default these are y, z and x; z is the direction of the load.
 
         Parameters
         ----------
         coordinates
-            Reference places, (..., 3), in the unit of length.
+            Reference positions, (..., 3), in the unit of length.
         """
         return np.broadcast_to(np.roll(np.eye(3), -1, axis=0), (*coordinates.shape[:-1], 3, 3))
 
     def depth(self, coordinates: Array) -> Array:
-        """How far places (..., 3) are through the body, from 0 to 1: here along z.
+        """Return the normalised depth of positions (..., 3), from 0 to 1; by default along z.
 
         Parameters
         ----------
         coordinates
-            Reference places, (..., 3), in the unit of length.
+            Reference positions, (..., 3), in the unit of length.
         """
         return self.station(coordinates)
 
     def station(self, coordinates: Array) -> Array:
-        """How far places (..., 3) are along the body, from 0 to 1: here along z.
+        """Return the normalised axial coordinate of positions (..., 3), from 0 to 1; here along z.
 
         Parameters
         ----------
         coordinates
-            Reference places, (..., 3), in the unit of length.
+            Reference positions, (..., 3), in the unit of length.
         """
         found: Any = coordinates[..., 2] / self.axial_length
         return found
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
-        """Axes, depth and station at the points of a mesh of the body: here functions of the place.
+        """Return axes, depth and station at quadrature points, by default functions of position.
 
         Parameters
         ----------
         domain
             The meshed body.
         quadrature
-            Its points.
+            Quadrature of the domain.
         """
         places = quadrature.coordinates
         return LocalAxes(
@@ -639,20 +655,20 @@ class Shape(_Is):  # type: ignore[misc]
         )
 
     def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
-        """Warn of columns whose values the elements of a mesh do not resolve, a line each.
+        """Return warnings of columns whose values the elements do not resolve, one line each.
 
         Parameters
         ----------
         mesh
             The table `[mesh]`.
         columns
-            Columns that are asked for.
+            Requested columns.
         """
         return []
 
     @property
     def name(self) -> str:
-        """The shape's name."""
+        """Name of the shape."""
         return self.shape
 
     @abstractmethod
@@ -675,39 +691,40 @@ class Shape(_Is):  # type: ignore[misc]
         """
 
     def build_with(self, regions: Regions, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """Mesh the body with the regions of a scene, where the scene draws them. Collective."""
+        """Mesh the body with a scene's regions, if these have a geometry. Collective."""
         return self.build(mesh, comm)
 
     def region_depths(self, regions: Regions) -> dict[str, tuple[float, float]]:
-        """Where regions that lie one behind the other begin and end in `depth`; empty where they do not."""
+        """Return start and end depth of regions that are layers; empty for other regions."""
         return {}
 
     @classmethod
     def region_columns_on_request(cls, name: str) -> Columns:
-        """Further columns that a scene may name of its region `name`."""
+        """Return further columns that a scene may name for its region `name`."""
         return ()
 
     @abstractmethod
     def hold(self, loading: Loading) -> None:
-        """Hold the body as it is held without loads, its ends free.
+        """Add the supports of the unloaded body with free ends.
 
         Parameters
         ----------
         loading
-            Of the body; its conditions are added to it.
+            Loading of the body, to which the conditions are added.
         """
 
     def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
-        """Hold the body and add loads, each zero.
+        """Add supports, and loads with magnitude zero.
 
         Parameters
         ----------
         loading
-            Of the body or of its reduction, which has planes of symmetry of its own.
+            Loading of the body or of its reduction, which has its own planes of symmetry.
         ends
-            Of `Shape.ends`.
+            Name in `Shape.ends`.
         loads
-            Names of those that there are; default: all that the body knows and the kinematics has.
+            Names of the scene's loads; default: all loads of the body that the kinematics can
+            apply.
         """
         self.ends[ends].hold(self, loading)
         kinematics = loading.kinematics
@@ -719,102 +736,102 @@ class Shape(_Is):  # type: ignore[misc]
                 kind.add(self, loading, name)
 
     def held_faces(self, supports: Supports) -> list[str]:
-        """Faces whose supports are `[supports.NAME]`, and none of the shape's own.
+        """Return the faces with supports `[supports.NAME]`, without the shape's own supports.
 
         Parameters
         ----------
         supports
-            Those of a scene by name of the face.
+            Supports of a scene by name of the face.
         """
         return []
 
     def fills(self, regions: Collection[str]) -> bool:
-        """Whether these regions of a scene, by name, are all of the body."""
+        """Return whether these regions of a scene, by name, cover the body."""
         return False
 
     @classmethod
     def loads_on(cls, faces: Mapping[str, OnFace]) -> dict[str, LoadKind]:
-        """All loads by name: its own, and those that a scene puts on faces, where any may be held and loaded.
+        """Return all loads by name: the shape's own, and further ones on faces if it allows them.
 
         Parameters
         ----------
         faces
-            Of the scene's further loads by name (`faces_of`).
+            Faces of the scene's further loads by name of the load (`faces_of`).
         """
         return cls.loads
 
     def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
-        """Refuse supports of, and loads on, faces of a mesh that cannot have them. Collective.
+        """Check that the faces of a mesh can have these supports and loads. Collective.
 
         Parameters
         ----------
         domain
             The mesh.
         supports, loads
-            As for `hold_faces`.
+            See `hold_faces`.
 
         Raises
         ------
         SceneError
-            On all ranks; one line that names the key.
+            If a face cannot, on all ranks: one line with the key.
         """
 
     def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
-        """Hold faces as `[supports.NAME]` says.
+        """Add the supports `[supports.NAME]` of faces.
 
         Parameters
         ----------
         loading
-            Of the body, with all its loads.
+            Loading of the body, with all loads.
         supports
-            By name of the face.
+            Supports by name of the face.
         modulus
             lambda + 2 mu of the stiffest matrix in the body, in the scene's unit of stress.
         loads
-            Names of those that the scene has.
+            Loads of the scene by name.
         """
 
     @classmethod
     def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
-        """`defaults` for a scene with these keys, as they were read."""
+        """Return `defaults` for a scene with these keys, as read."""
         return cls.defaults
 
     @classmethod
     def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """The keys of `[geometry]` as they were read from a scene in a folder, with the places of files."""
+        """Return the keys of `[geometry]` as read from a scene in a folder, with paths of files."""
         return dict(geometry)
 
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """Values that a scene as run has in place of its own, by dotted key, and files beside it by name."""
+        """Return values of a stored scene by dotted key, and the files stored with it by name."""
         return {}, {}
 
     def check_size(self, mesh: Mesh) -> None:
-        """Refuse a mesh that the shape cannot have, whatever its size: raise a `fault` that names the key."""
+        """Check that the shape can have this mesh, or raise a `fault` that names the key."""
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Angle of the chain direction in degrees; here to the load axis z.
+        """Return the angle of the chain direction in degrees, by default to the load axis z.
 
         Parameters
         ----------
         dimensions, axes, local
-            l_I (..., 3), axes of the cells and local axes of the body as rows (..., 3, 3), all in the reference or all
-            in the deformed configuration.
+            l_I (..., 3), axes of the cells and local axes of the body as rows (..., 3, 3), all in
+            the reference or all in the deformed configuration.
 
         Returns
         -------
         array (...,)
-            Degrees; NaN where the chain direction has no such angle: means are over the others.
+            Degrees, NaN if the chain direction has no such angle. Means ignore NaN.
         """
         return angle_to_axis(dimensions, axes, np.array([0.0, 0.0, 1.0]))
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Share of the chains, by squared length, that `fibre_angle` does not see, (...,); parameters as there."""
+        """Return the chains' fraction that `fibre_angle` omits, by squared length, (...,)."""
         return np.zeros(dimensions.shape[:-1])
 
 
-# ---------------------------------------------------------------- what some bodies can
+# ---------------------------------------------------------------- capabilities of some bodies
 class WithRegions(Shape):
-    """A body to which a scene may give `[regions.NAME]`, parts with tissue of their own; here they come with its mesh.
+    """Body that may have regions `[regions.NAME]` with their own tissue, defined by its mesh.
 
     Its keyword arguments are the keys of `[geometry]`, as of every `Shape`.
 
@@ -826,46 +843,46 @@ class WithRegions(Shape):
     """
 
     def check_regions(self, regions: Regions, mesh: Mesh) -> None:
-        """Refuse what the regions of a scene ask of the body and it cannot have, with the key.
+        """Check that the body can have these regions.
 
         Parameters
         ----------
         regions
-            By name.
+            Regions of the scene by name.
         mesh
             Settings of the elements.
 
         Raises
         ------
         SceneError
-            One line that names the key.
+            If the body cannot have a region: one line with the key.
         """
         for name, region in regions.items():
             if region.outer_radius is not None:
-                rule = f"the regions of a {self.name} come with its mesh; only layers of a tube have an outer radius"
+                rule = f"the mesh defines the regions of a {self.name}; only a tube has this key"
                 raise fault(rule, f"regions.{name}.outer_radius", region.outer_radius)
 
 
 class Unloads(Shape):
-    """A body whose loaded shape a scene may give, `geometry.is = "loaded"`."""
+    """Body whose geometry may be the loaded configuration, `geometry.is = "loaded"`."""
 
 
 class FromFile(Shape):
-    """A body whose elements are those of a file: `[mesh]` may divide them, and decides on nothing else."""
+    """Body with the elements of a file, which `[mesh]` may only divide."""
 
 
 def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
-    """Raise the fault of `length_fault` at its key."""
+    """Check that Gmsh can mesh a body of these lengths, or raise the fault at its key."""
     found = length_fault(lengths)
     if found is not None:
         raise fault(found[1], found[0], getattr(shape, found[0]))
 
 
 def axial_dead_force(face: str) -> LoadKind:
-    """A force along z on a face across it."""
+    """Return a dead load along z on a face across z."""
     return LoadKind(
         lambda shape, loading, name: loading.add_dead_force(name, face, component=2),
-        "total force along z on the top; its direction stays (a dead load)",
+        "total force along z on the top, a dead load",
         FORCE,
         reductions=("point",),
         area=lambda shape: shape.section_area,
@@ -873,19 +890,19 @@ def axial_dead_force(face: str) -> LoadKind:
 
 
 def uniaxial_columns(top: str, length: str) -> Columns:
-    """Columns of a body that is pulled along z: its stretches and its mean fibre angle.
+    """Return the columns of a body under tension along z: stretches and mean fibre angle.
 
     Parameters
     ----------
     top
-        Name of the face that is pulled.
+        Name of the loaded face.
     length
         Name of the body's dimension along z (`Domain.dimensions`).
 
     Returns
     -------
     tuple of Column
-        For `Shape.columns`.
+        Columns for `Shape.columns`.
 
     Examples
     --------
@@ -916,24 +933,24 @@ def uniaxial_columns(top: str, length: str) -> Columns:
         Column(
             "mean_fibre_angle",
             "degrees",
-            "angle between chains and load axis in the reference body, mean over the volume",
+            "angle between chains and load axis in the reference configuration, volume mean",
             lambda m: m.quadrature.mean_of_known(m.fibre_angle),
         ),
     )
 
 
 def cauchy_columns(*names: str) -> Columns:
-    """Columns of Cauchy's stress, volume means: of "x" the normal one along x, of "xy" the shear stress.
+    """Return columns of the Cauchy stress, volume means.
 
     Parameters
     ----------
     names
-        Letters of one or two axes.
+        Letters of one or two axes: "x" is the normal stress along x, "xy" the shear stress.
 
     Returns
     -------
     tuple of Column
-        `cauchy_stress_` with each name.
+        Columns `cauchy_stress_...`, one for each name.
 
     Examples
     --------
@@ -955,7 +972,7 @@ def cauchy_columns(*names: str) -> Columns:
 def homogeneous_bar(
     bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]], whole: Callable[[Any], reduced.Body]
 ) -> reduced.Reduction:
-    """The reduction "point" of a body between two faces across z, the same strain everywhere."""
+    """Return the reduction "point", of uniform strain, for a body between two faces across z."""
 
     def build(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
         from remodel_fenicsx.body.domain import lattice_domain

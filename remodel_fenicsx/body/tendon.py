@@ -1,4 +1,4 @@
-"""Cylindrical tendon (Fig. 6)."""
+"""Cylindrical tendon, the paper's second specimen (Fig. 6)."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
 
-AROUND, CORE, RINGS, ALONG = 16, 4, 2, 10  # the paper's elements: around, along a side of the core, rings, along
-# The core's corners lie at this fraction of the radius, its sides this fraction of the way from straight to round:
-# smallest scaled Jacobian of the hexahedra 0.86 (refinement 1), 0.83 (2), 0.81 (4)
+# The paper's numbers of elements: around, along a side of the core, rings, along.
+AROUND, CORE, RINGS, ALONG = 16, 4, 2, 10
+# Position of the core's corners over the radius, and roundness of its sides from straight (0) to
+# round (1). Smallest scaled Jacobian of the hexahedra: 0.86 (refinement 1), 0.83 (2), 0.81 (4).
 CORE_RADIUS, CORE_ROUNDNESS = 0.65, 0.4
 
 
 class Tendon(Shape):
-    """A cylinder along z, held at its bottom and pulled at its top: the tendon of the paper's Fig. 6.
+    """Cylinder along z, fixed at its bottom, pulled at its top: the tendon of the paper's Fig. 6.
 
     Length and square root of the area: 1e-6 to 1e6, one up to 10,000 times the other.
 
@@ -76,7 +77,7 @@ class Tendon(Shape):
     }
 
     shape: Literal["tendon"] = "tendon"
-    """Which body it is."""
+    """Shape of the body."""
     length: Annotated[float, LENGTH] = Field(default=10.0, gt=0)
     """Length along z, in the scene's unit of length."""
     area: Annotated[float, AREA] = Field(default=10.0, gt=0)
@@ -84,21 +85,21 @@ class Tendon(Shape):
 
     @property
     def axial_length(self) -> float:
-        """The length."""
+        """Length of the tendon along z."""
         return self.length
 
     @property
     def section_area(self) -> float:
-        """The area."""
+        """Area of the cross-section."""
         return self.area
 
     @property
     def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
-        """Of tendons: neither a plate nor a thread."""
+        """Proportions of tendons, which are neither plates nor threads."""
         return (("length", "length / sqrt(area)", self.length / math.sqrt(self.area), (-2, 3)),)
 
     def strut(self, ends: str) -> Strut:
-        """Its bottom stays in its plane, its top is free."""
+        """Return the strut: the bottom stays in its plane, the top is free."""
         moment = self.area / (4 * math.pi)
         return Strut(self.length, 2.0, global_axes, lambda places: np.full(len(places), moment))
 
@@ -108,10 +109,11 @@ class Tendon(Shape):
         return self
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """A core of 4 x 4 elements with rounded sides inside two rings of 16, ten layers; times the refinement.
+        """Mesh a core of 4 x 4 elements, rounded, in two rings of 16, in ten layers.
 
-        There are nodes in the centre of the section and on the axes. `dimensions["radius"]` is the radius of the outer
-        nodes: a little more than sqrt(area / pi), so that the area of the mesh is `area`.
+        The refinement multiplies these numbers. The centre of the section and the axes have nodes.
+        `dimensions["radius"]` is the radius of the outer nodes. It slightly exceeds sqrt(area /
+        pi), so that the area of the mesh is `area`.
         """
         from remodel_fenicsx.body.domain import build_domain
 
@@ -122,7 +124,7 @@ class Tendon(Shape):
         return build_domain(draw, self.name, _dimensions(self.length, self.area, radius), comm)
 
     def hold(self, loading: Loading) -> None:
-        """u_z = 0 at the bottom, the rigid motions held at two of its nodes."""
+        """Constrain u_z at the bottom, and the other rigid body modes at two of its nodes."""
         loading.hold_face("bottom", 2)
         loading.hold_node((0.0, 0.0, 0.0), 0)
         loading.hold_node((0.0, 0.0, 0.0), 1)
@@ -134,17 +136,19 @@ def _dimensions(length: float, area: float, radius: float) -> dict[str, float]:
 
 
 def outer_radius(area: float, refinement: int = 1, degree: int = 1) -> float:
-    """Radius of the outer nodes for which the meshed cross-section has the given area."""
+    """Return the radius of the outer nodes for which the meshed cross-section has an area."""
     number = AROUND * refinement
     half = np.pi / number
     sector = 0.5 * np.sin(2.0 * half)  # triangle between the centre and the chord, of radius 1
-    if degree == 2:  # an edge through the arc's middle is a parabola: two thirds of chord times sagitta more
+    # An edge of degree 2 through the arc's midpoint is a parabola, which adds two thirds of chord
+    # times sagitta.
+    if degree == 2:
         sector += 2.0 / 3.0 * (2.0 * np.sin(half)) * (1.0 - np.cos(half))
     return float(np.sqrt(area / (number * sector)))
 
 
 def draw_tendon(length: float, area: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1) -> None:
-    """Draw and mesh the tendon in the current Gmsh model: a core and four ring quarters, swept along z."""
+    """Draw and mesh the tendon in Gmsh: a core and four ring quarters, extruded."""
     radius = outer_radius(area, refinement, degree)
     number, quarter = AROUND * refinement, CORE * refinement
     inner = model.points(core_boundary(CORE_RADIUS * radius, refinement))
@@ -155,12 +159,16 @@ def draw_tendon(length: float, area: float, refinement: int = 1, element: str = 
     section = [model.block([inner_lines], [inner[k] for k in corners], element)]
     section += model.ring(inner, outer, inner_lines, outer_lines, spokes, element)
     model.extrude(section, length, ALONG * refinement, element, {"side": outer_lines})
-    # round at the side, ever straighter towards the centre, where the elements are not concentric
+    # Elements are round at the side and become straight towards the centre, where they are not
+    # concentric.
     model.raise_degree(degree, lambda mean_radius: np.square(mean_radius / radius))
 
 
 def core_boundary(radius: float, refinement: int) -> Array:
-    """Nodes around the core, (16 refinement, 2), from -45 degrees on: between a square and the circle around it."""
+    """Return the nodes around the core, (16 refinement, 2), from -45 degrees on.
+
+    The curve lies between a square and its circumscribed circle.
+    """
     number, quarter = AROUND * refinement, CORE * refinement
     round_side = model.circle(radius, number, -quarter // 2)
     corner = round_side[::quarter]

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 
-# ---------------------------------------------------------------- what stands for all of a tube
+# ---------------------------------------------------------------- meshes of reductions
 
 
 def build_in_half_plane(dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
@@ -68,27 +68,27 @@ def build_in_half_plane(dimension: int, scene: ReducedScene, comm: MPI.Intracomm
 
 
 def build_quarter(scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
-    """The body's elements with x > 0 and y > 0; one layer along z where all sections are alike."""
+    """Mesh the quarter x > 0, y > 0, with one layer along z if all sections are equal."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)
     return whole_tube(scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1)
 
 
 def layers(scene: ReducedScene) -> int:
-    """Elements of a quarter along z: one where nothing but u_z depends on z, which is linear in it."""
+    """Return the number of a quarter's elements along z: one if only u_z depends on z, linearly."""
     alike = reduced.free_ends(scene) is None and reduced.same_cells(scene) is None
     return 1 if alike else PAPER[2] * scene.mesh.refinement
 
 
 def _spoke(wall: Wall, number: int, corner: int, start: model.Point, stop: model.Point) -> list[int]:
-    """Chain of curves through the wall between the corners of the same number on its two faces."""
+    """Add a chain of curves through the wall between the corners of one number on its two faces."""
     inside = [model.points(model.circle(radius, number)[[corner]])[0] for radius in wall.radii[1:-1]]
     pairs = itertools.pairwise([start, *inside, stop])
     return [curve for pair, count in zip(pairs, wall.counts, strict=True) for curve in model.line(*pair, count)]
 
 
 def _counts(mesh: Mesh) -> tuple[int, int, int]:
-    """Elements of the whole tube around, through the wall and along."""
+    """Return the numbers of elements of the tube around, through the wall and along."""
     around, through, along = (mesh.refinement * count for count in PAPER)
     return around, through, along
 
@@ -98,13 +98,13 @@ def _dimensions(shape: Any) -> dict[str, float]:
 
 
 def _in_layers(points: Array, elements: Integers) -> reduced.Body:
-    """Hexahedra of a quarter as long as the body, which pictures show in layers; all others as they are."""
+    """Divide hexahedra as long as the body into layers for pictures; return others as is."""
     as_long = np.isclose(np.ptp(points[elements, 2], axis=1), np.ptp(points[:, 2])).all()
     return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
 
 
 def springs_across(scene: ReducedScene) -> str | None:
-    """Springs along the wall pull its sections out of their planes."""
+    """Require springs without tangential stiffness, so that sections stay plane."""
     for face, support in scene.supports.faces.items():
         if support.tangential:
             return f"supports.{face}.tangential is above 0: sections do not stay plane"
@@ -112,12 +112,13 @@ def springs_across(scene: ReducedScene) -> str | None:
 
 
 def mirrored_draws(scene: ReducedScene) -> str | None:
-    """Random cells of the quarter stand for those of the whole tube in the mean alone, and nearly."""
+    """Require no random cells: those of a quarter represent the tube only in means."""
     if reduced.drawn_once(scene) is None:
         return None
     return (
-        "random cells are drawn for a quarter, and the other three mirror them: means over seeds are nearly those of "
-        "the whole tube (docs/kinematics.md), a single draw scatters about twice as much"
+        "random cells are drawn for a quarter and mirrored to the other three: means over seeds "
+        "are nearly those of the whole tube (docs/kinematics.md), a single draw scatters about "
+        "twice as much"
     )
 
 
@@ -152,7 +153,7 @@ REDUCTIONS = {
         in_the_mean=(mirrored_draws,),
     ),
 }
-"""The cheapest first."""
+"""Reductions of the tube, the cheapest first."""
 
 
 # ---------------------------------------------------------------- columns and loads
@@ -163,7 +164,7 @@ def _mean_radius(face: str) -> Callable[[Any], float]:
 
 
 def _mean_hoop_stress(m: Any) -> float:
-    """Over dr, the deformed volume over the deformed circumference 2 pi R |F c| and a length."""
+    """Return the mean over dr: deformed volume over circumference 2 pi R |F c| and length."""
     local = m.state.cells.local_axes
     around = np.linalg.norm(np.einsum("...ij,...j->...i", m.F, local.axes[..., 0, :]), axis=-1)
     radii = np.linalg.norm(local.coordinates[..., :2], axis=-1)
@@ -171,7 +172,7 @@ def _mean_hoop_stress(m: Any) -> float:
 
 
 def _layer_angle(share: float) -> AngleOf:
-    """Mean angle over the elements that touch R_i + share (R_o - R_i)."""
+    """Return the mean over the elements that touch R_i + share (R_o - R_i)."""
 
     def mean(m: Any, angle: Array) -> float:
         inner, outer = (m.domain.dimensions[f"{face}_radius"] for face in FACES)
@@ -180,7 +181,9 @@ def _layer_angle(share: float) -> AngleOf:
     return mean
 
 
-THICK_ELEMENTS = 0.2  # inner radii: at 0.25 the radial stress at the face of linear elements is 4 to 5 % off
+# Element thickness over the inner radius. At 0.25 the radial stress at the face of linear elements
+# has an error of 4 to 5 %.
+THICK_ELEMENTS = 0.2
 
 MEANS = {
     "inner": ("that touch the inner radius", _layer_angle(0.0)),
@@ -190,26 +193,26 @@ MEANS = {
 
 
 def _elongation(m: Any) -> float:
-    """As prescribed, or as found where the length is an unknown."""
+    """Return the prescribed elongation, or the solution if the length is an unknown."""
     strain = getattr(m.state.kinematics, "strain_of_length", None)
     return float(m.step.loads.get("elongation", 0.0)) if strain is None else float(strain(m.state.unknown))
 
 
 def _of_the_end(name: str, m: Any) -> float:
-    """`of_the_wall` or `reduced` of an `EndForce`."""
+    """Return `of_the_wall` or `reduced` of an `EndForce`."""
     return float(getattr(m.end_force("inner"), name)(m.state.loading.values.get("pressure", 0.0)))
 
 
 def _opening_angle(m: Any) -> float:
-    """Of the tube without loads, cut along its length, with its cells as they are; collective."""
+    """Compute the opening angle of the unloaded tube with its current cells. Collective."""
     from remodel_fenicsx.model.residual_stress import Rings, cut, means_through
 
     cells, state, stepper, comm = m.state.cells, m.state, m.observer.stepper, m.state.comm
-    local, tissue = cells.local_axes, stepper.remodeling.parameters.largest()  # one tissue: numbers
+    local, tissue = cells.local_axes, stepper.remodeling.parameters.largest()  # numbers
     axes = local.axes.reshape(-1, 3, 3)
 
     def along(tensors: Array) -> Array:
-        """Around, along and across the wall."""
+        """Return the components around, along and across the wall."""
         return np.einsum("nia,nab,nib->ni", axes, tensors.reshape(-1, 3, 3), axes)
 
     natural, closed = state.natural_gradient, state.kinematics.closing
@@ -239,7 +242,7 @@ def _opening_angle(m: Any) -> float:
 
 
 def _elements_through(domain: Domain, degree: int) -> tuple[Array, Array]:
-    """Radii where elements end, as nodes on the x axis have them, and those between which one of Gauss' points lies."""
+    """Return radii of element boundaries on the x axis, and radii that separate Gauss points."""
     nodes = domain.comm.bcast(domain.gather_nodes(domain.mesh.geometry.x))
     off, size = np.abs(nodes[:, 1:]).max(axis=1), np.abs(nodes).max()
     radii = np.sort(nodes[(off < 1e-9 * size) & (nodes[:, 0] > 0), 0])
@@ -249,10 +252,11 @@ def _elements_through(domain: Domain, degree: int) -> tuple[Array, Array]:
 
 
 class Tube(RoundWall):
-    """A thick-walled tube about z under inner pressure and axial elongation: the artery of the paper's Fig. 7.
+    """Thick-walled tube about z under internal pressure and elongation: the paper's artery.
 
-    Its ends stay in their planes; they are free to move radially, clamped, or closed by caps (`supports.ends`). Inner
-    radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times the other.
+    The ends stay in their planes. They move radially, are clamped, or are closed by caps
+    (`supports.ends`). Inner radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times
+    the other.
 
     Its keyword arguments are the keys of `[geometry]`: `inner_radius`, `outer_radius` and `length` in the unit
     `length_unit`, or in any one unit.
@@ -284,7 +288,7 @@ class Tube(RoundWall):
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
-            "engineering strain of the length (0.1: 10 % longer), prescribed, or found where the length is an unknown",
+            "engineering strain of the length (0.1: 10 % longer), prescribed or computed",
             column="axial_elongation",
             above=-1.0,
             reductions=tuple(REDUCTIONS),
@@ -292,8 +296,8 @@ class Tube(RoundWall):
         ),
         "axial_force": LoadKind(
             lambda shape, loading, name: loading.add_axial_force(name),
-            "force along z in the wall at the end z = `length`. As a load it is a dead force on the ends, beside the "
-            "pressure on caps; the length is then an unknown",
+            "force along z in the wall at the end z = `length`. As a load it is a dead load on the "
+            "ends, in addition to the pressure on caps; the length is then an unknown",
             FORCE,
             reductions=tuple(REDUCTIONS),
             frees_length=True,
@@ -317,13 +321,13 @@ class Tube(RoundWall):
         Column(
             "reduced_axial_force",
             "force",
-            "what a testing machine measures: `axial_force` less p pi r_i^2 at that end",
+            "force that a testing machine measures: `axial_force` minus p pi r_i^2 at that end",
             partial(_of_the_end, "reduced"),
         ),
         Column(
             "opening_angle",
             "degrees",
-            "the sector by which the unloaded tube would open if it were cut along its length now",
+            "sector by which the unloaded tube would open after a cut along its length now",
             _opening_angle,
             by_case=False,
             of_one_tissue=True,
@@ -337,7 +341,7 @@ class Tube(RoundWall):
         Column(
             "wall_thickness",
             "length",
-            "outer less inner radius",
+            "outer minus inner radius",
             lambda m: _mean_radius("outer")(m) - _mean_radius("inner")(m),
         ),
         *columns_on_request(MEANS),
@@ -351,11 +355,11 @@ class Tube(RoundWall):
         "closed": End(lambda shape, loading: shape.close(loading), frees_length=True),
     }
     supported_faces = ("outer",)
-    # with global axes a tube of isotropic cells would not stay round in the first step
+    # With global axes a tube of isotropic cells would not stay round in the first step.
     defaults = {"cells": {"axes": "cylindrical"}}
 
     shape: Literal["tube"] = "tube"
-    """Which body it is."""
+    """Shape of the body."""
     inner_radius: Annotated[float, LENGTH] = Field(gt=0)
     """Inner radius R_i, in the scene's unit of length."""
     outer_radius: Annotated[float, LENGTH] = Field(gt=0)
@@ -364,9 +368,9 @@ class Tube(RoundWall):
     """Length along z, in the scene's unit of length."""
 
     def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
-        """Springs of what surrounds it."""
+        """Add springs for the surrounding tissue."""
         for face, support in supports.items():
-            from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # which few tubes need
+            from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # few tubes need it
 
             add_support(loading, face, support, modulus, None)
             if loading.kinematics.moves_rigidly:
@@ -386,73 +390,73 @@ class Tube(RoundWall):
         return self
 
     def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
-        """Warn of stresses at the inner face of linear elements that are thick for its radius."""
+        """Warn of stresses at the inner face of linear elements that are too thick."""
         size = (self.outer_radius - self.inner_radius) / _counts(mesh)[1] / self.inner_radius
         at_face = [name for name in columns if name in {f"{component}_stress_inner" for component in STRESSES}]
         if mesh.degree > 1 or size < THICK_ELEMENTS:
             return []
         return [
-            f"output.columns = {name!r}: linear elements that are {size:.2g} inner radii thick leave 4 % or more of "
-            "it, and several times as much if chains nearly lock; set mesh.degree = 2"
+            f"output.columns = {name!r}: error of 4 % or more, and several times as much if chains "
+            f"nearly lock: linear elements are {size:.2g} inner radii thick; set mesh.degree = 2"
             for name in at_face
         ]
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """The paper's 16 elements around, 8 through the wall and 12 along, times the refinement."""
+        """Mesh 16 elements around, 8 through the wall, 12 along, times the refinement."""
         return self.build_with({}, mesh, comm)
 
     def build_with(self, regions: Regions, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
-        """The same with the scene's layers: as many elements, equally thick in each layer, none in two."""
+        """Mesh the tube with the scene's layers; no element lies in two layers."""
         return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm, regions)
 
     def check_regions(self, regions: Regions, mesh: Mesh) -> None:
-        """Regions are layers of the wall, from the lumen outwards by their outer radii."""
+        """Check that the regions are layers of the wall with distinct outer radii."""
         check_layers(self.inner_radius, self.outer_radius, _counts(mesh)[1], regions)
 
     def region_depths(self, regions: Regions) -> dict[str, tuple[float, float]]:
-        """Of the layers, from the inside outwards."""
+        """Return start and end depth of the layers, from the lumen outwards."""
         wall = self.wall(len(regions), regions)
         places = ((np.array(wall.radii) - wall.radii[0]) / np.ptp(wall.radii)).tolist()
         return dict(zip(wall.names, itertools.pairwise(places), strict=True)) if regions else {}
 
     def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
-        """The ends stay in their planes, at the distance that an elongation, or the free length, gives them."""
+        """Add supports and loads; without elongation the top is fixed along z."""
         super().support(loading, ends, loads)
         if "elongation" not in loading.values:
             loading.hold_face("top", 2)
 
     def hold(self, loading: Loading) -> None:
-        """u_z = 0 at the bottom, the rigid motions held at three of its nodes."""
+        """Constrain u_z at the bottom, and the other rigid body modes at three of its nodes."""
         loading.hold_face("bottom", 2)
         loading.hold_node((self.inner_radius, 0.0, 0.0), 1)
         loading.hold_node((-self.inner_radius, 0.0, 0.0), 1)
         loading.hold_node((0.0, self.inner_radius, 0.0), 0)
 
     def clamp(self, loading: Loading) -> None:
-        """The ends keep their circles: u_z = 0 at the bottom, u_x = u_y = 0 there and at the top."""
+        """Constrain u_z at the bottom, and u_x and u_y at the bottom and the top."""
         loading.hold_face("bottom", 2)
         for face in ("bottom", "top"):
             for component in (0, 1):
                 loading.hold_face(face, component)
 
     def close(self, loading: Loading) -> None:
-        """As with free ends, with caps on which the pressure acts."""
+        """Add the supports of free ends, and caps under the pressure."""
         self.hold(loading)
         loading.has_caps = True
 
     @property
     def axial_length(self) -> float:
-        """The length."""
+        """Length of the tube along z."""
         return self.length
 
     @property
     def section_area(self) -> float:
-        """Of the wall."""
+        """Area of the wall's section."""
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
     @property
     def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
-        """Of vessels: a wall thicker than two radii (the paper's), a ring, a tube a thousand times as long as wide."""
+        """Proportions of vessels, which are neither rings nor threads."""
         outer = self.outer_radius
         return (
             ("inner_radius", "outer_radius / inner_radius", outer / self.inner_radius, (0, 0.5)),
@@ -460,11 +464,11 @@ class Tube(RoundWall):
         )
 
     def log_of_radii(self, wall: Any) -> float:
-        """Of the unloaded tube, or of the loaded one where that is given."""
+        """Return ln(r_o/r_i) of the scene's geometry."""
         return math.log(self.outer_radius / self.inner_radius)
 
     def strut(self, ends: str) -> reduced.Strut:
-        """Its ends keep their planes; one of them moves sideways unless they are clamped."""
+        """Return the column: planes of the ends are fixed, one end moves unless clamped."""
         return reduced.Strut(
             self.length,
             0.5 if ends == "clamped" else 1.0,
@@ -474,12 +478,13 @@ class Tube(RoundWall):
         )
 
     def depth(self, coordinates: Array) -> Array:
-        """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""
+        """Return the depth from the inner (0) to the outer face (1), (...,)."""
+        # The plane faces of elements lie inside the cylinders.
         radii = np.linalg.norm(coordinates[..., :2], axis=-1)
         return np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
 
     def axes_at(self, coordinates: Array) -> Array:
-        """Circumferential, axial, radial about the z axis, rows (..., 3, 3)."""
+        """Return circumferential, axial and radial axes about z, rows (..., 3, 3)."""
         return cylindrical_axes(coordinates)
 
 
@@ -487,10 +492,13 @@ def whole_tube(
     shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None,
     regions: Regions | None = None, quarters: int = 4,
 ) -> Domain:  # fmt: skip
-    """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective."""
-    # The nodes lie exactly on the radii, equally spaced through each layer; some are on the positive and negative x and
-    # y axes. Elements of degree 1 have plane faces: their inner and outer faces are regular prisms inside the
-    # cylinders.
+    """Mesh a tube with these elements around (a multiple of 4), through the wall and along.
+
+    Collective.
+    """
+    # The nodes lie exactly on the radii, equally spaced through each layer. Some are on the
+    # positive and negative x and y axes. Elements of degree 1 have plane faces: the inner and outer
+    # faces of the mesh are regular prisms inside the cylinders.
     from remodel_fenicsx.body.domain import build_domain
 
     around, through, along = counts
@@ -503,7 +511,10 @@ def whole_tube(
 
 
 def draw_tube(wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int, quarters: int = 4) -> None:
-    """Draw and mesh quarters of the tube in the current Gmsh model, swept along z; elements around all and along."""
+    """Draw and mesh quarters of the tube in the current Gmsh model, extruded along z.
+
+    `counts` are the elements around the whole tube and along.
+    """
     number, along = counts
     quarter, is_whole = number // 4, quarters == 4
     nodes = quarters * quarter + (not is_whole)

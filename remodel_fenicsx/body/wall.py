@@ -1,4 +1,4 @@
-"""What shapes with a wall share: layers, depths, angles and columns."""
+"""Common parts of shapes with a wall: layers, depths, angles and columns."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 
 # ---------------------------------------------------------------- layers of a round wall
-# Which regions lie where, and where elements begin and end so that none lies in two.
+# Positions of regions, and of elements such that none lies in two regions.
 
 
 class Wall(NamedTuple):
-    """A wall and its elements in the direction of its thickness, from the lumen outwards."""
+    """Layers of a wall and their numbers of elements, from the lumen outwards."""
 
     names: tuple[str, ...]
     radii: tuple[float, ...]
@@ -37,19 +37,19 @@ class Wall(NamedTuple):
 
     @classmethod
     def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> Wall:
-        """The wall of a scene's regions with so many elements through it, as many as layers or more."""
+        """Return the wall of a scene's regions with these elements, at least one a layer."""
         order = sorted(regions, key=lambda name: _outer(regions[name], outer_radius)) or ["body"]
         inside = [_outer(regions[name], outer_radius) for name in order[:-1]]
         radii = (inner_radius, *inside, outer_radius)
         return cls(tuple(order), radii, shared_out([b - a for a, b in itertools.pairwise(radii)], elements))
 
     def nodes(self, degree: int) -> Array:
-        """Radii of the nodes of elements of this degree, equally spaced within a layer."""
+        """Return the radii of nodes of elements of this degree, equally spaced in each layer."""
         ends = degree * np.cumsum([0, *self.counts])
         return np.interp(np.arange(ends[-1] + 1), ends, self.radii)
 
     def marked(self, domain: Domain) -> Domain:
-        """The domain with its layers as regions: an element is where the middle of its radii is."""
+        """Return the domain with its layers as regions; mid-radii of elements decide."""
         from remodel_fenicsx.fem import compat
 
         nodes = domain.mesh.geometry.x[compat.geometry_dofmap(domain.mesh)]
@@ -64,7 +64,7 @@ def _outer(region: Region, outer_radius: float) -> float:
 
 
 def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
-    """Elements for each layer, one at least: the next one always where elements are thickest."""
+    """Distribute elements over layers, at least one each, as evenly thick as possible."""
     counts = [1] * len(thicknesses)
     for _ in range(elements - len(counts)):
         counts[int(np.argmax(np.divide(thicknesses, counts)))] += 1
@@ -72,7 +72,7 @@ def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
 
 
 def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> None:
-    """Refuse regions that are no layers of the wall between two radii with so many elements through it."""
+    """Check that the regions are layers of the wall, with at least one element each."""
     # A layer is at least as thick as Gmsh can mesh (`length_fault`).
     seen: dict[float, str] = {}
     for name, region in regions.items():
@@ -81,15 +81,15 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
             limits = f"geometry.inner_radius = {shown(inner_radius)}, at most outer_radius = {shown(outer_radius)}"
             raise fault(f"must be greater than {limits}", key, radius)
         if radius in seen:
-            rule = f"regions.{seen[radius]} ends at {shown(radius)} too; each layer has an outer radius of its own"
+            rule = f"regions.{seen[radius]} also ends at {shown(radius)}; outer radii must differ"
             raise fault(rule, key, region.outer_radius)
         seen[radius] = name
     if regions and outer_radius not in seen:
         last = seen[max(seen)]
-        rule = f"the outermost region ends at geometry.outer_radius = {shown(outer_radius)}, or leaves it out"
+        rule = f"must be geometry.outer_radius = {shown(outer_radius)} or omitted: outermost region"
         raise fault(rule, f"regions.{last}.outer_radius", max(seen))
     if len(regions) > elements:
-        rule = f"{elements} elements through the wall; {len(regions)} regions need one each: a larger mesh.refinement"
+        rule = f"{len(regions)} regions, {elements} elements through the wall; increase mesh.refinement"
         raise fault(rule, "regions", None)
     for inside, radius in itertools.pairwise([inner_radius, *sorted(seen)]):
         key = f"regions.{seen[radius]}.outer_radius"
@@ -97,12 +97,12 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
             raise fault(f"the layer is {found[1]}", key, radius)
 
 
-# ---------------------------------------------------------------- tissue that is free of stress elsewhere than the mesh
-# G leads from where the tissue is free of stress to the mesh.
+# ---------------------------------------------------------------- stress-free configurations
+# G maps the stress-free configuration to the mesh.
 
 
 def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array:
-    """Circumferential, axial and radial stretch of the layers at the points, (elements, points, 3)."""
+    """Return the layers' three stretches at the points, (elements, points, 3)."""
     depth = local_axes.depth
     found = np.ones((*depth.shape, 3))
     for layer in natural.layers:
@@ -115,26 +115,26 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
 
 
 def gradient(stretches: Array, axes: Array) -> Array:
-    """G (..., 3, 3) of stretches (..., 3) along axes, rows (..., 3, 3)."""
+    """Return G (..., 3, 3) of stretches (..., 3) along axes, rows (..., 3, 3)."""
     return np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
 
 
-# ---------------------------------------------------------------- bodies with a wall between an inner and an outer face
-# What is measured in it, and its local axes on any mesh.
+# ---------------------------------------------------------------- bodies with inner and outer face
+# Measurements in the wall, and its local axes on any mesh.
 
-AngleOf = Callable[[Any, Array], float]  # of a measurement and angles at its points
-ANGLE_IN = "mean reference fibre angle (0 circumferential, 90 axial) of the chains in the wall, in the elements"
+AngleOf = Callable[[Any, Array], float]  # function of a measurement and of angles at its points
+ANGLE_IN = "mean reference fibre angle (0 circumferential, 90 axial) in the wall, over the elements"
 
 
 CONFIGURATIONS = {
-    "unloaded": "in the unloaded body; it differs where that has residual stress",
-    "deformed": "in the deformed body, in local axes that move with it",
+    "unloaded": "in the unloaded body; it differs if that has residual stress",
+    "deformed": "in the deformed configuration, in local axes that move with the body",
 }
-"""Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
+"""Further configurations for angles in addition to the cells' own, each with its description."""
 
 
 def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str = "") -> Columns:
-    """Of the cells' own configuration, or of another one of `CONFIGURATIONS`."""
+    """Return columns of angles in the cells' own configuration, or in one of `CONFIGURATIONS`."""
     name = f"fibre_angle_{configuration}" if configuration else "fibre_angle"
     return tuple(
         Column(
@@ -153,11 +153,11 @@ def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str =
 
 
 STRESSES = {"hoop": ("around", 0), "axial": ("along", 1), "radial": ("across", 2)}
-"""Components of Cauchy's stress in the wall, by name: their direction, and where `Measurement.wall_stress` has them."""
+"""Components of the Cauchy stress in a wall: direction, and index in `Measurement.wall_stress`."""
 
 
 def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
-    """Cauchy's stress in the wall: at its faces, and means where the angles are."""
+    """Return columns of the Cauchy stress at the wall's faces, and of its means."""
     return tuple(
         Column(
             f"{name}_stress_{where}",
@@ -172,7 +172,7 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
 
 
 def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
-    """Of a body with these means: angles in other configurations, stresses, and what all walls have."""
+    """Return columns of angles in other configurations and of stresses, and those of all walls."""
     angles = (angle_columns(means, name) for name in CONFIGURATIONS)
     return (*itertools.chain(*angles), *stress_columns(means), *Walled.columns_on_request)
 
@@ -181,8 +181,8 @@ FACES = ("inner", "outer")
 FITTED_TO_FACE = (
     "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
 )
-ON_THE_FACE = 1e-6  # normalised depth: rounding of coordinates
-SECOND_LAYER = 1.5  # layers: deeper than this the third begins, and the second begins above
+ON_THE_FACE = 1e-6  # normalised depth within the rounding of coordinates
+SECOND_LAYER = 1.5  # depth over layer thickness, between the start of the second and third layer
 
 
 def _stress(where: str, mean: AngleOf, component: int, m: Any) -> float:
@@ -192,11 +192,10 @@ def _stress(where: str, mean: AngleOf, component: int, m: Any) -> float:
 
 
 def _fitted_to_face(face: str, m: Any) -> Array:
-    """Return the stress around, along and across the wall at a face, (3,). Collective.
-
-    The stress at superconvergent points is fitted by a polynomial of (R_face/R)^2: in a linear elastic tube its parts
-    are linear in it (Lame). R/R_face follows from the areas of both faces, so that this holds for any wall.
-    """
+    """Return the stress around, along and across the wall at a face, (3,). Collective."""
+    # The stress at superconvergent points is fitted by a polynomial of (R_face/R)^2. In a linear
+    # elastic tube the components are linear in it (Lame). R/R_face follows from the areas of both
+    # faces, so that the fit holds for any wall.
     from remodel_fenicsx.fem.compat import geometry_dofmap
 
     quadrature, comm = m.quadrature, m.domain.comm
@@ -208,7 +207,7 @@ def _fitted_to_face(face: str, m: Any) -> Array:
     volumes, at_face = quadrature.owned(quadrature.volumes.sum(axis=1)), depths.min(axis=1) < ON_THE_FACE
     thickness, total = comm.allreduce(np.array([depths.max(axis=1), np.ones(len(depths))]) @ (volumes * at_face))
     near = depths.min(axis=1) < SECOND_LAYER * thickness / total
-    if m.domain.regions:  # of other tissue the stress around differs
+    if m.domain.regions:  # the circumferential stress of another tissue differs
         region = quadrature.owned(m.domain.element_region)
         near &= np.isin(region, np.concatenate(comm.allgather(np.unique(region[at_face]))))
     layers = 2 if any(comm.allgather(bool((near & ~at_face).any()))) else 1
@@ -224,7 +223,7 @@ def _fitted_to_face(face: str, m: Any) -> Array:
 
 
 class Walled(Shape):
-    """A body with a wall: angles are those in it, and a scene may give it `natural.layers`.
+    """Body with a wall, in which fibre angles are measured and `natural.layers` are allowed.
 
     Its keyword arguments are the keys of `[geometry]`, as of every `Shape`.
 
@@ -239,7 +238,7 @@ class Walled(Shape):
         Column(
             "radial_share",
             "",
-            "share of the chains that points out of the wall, the volume mean of A_rr / tr A",
+            "fraction of the chains that points out of the wall, volume mean of A_rr / tr A",
             lambda m: m.quadrature.mean_of_known(m.radial_share),
             by_case=False,
         ),
@@ -254,21 +253,21 @@ class Walled(Shape):
 
     @classmethod
     def region_columns_on_request(cls, name: str) -> Columns:
-        """Stresses in the wall."""
+        """Return columns of the stresses in the region's wall."""
         words = f"of the region `{name}`"
         return stress_columns({name: (words, lambda m, v: m.quadrature.mean_of_known(v, m.elements_of_region(name)))})
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Angle of the chain direction in the wall, degrees, (...,): circumferential 0, axial 90, NaN across."""
+        """Return the pitch of chains, degrees, (...,): circumferential 0, axial 90, else NaN."""
         return pitch_angle(dimensions, axes, local)
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Share of the chains across the wall, A_rr / tr A, (...,)."""
+        """Return the fraction of the chains across the wall, A_rr / tr A, (...,)."""
         return radial_share(dimensions, axes, local)
 
 
 class RoundWall(Walled, WithRegions, Unloads):
-    """A wall between two radii that numbers describe: regions are layers that fill it, it may close from a sector."""
+    """Wall between two radii, filled by layers as regions, which may close from a sector."""
 
     @abstractmethod
     def wall(self, elements: int, regions: Regions) -> Wall:
@@ -298,5 +297,5 @@ class RoundWall(Walled, WithRegions, Unloads):
         return found
 
     def fills(self, regions: Collection[str]) -> bool:
-        """The outermost ends at the outer radius."""
+        """Return whether there are regions; the outermost one ends at the outer radius."""
         return bool(regions)

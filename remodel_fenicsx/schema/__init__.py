@@ -1,1 +1,1 @@
-"""Strict tables with errors of one line, and TOML in and out; knows no key of any scene."""
+"""Strict tables with one-line errors, and TOML in and out; independent of any scene's keys."""

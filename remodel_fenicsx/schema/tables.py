@@ -1,6 +1,6 @@
-"""What all tables of a scene share: strict values, errors of one line, and the reference of their keys.
+"""Base of all tables of a scene: strict values, one-line errors, and the reference of their keys.
 
-A leaf: it knows no key of any scene. `parameters` and `scene` declare the keys.
+A leaf that is independent of any scene's keys, which `settings` and `scene` declare.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ if TYPE_CHECKING:
 
     from pydantic.json_schema import JsonSchemaValue
 
-LONGEST_VALUE = 60  # characters of a value in an error
-# annotation of a tuple: what is a list in TOML becomes one
+LONGEST_VALUE = 60  # largest number of a value's characters in an error
+# Annotation of a tuple: a list of TOML is converted.
 IN_A_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 _MISSING = object()
-Faults = Iterator[tuple[str, str, object]]  # what is allowed, a key, and its value; the first is told
+Faults = Iterator[tuple[str, str, object]]  # rule, key and value; only the first fault is reported
 T = TypeVar("T")
 
 
 class SceneError(RemodelError, ValueError):
-    """Bad input. Its text is one line: the dotted key, the value, what is allowed.
+    """Invalid input. The text is one line: the dotted key, the value, the allowed values.
 
     Parameters
     ----------
     message
-        The line; what no terminal can show is replaced.
+        The line; characters that a terminal cannot print are replaced.
 
     Examples
     --------
@@ -67,16 +67,16 @@ class SceneError(RemodelError, ValueError):
 
 
 class Table(BaseModel):
-    """A table of a scene: immutable, no unknown keys, no conversion between types, no NaN and no infinity.
+    """Table of a scene: immutable, without unknown keys, type conversion, NaN and infinity.
 
     Attributes
     ----------
     further
-        Class of tables that may be there under any name beside the fields; None: there are none.
+        Class of the tables that may have any name, in addition to the fields, or None.
 
     Examples
     --------
-    A shape's keys, or those of what remodels, are fields with what is allowed:
+    Keys are fields. Their annotations say which values are allowed:
 
     >>> from remodel_fenicsx.extend import Table
     >>> class Decay(Table):
@@ -96,7 +96,7 @@ class Table(BaseModel):
     )
 
     def _faults(self) -> Faults:
-        """What does not fit together in its keys: what is allowed, the key and its value."""
+        """Yield rule, key and value of each inconsistency between the table's keys."""
         yield from ()
 
     @model_validator(mode="after")
@@ -107,7 +107,7 @@ class Table(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """With the meaning of each key, and without what scripts alone need."""
+        """Return the schema with each key's meaning, without the entries that only scripts need."""
         found = handler(schema)
         table = handler.resolve_ref_schema(found)
         table.pop("title", None)
@@ -127,18 +127,19 @@ class Table(BaseModel):
             except ValidationError as error:
                 raise SceneError(one_line(error, type(self))) from None
 
-        # A table inside a table is then validated by pydantic directly, so that an error keeps its whole dotted key.
+        # With this flag pydantic validates a table inside a table itself, so that an error keeps
+        # its complete dotted key.
         __init__.__pydantic_base_init__ = True
 
 
 def with_key(name: str, kind: object, **field: Any) -> type[Table]:
-    """A class of tables with a key that is a word of Python."""
+    """Create a table class with a key that is a keyword of Python."""
     fields: Any = {name: (kind, Field(**field))}
     return create_model(f"_With_{name}", __base__=Table, **fields)
 
 
 def _of_python(value: Any) -> object:
-    """A value with numpy's numbers and arrays, at any depth, as Python's own."""
+    """Return a value with its numpy numbers and arrays, at any depth, as Python's own types."""
     if hasattr(value, "dtype") and hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, dict):
@@ -147,19 +148,19 @@ def _of_python(value: Any) -> object:
 
 
 class Before:
-    """An annotation of a field whose values are looked at first."""
+    """Annotation of a field whose values are preprocessed before validation."""
 
     def __get_pydantic_core_schema__(self, source: type, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(functools.partial(self.seen, source), handler(source))
 
     def seen(self, source: type, value: object) -> object:
-        """The value to take in place of one of a field of this type."""
+        """Return the value that replaces the value of a field of type `source`."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class OneOf(Before):
-    """Annotation of a field whose value is one of a registry's keys, those registered later included."""
+    """Annotation of a field whose value is a key of a registry, including keys registered later."""
 
     registry: Collection[object]
     also: tuple[object, ...] = ()
@@ -167,14 +168,14 @@ class OneOf(Before):
 
     @property
     def choices(self) -> list[object]:
-        """All that is allowed."""
+        """Allowed values of the field."""
         return [*self.also, *(name for name in self.registry if name not in (self.removed or ()))]
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"enum": self.choices}
 
     def seen(self, source: type, value: object) -> object:
-        """The value, if it is one of those."""
+        """Return the value, or raise if it is not one of the choices."""
         if isinstance(value, str) and value in (self.removed or ()) and value not in self.registry:
             raise fault((self.removed or {})[value])
         if value is not None and value not in (*self.also, *self.registry):
@@ -184,13 +185,14 @@ class OneOf(Before):
 
 @dataclass(frozen=True)
 class VariantOf(Before):
-    """Annotation of a field that is one of several tables, those registered later included."""
+    """Annotation of a field that is one of several tables, including tables registered later."""
 
     registry: Mapping[str, type[Table]]
     tag: str
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """The keys of any variant, which an editor completes, and those that each has."""
+        """Return a schema with the keys of all variants, for completion in an editor, and those of
+        each."""
         known: dict[str, Any] = {}
         chosen = []
         for tag, table in self.registry.items():
@@ -201,23 +203,24 @@ class VariantOf(Before):
         return {"type": "object", "properties": known, "required": [self.tag], "allOf": chosen}
 
     def seen(self, source: type, value: object) -> object:
-        """The table of the variant that a table names."""
+        """Validate a table as the variant that its tag names."""
         if not isinstance(value, Mapping):
             return value
         name = value[self.tag]
         only = core_schema.tagged_union_schema({name: self.registry[name].__pydantic_core_schema__}, self.tag)
-        return SchemaValidator(only).validate_python(dict(value))  # its faults name the variant after the field
+        # The locations of its errors have the variant's name after the field's.
+        return SchemaValidator(only).validate_python(dict(value))
 
 
 class PartWithTable(Protocol):
-    """A part that brings a table."""
+    """Protocol of a part that has a table of keys."""
 
     @property
     def table(self) -> type[Table]: ...
 
 
 class OwnNumber(Protocol):
-    """A number that a part brings."""
+    """Protocol of a part's numerical parameter."""
 
     default: float
     above: float | None
@@ -226,14 +229,14 @@ class OwnNumber(Protocol):
 
 @dataclass(frozen=True)
 class KeysOfParts(Before):
-    """Annotation of a field that is a table: with the keys too that the parts chosen in it bring (`parameters`)."""
+    """Annotation of a table with additional keys of the parts that it selects (`parameters`)."""
 
     registries: Mapping[str, Mapping[str, object]]  # by the key that names the part
-    optional: bool = False  # whether the keys may be left out, as those of regions
-    tables: Mapping[str, PartWithTable] = MappingProxyType({})  # parts that bring a table of their name
+    optional: bool = False  # whether the keys may be omitted, as in regions
+    tables: Mapping[str, PartWithTable] = MappingProxyType({})  # parts with a table, by its name
 
     def seen(self, source: type, value: object) -> object:
-        """The table with the keys of its parts."""
+        """Validate a table with the keys of the parts that it selects."""
         table: type[Table] = source
         if not isinstance(value, Mapping):
             return value
@@ -255,7 +258,7 @@ Own = tuple[tuple[str, OwnNumber | type[Table]], ...]
 
 @functools.cache
 def _widened(table: type[Table], own: Own, optional: bool) -> type[Table]:
-    """A table with further numbers and tables: one class, so that scenes with them can be equal."""
+    """Create a table with further numbers and tables, cached so that such scenes compare equal."""
     kind = float | None if optional else float
     fields: dict[str, Any] = {
         name: (kind, Field(default=None if optional else number.default, gt=number.above, description=number.meaning))
@@ -267,18 +270,18 @@ def _widened(table: type[Table], own: Own, optional: bool) -> type[Table]:
 
 
 def fault(rule: str, key: str = "", value: object = _MISSING) -> PydanticCustomError:
-    """Error to raise in a validator."""
+    """Return the error that a validator raises."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
     return PydanticCustomError("fault", "{rule}", context)
 
 
 def named(registry: Mapping[str, T], fits: Callable[[T], object]) -> str:
-    """The names in a registry of the parts that fit, for an error."""
+    """Return the names of the parts of a registry that fit, for an error message."""
     return ", ".join(repr(name) for name, part in registry.items() if fits(part))
 
 
 def listed(names: Iterable[str], wrong: str, most: int = 24) -> str:
-    """Names for an error; of many those that are most like a wrong one."""
+    """Return names for an error message: all, or the `most` that resemble a wrong name."""
     names = list(names)
     if len(names) <= most:
         return ", ".join(names)
@@ -286,21 +289,22 @@ def listed(names: Iterable[str], wrong: str, most: int = 24) -> str:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value is a finite number that a float can hold; true and false are not."""
+    """Return whether a value is a finite number in the range of a float; true and false are not."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-# ---------------------------------------------------------------- one line for an error
+# ---------------------------------------------------------------- errors on one line
 
 
 def one_line(error: ValidationError, table: type[Table]) -> str:
-    """`key = value: what is allowed` of the first fault, with the number of further ones."""
-    faults: dict[str, ErrorDetails] = {}  # where several kinds of values are allowed there is one for each kind
+    """Format the first fault as `key = value: rule`, with the number of further faults."""
+    faults: dict[str, ErrorDetails] = {}  # a key that allows several types has an error for each
     for detail in sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden"):
         faults.setdefault(locate(table, detail["loc"])[0], detail)
     for detail in [detail for detail in faults.values() if detail["type"] == "extra_forbidden"]:
         key, owner, _ = locate(table, detail["loc"])
-        meant = _nearest_key(key, owner)  # a mistyped key is also a missing key: the mistyped one says more
+        # A mistyped key is also reported as missing. The error of the mistyped key is more helpful.
+        meant = _nearest_key(key, owner)
         if meant in faults and faults[meant]["type"] == "missing":
             del faults[meant]
     text, more = _describe(next(iter(faults.values())), table), len(faults) - 1
@@ -323,9 +327,9 @@ def _describe(detail: ErrorDetails, table: type[Table]) -> str:
 
 
 def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, type[Table], FieldInfo | None]:
-    """Dotted key of a place in a table, the table class that owns it, and its field (None where there is none)."""
+    """Return the dotted key at a location, the table class that owns it, and its field or None."""
     key, owner, field = "", table, None
-    inside: type[Table] | None = table  # the table of which the next item is a key
+    inside: type[Table] | None = table  # the table that owns the next item as a key
     items = list(location)
     while items:
         item = items.pop(0)
@@ -333,7 +337,7 @@ def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, ty
             if isinstance(item, int) or (field is not None and get_origin(field.annotation) is dict):
                 key = _joined(key, _step(item))
             if isinstance(item, str):
-                break  # what follows is pydantic's name of a kind of value that the key may have
+                break  # the remaining items are pydantic's names of the types of the value
             continue
         key, owner, field = _joined(key, _step(item)), inside, inside.model_fields.get(str(item))
         if field is None:
@@ -351,7 +355,7 @@ def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, ty
 
 
 def _step(item: int | str) -> str:
-    """One part of a dotted key."""
+    """Format one component of a dotted key."""
     return f"[{item}]" if isinstance(item, int) else quoted(item)
 
 
@@ -360,15 +364,15 @@ def _joined(key: str, rest: str) -> str:
 
 
 def quoted(key: str) -> str:
-    """A key as TOML writes it: bare, or in quotes."""
+    """Return a key as TOML writes it: bare, or in quotes."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else shown(key)
 
 
 def shown(value: object) -> str:
-    """A value as a scene writes it, on one line, cut where it is long."""
+    """Format a value as in a scene, on one line, truncated to `LONGEST_VALUE` characters."""
     try:
         text = _toml_text(value)
-    except (ValueError, RecursionError):  # an integer of thousands of digits, a list without end
+    except (ValueError, RecursionError):  # an integer with thousands of digits, a recursive list
         text = f"a {type(value).__name__}"
     return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
 
@@ -388,18 +392,18 @@ def _toml_text(value: object) -> str:
 
 
 def _nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> list[str]:
-    """The one name that is most like another, in a list, or none."""
+    """Return the known name that most resembles a name, as a list of one or none."""
     return difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
 
 
 def _nearest_key(key: str, owner: type[Table]) -> str:
-    """The key of the same table that is most like an unknown one, or nothing."""
+    """Return the key of the same table that most resembles an unknown key, or an empty string."""
     parent, _, name = key.rpartition(".")
     return "".join(_joined(parent, near) for near in _nearest(name, owner.model_fields))
 
 
 def _suggestion(key: str, owner: type[Table], table: type[Table]) -> str:
-    """The nearest key of the same table, else a key of the same name in another one, else all keys of the table."""
+    """Suggest a similar key of this table, else of another table, else list the table's keys."""
     parent, _, name = key.rpartition(".")
     if near := _nearest_key(key, owner):
         return f"did you mean {near}?"
@@ -407,24 +411,24 @@ def _suggestion(key: str, owner: type[Table], table: type[Table]) -> str:
     elsewhere = {known: _joined(other, known) for other, inner in others for known in inner.model_fields}
     if names := _nearest(name, elsewhere, cutoff=0.8):
         return f"did you mean {elsewhere[names[0]]}?"
-    return "allowed are " + ", ".join(_joined(parent, known) for known in owner.model_fields)
+    return "allowed: " + ", ".join(_joined(parent, known) for known in owner.model_fields)
 
 
-# ---------------------------------------------------------------- what a field allows
+# ---------------------------------------------------------------- allowed values of a field
 
 
 def is_table(annotation: object) -> TypeGuard[type[Table]]:
-    """Whether an annotation is a table class."""
+    """Return whether an annotation is a table class."""
     return isinstance(annotation, type) and issubclass(annotation, Table)
 
 
 def variant_of_field(field: FieldInfo) -> VariantOf | None:
-    """The registry behind a field that has several kinds of tables, or None."""
+    """Return the annotation of a field that is one of several tables, or None."""
     return next((entry for entry in field.metadata if isinstance(entry, VariantOf)), None)
 
 
 def choices(field: FieldInfo) -> list[object]:
-    """The values of a field that has a closed list of them, else an empty list."""
+    """Return the allowed values of a field that has a finite list of them, else an empty list."""
     if variant := variant_of_field(field):
         return list(variant.registry)
     for entry in field.metadata:
@@ -434,22 +438,22 @@ def choices(field: FieldInfo) -> list[object]:
 
 
 def _kind(field: FieldInfo) -> object:
-    """The annotation of a field that may be left out as that of one that may not."""
+    """Return the annotation of a field without None, if it is one type or None."""
     kinds = [kind for kind in get_args(field.annotation) if kind is not NoneType]
     return kinds[0] if get_args(field.annotation) == (*kinds, NoneType) and len(kinds) == 1 else field.annotation
 
 
 def allowed(field: FieldInfo) -> str:
-    """What a field allows, as an error and the reference say it."""
+    """Describe the values that a field allows, for errors and the reference of keys."""
     if listed := choices(field):
-        return f"allowed {'is' if len(listed) == 1 else 'are'} " + ", ".join(shown(choice) for choice in listed)
+        return f"must be {'one of ' if len(listed) > 1 else ''}" + ", ".join(map(shown, listed))
     if isinstance(field.json_schema_extra, dict):
         return f"must be {field.json_schema_extra['allowed']}"
     if is_table(field.annotation) or get_origin(field.annotation) is dict:
         fields: dict[str, FieldInfo] = getattr(field.annotation, "model_fields", {})
         required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
-    nouns: dict[object, str] = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a string"}
+    nouns: dict[object, str] = {float: "a finite number", int: "an integer", bool: "true or false", str: "a string"}
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
     bounds = [
         f"{word} {getattr(entry, name)}"
@@ -461,7 +465,7 @@ def allowed(field: FieldInfo) -> str:
 
 
 def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[Table]]]:
-    """Of a field: what stands after its key for a table in it, the variant, the class; NAME stands for a free name."""
+    """Yield suffix of the key, variant and class of each table in a field; NAME is a free name."""
     if several := variant_of_field(field):
         yield from (("", tag, kind) for tag, kind in several.registry.items())
         return
@@ -470,7 +474,7 @@ def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[Table]]]:
 
 
 def sections(table: type[Table], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[Table]]]:
-    """(dotted key, variant, class) of a table and of all tables in it; NAME stands for a free name."""
+    """Yield dotted key, variant and class of a table and its inner tables; NAME is a free name."""
     yield key, variant, table
     if (kind := table.further) is not None:
         yield from sections(kind, _joined(key, "NAME"))
@@ -483,10 +487,10 @@ def sections(table: type[Table], key: str = "", variant: str = "") -> Iterator[t
 
 
 def description(table: type[Table], name: str) -> str:
-    """What a field means, on one line."""
+    """Return the meaning of a field, on one line."""
     return " ".join((table.model_fields[name].description or "").split())
 
 
 def meaning(table: type[Table]) -> str:
-    """What a reader of scenes is told of a table: its docstring up to what scripts need."""
+    """Return a table's docstring without the sections that only scripts need."""
     return re.split(r"\n\nIts keyword arguments |\n\n\w+\n---", inspect.cleandoc(table.__doc__ or ""))[0]

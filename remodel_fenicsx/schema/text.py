@@ -1,6 +1,6 @@
-"""Text files as data: TOML in and out (scenes, overrides, a table's values), and tables of numbers that others write.
+"""Text files as data: TOML input and output (scenes, overrides, tables), and columns of numbers.
 
-A leaf: it knows no key of any scene.
+A leaf that is independent of any scene's keys.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from remodel_fenicsx.system.files import read_regular
 
 log = logging.getLogger(__name__)
 
-COMMENT_WIDTH = 100  # characters of a line of comment
+COMMENT_WIDTH = 100  # characters in a line of comment
 LARGEST = 10**6  # bytes: thirty times a scene with all keys and their comments
-MOST_PARTS = 100  # of a dotted key: tomllib's time grows with their square
+MOST_PARTS = 100  # components of a dotted key: tomllib's time grows with the square of the number
 _DECIMAL = re.compile(r"(?<![\w.])[+-]?\d[\d_]*\.\d[\d_]*(?:[eE][+-]?\d+)?(?![\w.])")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The nested dicts of a TOML file."""
+    """Read a TOML file as nested dicts."""
     try:
         text = read_regular(path, LARGEST).decode("utf-8-sig")
     except FileNotFoundError:
@@ -57,18 +57,18 @@ def read_toml(path: Path) -> dict[str, Any]:
         words = text.splitlines()[int(place[2]) - 1] if place and place[2] else ""
         raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}{_marks(words)}") from None
     if _depth_exceeds(values, MOST_PARTS):
-        raise SceneError(f"{path}: tables or lists in more than {MOST_PARTS} others; a scene has up to 4")
+        raise SceneError(f"{path}: more than {MOST_PARTS} nested tables; a scene has up to 4")
     return values
 
 
 def _marks(text: str) -> str:
-    """What is to be said of quotes that word processors have turned."""
+    """Return a remark on typographic quotes in a text, which word processors insert, or nothing."""
     found = re.search("[\u2018-\u201f\u00ab\u00bb]", text)
-    return f'; {found[0]} is no quote of TOML: type " in its place' if found else ""
+    return f'; {found[0]} is not a quote of TOML: type " instead' if found else ""
 
 
 def _depth_exceeds(value: object, most: int) -> bool:
-    """Whether tables and lists lie in more than so many others."""
+    """Return whether tables and lists are nested more than `most` levels deep."""
     if not isinstance(value, (dict, list)):
         return False
     entries = value.values() if isinstance(value, dict) else value
@@ -76,7 +76,7 @@ def _depth_exceeds(value: object, most: int) -> bool:
 
 
 def parse_override(text: str) -> tuple[str, object]:
-    """Dotted key and value of "KEY=VALUE"; VALUE is TOML, or a string: a bare word, a number with a unit."""
+    """Parse "KEY=VALUE"; VALUE is TOML, a bare word or a number with a unit."""
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
         raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")
@@ -96,7 +96,7 @@ def parse_override(text: str) -> tuple[str, object]:
 
 
 def put(values: dict[str, object], key: str, value: object) -> None:
-    """Put a value at a dotted key, making the tables on the way."""
+    """Set a value at a dotted key and create the tables that contain it."""
     *parents, name = (part.strip() for part in key.split("."))
     for depth, parent in enumerate(parents):
         table = values.setdefault(parent, {})
@@ -108,7 +108,7 @@ def put(values: dict[str, object], key: str, value: object) -> None:
 
 
 def merged(base: Mapping[str, object], over: Mapping[str, object]) -> dict[str, Any]:
-    """Nested dicts laid over each other, table by table; a list or a value of `over` replaces that of `base`."""
+    """Merge nested dicts table by table; a list or value of `over` replaces that of `base`."""
     result = dict(base)
     for name, value in over.items():
         below = result.get(name)
@@ -117,13 +117,13 @@ def merged(base: Mapping[str, object], over: Mapping[str, object]) -> dict[str, 
 
 
 def toml_text(table: BaseModel, header: str = "") -> str:
-    """A table with all its values as TOML, each key under its description as a comment."""
+    """Format a table with all its values as TOML, each key under its description as a comment."""
     head = [f"# {printable(line)}" if line.strip() else "" for line in header.splitlines()]
     return "\n".join([*head, *([""] if head else []), *_lines(table), ""])
 
 
 def _lines(table: BaseModel | Mapping[str, object], place: str = "") -> Iterator[str]:
-    """The lines of a table: TOML wants its own values before the tables in it."""
+    """Yield the lines of a table. TOML requires its values before the tables in it."""
     fields = type(table).model_fields if isinstance(table, BaseModel) else {}
     inside: list[tuple[str, Any]] = []
     entries: dict[str, Any] = dict(table)
@@ -137,9 +137,10 @@ def _lines(table: BaseModel | Mapping[str, object], place: str = "") -> Iterator
             yield f"{quoted(name)} = {tomlkit.item(value).as_string()}"
     for head, value in inside:
         lines = [*_lines(value, head.strip("[]") + ".")]
-        if fields and not lines:  # an empty table says nothing, but a name does
+        if fields and not lines:  # an empty table has no information, but a free name does
             continue
-        if isinstance(value, BaseModel) or lines[:1] != [""]:  # the tables in a plain one say that it is there
+        # A plain table that contains only tables needs no heading of its own.
+        if isinstance(value, BaseModel) or lines[:1] != [""]:
             yield from ("", head)
         yield from lines
 
@@ -150,7 +151,7 @@ def _wrapped(text: str) -> list[str]:
 
 
 # ---------------------------------------------------------------- tables of numbers
-# CSV in the dialects of spreadsheets and of ParaView.
+# CSV in the dialects of spreadsheets and ParaView.
 DELIMITERS = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "spaces"}
 
 
@@ -161,7 +162,7 @@ def read_columns(
     spellings: Mapping[str, str] | None = None,
     unused: Iterable[str] = (),
 ) -> dict[str, NDArray[np.float64]]:
-    """Columns of numbers by name, (rows,); a line of the log says how they were written."""
+    """Read columns of numbers by name, (rows,), and log how they were written."""
     names, rows, written = _cells(data)
     allowed, unused = list(allowed), set(unused)
     known = {name.lower(): name for name in (*allowed, *unused)}
@@ -169,9 +170,9 @@ def read_columns(
     if unknown := [name for name, found in zip(names, head, strict=True) if not found]:
         if all(_number(name, ".") is not None for name in names):
             raise UnreadableFile("begins with a row of numbers; the first row must have the names of the columns")
-        raise UnreadableFile(f"the column {shown(unknown[0])} is not known; allowed are {listed(allowed, unknown[0])}")
+        raise UnreadableFile(f"unknown column {shown(unknown[0])}; allowed: {listed(allowed, unknown[0])}")
     if twice := [name for number, name in enumerate(head) if name in head[:number]]:
-        raise UnreadableFile(f"the column {twice[0]} is there twice")
+        raise UnreadableFile(f"duplicate column {twice[0]}")
     mark = "," if any("," in cell for row in rows for cell in row) else "."
     values = np.empty((len(rows), len(head)))
     for number, row in enumerate(rows):
@@ -180,7 +181,7 @@ def read_columns(
         for place, cell in enumerate(row):
             if (value := _number(cell, mark)) is None:
                 more = " (others have decimal commas)" if mark == "," and "." in cell else ""
-                raise UnreadableFile(f"row {number + 1}, {head[place]}: {shown(cell)} is no number{more}")
+                raise UnreadableFile(f"row {number + 1}, {head[place]}: {shown(cell)} is not a number{more}")
             values[number, place] = value
     used = {name: column for name, column in zip(head, values.T, strict=True) if name not in unused}
     words = [f"{written} between columns", *(["decimal commas"] if mark == "," else [])]
@@ -190,12 +191,12 @@ def read_columns(
 
 
 def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
-    """Names, rows of cells as they are written, and what stands between them."""
+    """Return the column names, the rows of cells as written, and the name of the delimiter."""
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise UnreadableFile("is no text in UTF-8") from error
+        raise UnreadableFile("is not text in UTF-8") from error
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     said = lines.pop(0).strip()[4:] if lines and lines[0].lower().startswith("sep=") else ""
     head = lines[0] if lines else ""
@@ -211,13 +212,13 @@ def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
     width = len(table[0]) if table else 0
     table = [row[:width] if not any(row[width:]) else row for row in table if any(row)]
     if len(table) < 2:
-        raise UnreadableFile("is no table: needed are a row of names and rows of numbers")
+        raise UnreadableFile("is not a table; must have a row of names and rows of numbers")
     return table[0], table[1:], DELIMITERS.get(mark, repr(mark))
 
 
 def _number(cell: str, mark: str) -> float | None:
-    """A finite number with this decimal mark; None of what is none."""
-    if "_" in cell or (mark == "," and "." in cell):  # Python would take 1_0 for 10
+    """Parse a finite number with this decimal mark, or return None."""
+    if "_" in cell or (mark == "," and "." in cell):  # Python would read 1_0 as 10
         return None
     try:
         value = float(cell.replace(",", "."))

@@ -1,7 +1,8 @@
-"""Numbers with units, as "100 mmHg": turned into numbers in the units of a scene, exactly, by pint. And numbers that
-look like percent, strains, radians or diameters.
+"""Numbers with units, such as "100 mmHg", and numbers that seem to use another convention.
 
-Of the keys of a scene it knows only the two that choose its units: material.stress_unit and geometry.length_unit.
+pint converts numbers exactly to the units of a scene. A warning names numbers that look like
+percent, strains, radians or diameters. This module knows only the two keys that select a scene's
+units: material.stress_unit and geometry.length_unit.
 """
 
 from __future__ import annotations
@@ -24,30 +25,30 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from remodel_fenicsx.schema.tables import OneOf, fault, shown
 
-if TYPE_CHECKING:  # it takes half a second to start, and most scenes have no units
+if TYPE_CHECKING:  # importing pint takes half a second, and most scenes have no units
     from pydantic.json_schema import JsonSchemaValue
     import pint
 
 STRESS_UNIT, LENGTH_UNIT = "material.stress_unit", "geometry.length_unit"
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 LENGTH_UNITS = tuple(METRES)
-LARGEST_NUMBER = 1e60  # products of four are no overflow
+LARGEST_NUMBER = 1e60  # a product of four such numbers does not overflow
 NUMBER_TOO_LARGE = f"too large a number; must be at most {LARGEST_NUMBER:g}"
 _UNITS: ContextVar[Mapping[str, str | None] | None] = ContextVar(
     "units", default=None
-)  # of the scene that is validated
+)  # units of the scene that is being validated
 
-# the type of geometry.length_unit, for every shape
+# Type of geometry.length_unit, for every shape.
 LengthUnit = Annotated[
     str | None,
     OneOf(METRES),
     Field(
-        description="Unit of every length of the scene. It is needed only where lengths or forces are given with "
-        "units; without it lengths are in any one unit.",
+        description="Unit of every length of the scene. It is required only if lengths or forces "
+        "have units; without it lengths are in any one unit.",
     ),
 ]
 
-# A number, and a unit without brackets: pint would work out towers of powers, which may take for ever.
+# A number, and a unit without brackets: pint would evaluate nested powers, which may never end.
 _TERM = r"°?[^\W\d_]\w*(?:\s*(?:\^|\*\*)\s*[+-]?[0-9]{1,2}(?![0-9]))?"
 _UNIT = re.compile(rf"(?:/\s*)?{_TERM}(?:\s*[*/·]\s*{_TERM}|\s+{_TERM})*")
 _NUMBER, _REST = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", r"[^\s0-9.].*"
@@ -58,16 +59,16 @@ QUANTITY = rf"{_NUMBER}\s*{_REST}"
 
 @dataclass(frozen=True)
 class Dimension:
-    """What a number of a scene measures: an annotation of its field, ``side: Annotated[float, LENGTH]``.
+    """Dimension of a number of a scene, an annotation of its field: ``Annotated[float, LENGTH]``.
 
     Parameters
     ----------
     name
-        As errors and the reference say it.
+        Name in errors and in the reference.
     example
         A value with a unit.
     powers
-        The unit of the number: powers of units, each the name of a unit or the key that chooses it.
+        The unit of the number: powers of units, each the name of a unit or the key that selects it.
 
     Examples
     --------
@@ -86,24 +87,25 @@ class Dimension:
         return core_schema.no_info_before_validator_function(self.number, handler(source))
 
     def number(self, value: object, key: str = "") -> Any:
-        """The number that a text stands for, in the units of the scene that is validated.
+        """Convert a text with a unit to a number in the units of the scene being validated.
 
         Parameters
         ----------
         value
-            What the scene has: a number, or a text with a unit.
+            Value in the scene: a number, or a text with a unit.
         key
-            Of the value, below that of the table that is validated.
+            Key of the value relative to the table being validated.
 
         Returns
         -------
         float
-            In the scene's unit; whatever is no text stays.
+            Number in the scene's unit. A value that is not a text is returned unchanged.
 
         Raises
         ------
         PydanticCustomError
-            If the text is no number with a unit of this dimension, or the scene has not chosen its unit.
+            If the text is not a number with a unit of this dimension, or if the scene does not set
+            the unit.
         """
         units = _UNITS.get()
         if not isinstance(value, str) or units is None:
@@ -113,14 +115,15 @@ class Dimension:
             raise fault(f"must be a number, or one with {rule}", key, value)
         source = _unit(found[2])
         powers = {units.get(name, name): power for name, power in self.powers}
-        # a unit of length stands in for one that was not chosen, to tell first whether it is a length at all
+        # The metre replaces a unit of length that is not set, so that a wrong dimension is reported
+        # first.
         target = _unit(" * ".join(f"{unit or 'm'}**{power}" for unit, power in powers.items()))
         if source is None or target is None or source.dimensionality != target.dimensionality:
             raise fault(f"{shown(found[2])} is no unit of {self.name}; must be {rule}", key, value)
         if unset := [name for name, _ in self.powers if units.get(name, name) is None]:
-            remedy = f"set {unset[0]} (m, cm, mm or um), or leave the unit out"
+            remedy = f"set {unset[0]} (m, cm, mm or um), or omit the unit"
             raise fault(f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value)
-        number = float(found[1])  # sorts out the exponents that would make a fraction of a billion digits
+        number = float(found[1])  # rejects exponents that would make a fraction of a billion digits
         if abs(number) > LARGEST_NUMBER:
             raise fault(NUMBER_TOO_LARGE, key, value)
         return float(_registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude)
@@ -130,7 +133,7 @@ class Dimension:
 
 
 def schema_with_unit(dimension: Dimension) -> JsonSchemaValue:
-    """JSON schema of a number with a unit."""
+    """Return the JSON schema of a number with a unit."""
     return {"type": "string", "pattern": rf"^\s*{QUANTITY}\s*$", "examples": [dimension.example]}
 
 
@@ -144,14 +147,14 @@ NUMBER_DENSITY = Dimension("number per volume", "2e21 / m^3", (("m", -3),))
 
 
 def is_quantity(text: str) -> bool:
-    """Whether a text is a number followed by something that could be its unit."""
+    """Return whether a text is a number followed by a possible unit."""
     found = _QUANTITY.fullmatch(text)
     return found is not None and _UNIT.fullmatch(found[2].rstrip()) is not None
 
 
 @contextmanager
 def scene_units(units: Mapping[str, str | None]) -> Iterator[None]:
-    """Within, numbers with units that are validated become those in these units of a scene."""
+    """Convert numbers with units to these units of a scene while the block validates them."""
     token = _UNITS.set(units)
     try:
         yield
@@ -160,12 +163,12 @@ def scene_units(units: Mapping[str, str | None]) -> Iterator[None]:
 
 
 def dimension_of(field: FieldInfo) -> Dimension | None:
-    """The dimension that a field is annotated with, if it is."""
+    """Return the dimension with which a field is annotated, or None."""
     return next((entry for entry in field.metadata if isinstance(entry, Dimension)), None)
 
 
 def factor_to_scene(unit: str, dimension: Dimension, units: Mapping[str, str | None]) -> float:
-    """How many of the scene's units one of another unit is."""
+    """Return the factor from another unit to the scene's unit of a dimension."""
     try:
         with scene_units(units):
             return float(dimension.number(f"1 {unit}"))
@@ -174,14 +177,14 @@ def factor_to_scene(unit: str, dimension: Dimension, units: Mapping[str, str | N
 
 
 def _unit(text: str) -> pint.Unit | None:
-    """The unit that a text names, or None."""
+    """Parse a unit, or return None."""
     import pint
 
     if _UNIT.fullmatch(text) is None:
         return None
     try:
         return _registry().parse_units(re.sub("^/", "1 /", text.replace("·", "*")))
-    except (pint.PintError, ValueError, tokenize.TokenError):  # not defined, or not to be understood
+    except (pint.PintError, ValueError, tokenize.TokenError):  # undefined, or not parseable
         return None
 
 
@@ -189,56 +192,56 @@ def _unit(text: str) -> pint.Unit | None:
 def _registry() -> pint.UnitRegistry:
     import pint
 
-    # with fractions every factor is exact: 5 mm are 5 mm, and the one rounding is that to the nearest float
+    # Fractions keep every factor exact: 5 mm are 5 mm. Only the result is rounded, to a float.
     return pint.UnitRegistry(non_int_type=Fraction)
 
 
 # ---------------------------------------------------------------- numbers in another convention
-# Than the one that is asked for: one table, for scenes and for measurements.
+# One table for scenes and measurements.
 
 Array = NDArray[np.float64]
 
 
 class Doubt(NamedTuple):
-    """What numbers of a quantity hardly are."""
+    """Warning that numbers of a quantity seem to use another convention."""
 
     quantity: str  # regular expression of its key or column, with the unit of a column in brackets
-    holds: Callable[[Array, Array], bool]  # of magnitudes, and of those of the model, NaN where there is none
+    holds: Callable[[Array, Array], bool]  # of magnitudes and the model's, NaN if it has none
     words: str
 
 
-# The first that holds is said. Comparisons with NaN do not hold.
+# Only the first entry that holds is reported. Comparisons with NaN do not hold.
 CONVENTIONS = (
     Doubt("elongation", lambda x, _: x.max() > 3.0, "reaches {high:.4g}: percent? An elongation of 10 % is 0.1"),
-    # a table of stretches begins at 1 within what is measured
+    # A table of stretches begins at 1 within the measurement error.
     Doubt(
         "elongation",
         lambda x, _: x.min() > 0.98,
         "reaches {high:.4g}: a stretch? A stretch of 1.1 is an elongation of 0.1, an engineering strain",
     ),
     Doubt("stretch", lambda x, _: x.max() > 10.0, "reaches {high:.4g}: percent? A stretch of 110 % is 1.1"),
-    # soft tissue is compressed to 0.5 at most
+    # Soft tissue is compressed to a stretch of 0.5 at most.
     Doubt(
         "stretch", lambda x, _: x.min() < 0.4, "begins at {low:.4g}: strains? A stretch of 1 is the reference length"
     ),
-    # fibres along circles have angles of 0.1 and less; those of the model may be small too
+    # Circumferential fibres have angles of 0.1 and less. The model's angles may be small too.
     Doubt(
         r"\b(\w*_)?angle",
         lambda x, model: 0.1 < x.max() <= 3.15 and not model.max() <= 3.15,
-        "{high:.3g} at most: radians? Degrees are asked",
+        "{high:.3g} at most: radians? Angles must be in degrees",
     ),
     Doubt(
         "temperature",
-        lambda x, _: not 250.0 <= x.min() <= x.max() <= 400.0,  # of what is neither ice nor cooked
+        lambda x, _: not 250.0 <= x.min() <= x.max() <= 400.0,  # neither frozen nor cooked
         "{high:.4g} is hardly an absolute temperature in K; 37 degC are 310.15",
     ),
     Doubt(
-        r"radius \(length\)",  # the model's tissue is a guess
+        r"radius \(length\)",  # approximate, because the model's tissue is a guess
         lambda x, model: 1.7 < (x / model).min() <= np.median(x / model) < 2.4,
         "{ratio:.3g} times those of the scene at the start; are they diameters?",
     ),
     Doubt(
-        r"\(length\)",  # units differ by ten and more
+        r"\(length\)",  # units of length differ by a factor of ten or more
         lambda x, model: abs(np.log(np.median(x / model))) > np.log(5.0),
         "{ratio:.3g} times those of the scene at the start; another unit than geometry.length_unit? See units",
     ),
@@ -251,7 +254,7 @@ CONVENTIONS = (
 
 
 def convention_doubt(quantity: str, values: ArrayLike, model: ArrayLike = np.nan) -> str:
-    """Return what numbers of a quantity may be instead, or nothing."""
+    """Return a warning that numbers seem to use another convention, or an empty string."""
     numbers, expected = np.abs(np.atleast_1d(values)), np.maximum(np.abs(np.atleast_1d(model)), 1e-300)
     for doubt in CONVENTIONS:
         if re.search(doubt.quantity, quantity) and doubt.holds(numbers, expected):

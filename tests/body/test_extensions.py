@@ -338,7 +338,7 @@ def test_a_coupling(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with pytest.raises(
         SceneError,
-        match="^remodeling.coupling = 'late': allowed are 'staggered', 'relaxed', 'extrapolated'$",
+        match="^remodeling.coupling = 'late': must be one of 'staggered', 'relaxed', 'extrapolated'$",
     ):
         scene(remodeling={"coupling": "late"})
     late = extend.CouplingKind("as staggered, but the cells stay as they are up to t = 2", Late)
@@ -403,7 +403,7 @@ def test_a_formulation(monkeypatch: pytest.MonkeyPatch) -> None:
         extend.FORMULATIONS, "apart", extend.Selective("both parts at all points", {("hexahedron", 1): 2})
     )
     with pytest.raises(
-        SceneError, match="^mesh.formulation = 'apart': allowed for elements 'hexahedron' of degree 2 is"
+        SceneError, match="^mesh.formulation = 'apart': must be .* for elements 'hexahedron' of degree 2"
     ):
         whole(mesh={"formulation": "apart", "degree": 2})
     matrix = scene().with_values(WITHOUT_CHAINS)  # as one point: its kernels compile fastest

@@ -123,7 +123,7 @@ CASES: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "endless blocks": (".vtu", endless, "cannot be read"),
     "a bomb": (".vtu", bomb, "takes more than 1[0-9]{3} MB to read|cannot be read: "),
     "pieces": (".vtu", pieces, "several pieces; allowed is one: .*ParaView"),
-    "a polyhedron": (".vtu", of_type(42), "of type 'polyhedron'; allowed are"),
+    "a polyhedron": (".vtu", of_type(42), "of type 'polyhedron'; must be"),
     "an unknown element": (".vtu", of_type(99), "missing or unknown: 99"),
 }  # fmt: skip
 

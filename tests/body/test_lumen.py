@@ -181,7 +181,7 @@ def test_files_of_many_programs_are_the_same_surface(tmp_path: Path, capsys: pyt
     for name in ("arrays.vtp", "arrays.ply", *files):
         assert wall(tmp_path / name, "--thickness", 0.3, "--size", 0.5, "-o", tmp_path / f"{name}.msh") == 0
         flat = 0.5 * AROUND * np.sin(2 * np.pi / AROUND) * RADIUS**2 * LENGTH
-        assert f"triangles of {name} {flat:.4g}" in capsys.readouterr().out, name
+        assert f"triangles in {name} {flat:.4g}" in capsys.readouterr().out, name
 
 
 @pytest.mark.parametrize(("bend", "wide"), [(0.0, 3.0), (1.5, 1.0)])

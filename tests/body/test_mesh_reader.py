@@ -113,7 +113,7 @@ def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, ca
     faces = {"inner": 1, "outer": 2, "inlet": 3, "outlet": 4}
     caplog.set_level("INFO")
     file, boundary, _ = scene_of(tmp_path / "wall.vtu", faces=faces).geometry.checked()
-    assert file.kind == "tetrahedron" and len(file.cells) == 3 * len(wedges) and "wedges are split" in caplog.text
+    assert file.kind == "tetrahedron" and len(file.cells) == 3 * len(wedges) and "each wedge is split" in caplog.text
     sides = file.points[file.cells[:, 1:]] - file.points[file.cells[:, :1]]
     volumes = np.linalg.det(sides) / 6
     assert volumes.min() > 0 and volumes.sum() == pytest.approx(np.pi * (1.5**2 - 1.0) * 4.0, rel=0.01)
@@ -164,8 +164,8 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
     ("cells", "tags", "words"),
     [
         ([("pyramid", [[0, 1, 2, 3, 4]])], [[1]], "elements of type 'pyramid'"),
-        ([("hexahedron", [range(8)])], [[0.5]], "no whole number for each element"),
-        ([("hexahedron", [range(8)])], [[np.nan]], "no whole number for each element"),
+        ([("hexahedron", [range(8)])], [[0.5]], "an integer for each element"),
+        ([("hexahedron", [range(8)])], [[np.nan]], "an integer for each element"),
         ([("quad", [range(4)])], [[1]], "no elements of a volume"),
     ],
 )

@@ -82,9 +82,7 @@ def test_an_outer_radius_where_no_layer_is_is_refused() -> None:
     mesh = SHAPES["mesh"](file="vessel.msh")
     assert isinstance(mesh, WithRegions)
     mesh.check_regions({"core": Region()}, Mesh())
-    with pytest.raises(
-        PydanticCustomError, match="the regions of a mesh come with its mesh; only layers of a tube have"
-    ):
+    with pytest.raises(PydanticCustomError, match="the mesh defines the regions of a mesh; only a tube has"):
         mesh.check_regions({"core": Region(outer_radius=1.0)}, Mesh())
 
 

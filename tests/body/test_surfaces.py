@@ -116,8 +116,8 @@ def inside(files: dict[str, Path]) -> None:
 
 
 @pytest.mark.parametrize(("change", "line"), [
-    (shifted, "lumen.vtp: [0-9]+ corners of triangles are no nodes of the mesh, the first at .*is it the surface of"),
-    (in_metres, "lumen.vtp: [0-9]+ corners of triangles are no nodes of the mesh, the first at .* away: is it the"),
+    (shifted, "lumen.vtp: [0-9]+ triangle corners are not nodes of the mesh, the first at .*is it the surface of"),
+    (in_metres, "lumen.vtp: [0-9]+ triangle corners are not nodes of the mesh, the first at .* away: is it the"),
     (lambda files: files["inner"].write_bytes(b"<VTKFile>"), "lumen.vtp: cannot be read: "),
     (lambda files: files["inner"].write_bytes(files["inner"].read_bytes()[:900]), "lumen.vtp: "),
     (lambda files: files["inner"].unlink(), "no such file: .*lumen.vtp"),
@@ -147,10 +147,10 @@ def test_what_is_no_list_of_a_mesh_and_surfaces_is_refused(tmp_path: Path) -> No
     for geometry, line in (
         ({"file": [files["inner"], files["volume"]]}, "geometry.file = .*: must be the path of a mesh"),
         ({"file": []}, "geometry.file = \\[\\]: must be the path of a mesh"),
-        ({"file": [files["volume"], files["msh"]]}, "geometry.file = .*what follows the mesh must be paths of its su"),
+        ({"file": [files["volume"], files["msh"]]}, "geometry.file = .*or a list of it and paths of its su"),
         (
             {"file": [files["volume"], files["inner"], str(twice)]},
-            "geometry.file = .*: .*lumen.vtp: there is a face .lumen. already",
+            "geometry.file = .*: .*lumen.vtp: face .lumen. already exists",
         ),
         ({"file": files["msh"], "faces": {"inner": {"file": "lumen.txt"}}}, "geometry.f.*name or a number in the fi"),
         ({"file": files["volume"]}, "geometry.file = 'volume.vtu': has no array 'gmsh:physical' or"),
@@ -158,5 +158,5 @@ def test_what_is_no_list_of_a_mesh_and_surfaces_is_refused(tmp_path: Path) -> No
         with pytest.raises(SceneError, match=f"^{line}"):
             scene(geometry).geometry.checked()
     hexahedra = write_all(tmp_path, "hexahedron")
-    with pytest.raises(SceneError, match="lumen.vtp: surfaces are of triangles, so the mesh must be of tetrahedra"):
+    with pytest.raises(SceneError, match="lumen.vtp: a surface of triangles needs a mesh of tetrahedra"):
         scene(in_faces(hexahedra))

@@ -109,5 +109,5 @@ def test_a_missing_end_is_refused() -> None:
     whole = WalledTube().build(scene("walled").mesh, MPI.COMM_SELF)
     faces = {name: tag for name, tag in whole.faces.items() if name != "outlet"}
     walled = replace(whole, faces=faces)
-    with pytest.raises(SceneError, match="^geometry.faces: the local axes of a wall need a face 'outlet'$"):
+    with pytest.raises(SceneError, match="^geometry.faces: the local axes need a face 'outlet'$"):
         WalledTube().local_axes(walled, Simulation(scene("walled"), MPI.COMM_SELF, whole).quadrature)

@@ -110,7 +110,7 @@ def test_chosen_steps_are_counted_and_their_share_is_that_of_time(tmp_path):
     number = len((tmp_path / "run" / "history.csv").read_text().splitlines()) - 2
     assert number != 20 and f"cube: step {number} at 100%, t = 20" in done.stderr
     page = (tmp_path / "run" / "report.html").read_text()
-    assert f"{number} steps of an error below 5 degrees" in page and "20/20" not in done.stderr
+    assert f"{number} steps with an error below 5 degrees" in page and "20/20" not in done.stderr
 
 
 def test_hints_are_typed_as_the_command_was_found(tmp_path, monkeypatch):

@@ -362,7 +362,7 @@ def test_with_a_tolerance_any_time_may_be_hit() -> None:
     ramp = [[0.0, 0.0], [10.3, 1.0]]
     scene = tube("staggered", 60.5, **{"time.tolerance": 1.0, "loads.pressure.ramp": ramp})
     assert scene.stops() == [10.3, 25.0, 60.5]
-    assert Time(end=MOST_STEPS, tolerance=1.0).in_words() == "steps of an error below 1 degrees"
+    assert Time(end=MOST_STEPS, tolerance=1.0).in_words() == "steps with an error below 1 degrees"
 
 
 def test_studies_of_equal_steps_refuse_it(tmp_path: Path, refused: Refused) -> None:

@@ -193,7 +193,7 @@ def test_axes_of_ones_own_may_have_no_symmetry(monkeypatch: pytest.MonkeyPatch) 
     for shape, name, words in (
         ("tube", "sector", "may have no planes of symmetry"),
         ("tube", "radial", "along the diagonal"),
-        ("cube", "point", "may make cells that are not the same everywhere"),
+        ("cube", "point", "the cells may not be homogeneous"),
     ):
         base = scene(shape, AUTO, 2.0)
         with pytest.raises(SceneError, match=f"'{name}': cells.axes = 'tilted':? .*{words}"):

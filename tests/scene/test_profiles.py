@@ -43,7 +43,7 @@ def test_on_the_command_line_it_lies_over_the_scene(
     assert read_scene(path, [], "balanced").with_values({}) == read_scene(path, [], "balanced")
     assert cli.main(["validate", str(path), "--profile", "fast"]) == 0
     words = capsys.readouterr().out
-    assert "steps of an error below 1 degrees" in words
+    assert "steps with an error below 1 degrees" in words
     assert PROFILES["fast"].in_words("fast") in words
     said = refused("run", "--resume", tmp_path, "--profile", "fast")
     assert "--profile: a run goes on in its own folder, with its own settings" in said

@@ -386,7 +386,7 @@ def test_bounds_are_those_of_the_key(folder: Path, refused: Refused) -> None:
         ("outer_radius", 2.0, "are they diameters?"),
         ("outer_radius", 1e-3, "geometry.length_unit?"),
         ("inner_radius", 10.0, "geometry.length_unit?"),
-        ("fibre_angle_outer", np.pi / 180, "radians? Degrees are asked"),
+        ("fibre_angle_outer", np.pi / 180, "radians? Angles must be in degrees"),
         ("outer_radius", 1.1, ""),
     ],
 )
