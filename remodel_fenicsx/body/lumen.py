@@ -180,7 +180,7 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
         folded = np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) <= 0
         if not folded.any():
             break
-        normals = _smoothed(normals, surface, openings)
+        normals = _around(surface, normals[surface.triangles].sum(axis=1), openings)
     else:
         place = points[tetrahedra[folded][0]].mean(axis=0)
         raise SceneError(f"--thickness: too thick: the wall folds over at {in_place(place)}, where the lumen is hollow")
@@ -225,30 +225,20 @@ def _straightened(points: Array, tetrahedra: Integers) -> int:
         points[middles] = points[twisted[:, EDGES]].mean(axis=2)
 
 
-def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
-    """Unit vectors out of the lumen at the points, by the triangles around them; those of a rim in its plane."""
-    found, vectors = np.zeros_like(surface.points), area_vectors(surface.points[surface.triangles])
-    for k in range(3):
-        np.add.at(found, surface.triangles[:, k], vectors)
-    return _in_planes(found, surface.points, openings)
-
-
-def _in_planes(vectors: Array, points: Array, openings: Sequence[Integers]) -> Array:
-    found = vectors.copy()
+def _around(surface: Surface, vectors: Array, openings: Sequence[Integers]) -> Array:
+    """Unit vectors at the points, by sums over the triangles around them (triangles, 3); those of a rim in its plane."""
+    found = np.zeros_like(surface.points)
+    np.add.at(found, surface.triangles, vectors[:, None])
     for rim in openings:
         nodes = np.unique(rim)
-        across = np.linalg.svd(points[nodes] - points[nodes].mean(axis=0))[2][2]
+        across = np.linalg.svd(surface.points[nodes] - surface.points[nodes].mean(axis=0))[2][2]
         found[nodes] -= np.outer(found[nodes] @ across, across)
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-def _smoothed(normals: Array, surface: Surface, openings: Sequence[Integers]) -> Array:
-    """Each with those around it."""
-    edges = np.unique(np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2), axis=0)
-    sums = normals.copy()
-    for one, other in (edges.T, edges.T[::-1]):
-        np.add.at(sums, one, normals[other])
-    return _in_planes(sums, surface.points, openings)
+def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
+    """Unit vectors out of the lumen at the points."""
+    return _around(surface, area_vectors(surface.points[surface.triangles]), openings)
 
 
 def _check_room(inner: Array, outer: Array, thickness: Array) -> None:

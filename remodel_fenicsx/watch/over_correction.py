@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
+import dolfinx.la
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -22,11 +22,13 @@ Array = NDArray[np.float64]
 
 ORDER = 3  # of the difference over passes that takes a smooth course away and keeps what changes its sign each time
 GAIN = 2.0**ORDER  # by which it magnifies that
-# the beginning of an instability: measured, all bodies that left their solution did so; none that stayed on it
-# (factor of a pass, passes in a row, swing of A over r0^2 after the next)
-GROWING, GROWING_PASSES, CELL_TOLERANCE = -1.2, 2, 2e-2
-# its end: random cells swing for ever at single points, each its own way, which the body hardly feels
-SUSTAINED, SUSTAINED_PASSES, BODY_TOLERANCE = -0.9, 3, 0.02  # the same of the displacement, over the displacement
+# factor of a pass, and passes in a row, from which on a swing is told that will be over `TOLERANCE` after one more:
+# the beginning of an instability, of the cells over r0^2. All bodies that left their solution had it, no other one
+GROWING = -1.2, 2
+# its end, of the displacement over itself: random cells swing for ever at single points, each its own way, which the
+# body hardly feels
+SUSTAINED = -0.9, 3
+TOLERANCE = 0.02
 RESTED_SHARE = 0.5  # of the body: after a pass that has left so much of it as it was, a jump is no swing
 UNEVEN = 1.5  # ratio of two steps up to which they are about alike; of uneven ones a jump looks like a swing
 LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
@@ -34,37 +36,31 @@ LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
 RESUMED_CHANGE = 0.03
 
 
-def _weights(times: Array) -> Array:
-    """Of the difference of order ORDER over passes, the newest first: 1, -3, 3, -1."""
+def _difference(times: Array, values: Array) -> Array:
+    """Difference of order ORDER over the newest passes: of equal steps 1, -3, 3, -1 times the values."""
     # Of passes that are not equally far from each other it is the divided difference, made as large.
     apart = np.subtract.outer(times[: ORDER + 1], times[: ORDER + 1])
     np.fill_diagonal(apart, 1.0)
     weights = 1.0 / apart.prod(axis=1)
-    return np.asarray(GAIN * weights / np.abs(weights).sum())
+    return np.tensordot(GAIN * weights / np.abs(weights).sum(), values[: ORDER + 1], 1)
 
 
-@dataclass(frozen=True)
-class Swing:
+class Swing(NamedTuple):
     """The part of a step's change that the pass before had made the other way round."""
 
-    cells: float
-    cells_factor: float
-    body: float
-    body_factor: float
+    size: float
+    factor: float
 
 
 class OverCorrection(WarnsOnce):
     """Warns, once, when the cells swing to and fro from pass to pass so that results suffer."""
 
     name = "over_correction"
-    initial = {"growing": 0, "sustained": 0} | {f"time_{age}": 0.0 for age in range(ORDER + 1)}
+    initial = dict.fromkeys(("growing", "sustained", *(f"time_{age}" for age in range(ORDER + 1))), 0.0)
 
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
-        self.swing: Swing | None = None
-        # cells that belong to the stress of their own row, by a rule for any step, go nowhere too far
-        traits = stepper.coupling.traits
-        self._may_swing = not traits.accumulates or traits.longest < np.inf
+        self.swings: dict[str, Swing] = {}
         # of the passes before, with the newest one
         cells = partial(self.quadrature.function, "", (6,))
         self._cells = Earlier(self.state, "over_correction_cells", cells, ORDER + 1)
@@ -76,96 +72,70 @@ class OverCorrection(WarnsOnce):
         return cls(stepper) if stepper.remodeling.law.remodels and not scene.time.is_equilibrium else None
 
     def started(self, step: Step) -> None:
-        """The cells before the first pass."""
+        """Remember the cells before the first pass, and nothing else."""
         for memory in (self._cells, self._body, self._numbers):
             memory.forget()
-        self._keep(step, self._structure(), self.times)
         if self.rested is not None:
-            self.rested.started(step)
-
-    def due(self, step: Step) -> bool:
-        """A solved state says nothing: passes do."""
-        return False
+            self.rested.forget()
+        self.completed(step)
 
     def completed(self, step: Step) -> None:
-        """One pass more."""
-        structure, known, self.swing = self._structure(), self.times, None
-        cells, times = np.array([structure, *self._cells.values]), np.array([step.time, *known])
-        if self._cells.known > ORDER:
-            body = np.array([self.state.unknown.x.array, *self._body.values])
-            self.swing = swing = self._measured(cells, body, times)
-            tells = self._tells(step, cells, times)
-            numbers = self._numbers  # of passes in a row
-            numbers["growing"] = numbers["growing"] + 1 if tells and swing.cells_factor < GROWING else 0
-            numbers["sustained"] = numbers["sustained"] + 1 if tells and swing.body_factor < SUSTAINED else 0
-            next_one = swing.cells * abs(swing.cells_factor)  # as large as it will be after one pass more
-            begins = numbers["growing"] >= GROWING_PASSES and next_one >= CELL_TOLERANCE
-            lasts = numbers["sustained"] >= SUSTAINED_PASSES and swing.body >= BODY_TOLERANCE
-            if self._may_swing and (begins or lasts) and not self.said:
-                self.find(step, self._in_words(swing, cells, times))
-        self._keep(step, structure, known)
-        if self.rested is not None and not self.rested.said:
-            self.rested.compare(step, self._at_points(cells), times)
-
-    def _keep(self, step: Step, structure: Array, times: list[float]) -> None:
+        """Judge one pass more, and remember it."""
+        structure = tensors.to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
+        cells, known, numbers = [structure, *self._cells.values], self._cells.known, self._numbers
+        structures = np.reshape(cells, (len(cells), *self.quadrature.shape, 6))
+        times = [step.time, *(numbers[f"time_{age}"] for age in range(ORDER + 1))]
+        if known > ORDER:
+            self._judge(step, structures, np.array(times))
+        if self.rested is not None and known:
+            self.rested.compare(step, structures[0] - structures[1], times[1])
         self._cells.push(structure)
         self._body.push(self.state.unknown.x.array)
-        for age, time in enumerate([step.time, *times[:ORDER]]):
-            self._numbers[f"time_{age}"] = time
+        for age, time in enumerate(times[:-1]):
+            numbers[f"time_{age}"] = time
 
-    @property
-    def times(self) -> list[float]:
-        """Of the passes that are remembered, the newest first."""
-        return [self._numbers[f"time_{age}"] for age in range(ORDER + 1)]
+    def _judge(self, step: Step, cells: Array, times: Array) -> None:
+        """Say what swings, of the last passes (passes, ...), the newest first."""
+        quadrature, r0 = self.quadrature, self.stepper.remodeling.parameters.largest().end_to_end_length
+        scale = np.sqrt(quadrature.owned(quadrature.volumes) / quadrature.volume)[..., None] / r0**2
+        of_cells = (cells[:, : len(scale)] * scale).reshape(len(cells), -1)
+        of_body = np.array([self.state.unknown.x.array, *self._body.values])[:, : self.state.number_of_owned_unknowns]
+        of_body /= dolfinx.la.norm(self.state.unknown.x) or 1.0
+        swings = self.swings = {"growing": self._swing(times, of_cells), "sustained": self._swing(times, of_body)}
+        tells, found = self._tells(step, cells, times), False
+        for (name, swing), (factor, passes) in zip(swings.items(), (GROWING, SUSTAINED), strict=True):
+            self._numbers[name] = self._numbers[name] + 1 if tells and swing.factor < factor else 0
+            after_one_more = swing.size * abs(swing.factor)
+            found |= self._numbers[name] >= passes and after_one_more >= TOLERANCE
+        if found and not self.said:
+            most = quadrature.shown_place_of_largest(np.linalg.norm(_difference(times, cells), axis=-1))
+            self.find(step, self._in_words(*swings.values(), most))
 
-    def _structure(self) -> Array:
-        """A at all points, six Mandel components after each other."""
-        return tensors.to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
-
-    def _at_points(self, components: Array) -> Array:
-        """What stands after each other by points, (..., elements, points, 6)."""
-        return components.reshape(*components.shape[:-1], *self.quadrature.shape, len(tensors.MANDEL))
+    def _swing(self, times: Array, values: Array) -> Swing:
+        """Return that of values of this rank (passes, n), as root of their sum of squares."""
+        changes = np.array([_difference(times, values), _difference(times[1:], values[1:])])
+        products = over_ranks(self.state.comm, changes @ changes.T, MPI.SUM)
+        return Swing(np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf))
 
     def _tells(self, step: Step, cells: Array, times: Array) -> bool:
         """Whether a swing is one of passes: not of loads, of uneven steps, nor of cells that had rested."""
         # it starts unloaded
-        earlier = [self.stepper.load_values(time) if time else {} for time in times[1 : ORDER + 1]]
-        loads = [[one.get(name, 0.0) for name in step.loads] for one in (step.loads, *earlier)]
-        if np.any(np.abs(_weights(times) @ loads) > LOAD_JUMP * GAIN * np.abs(loads[0])):
-            return False
-        lengths = -np.diff(times)
-        if lengths.max() > UNEVEN * lengths.min():
-            return False
-        same: Any = self._at_points(cells[:ORDER] == cells[1 : ORDER + 1]).all(axis=-1)
-        return max([self.quadrature.mean(passed.astype(np.float64)) for passed in same]) <= RESTED_SHARE
-
-    def _measured(self, cells: Array, body: Array, times: Array) -> Swing:
-        """Of the last passes, the newest first."""
-        pair = np.array([np.append(_weights(times), 0.0), np.append(0.0, _weights(times[1:]))])
-        volumes = self.quadrature.owned(self.quadrature.volumes)
-        changes = self._at_points(pair @ cells)[:, : len(volumes)]
-        owned = np.concatenate([pair @ body, body[:1]])[:, : self.state.number_of_owned_unknowns]
-        # integrals of the products of fields, each with each
-        of_cells = over_ranks(self.state.comm, np.einsum("aepi,bepi,ep->ab", changes, changes, volumes), MPI.SUM)
-        of_body = over_ranks(self.state.comm, owned @ owned.T, MPI.SUM)
-        r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
-        return Swing(
-            np.sqrt(of_cells[0, 0] / self.quadrature.volume) / GAIN / r0**2,
-            _ratio(of_cells[0, 1], of_cells[1, 1]),
-            np.sqrt(_ratio(of_body[0, 0], of_body[2, 2])) / GAIN,
-            _ratio(of_body[0, 1], of_body[1, 1]),
+        loads = np.array([[*self.stepper.load_values(time).values()] for time in times]) * (times[:, None] > 0)
+        lengths, rested = -np.diff(times), (cells[:-1] == cells[1:]).all(axis=-1).astype(np.float64)
+        return bool(
+            np.all(np.abs(_difference(times, loads)) <= LOAD_JUMP * GAIN * np.abs(loads[0]))
+            and lengths.max() <= UNEVEN * lengths.min()
+            and max(map(self.quadrature.mean, rested)) <= RESTED_SHARE
         )
 
     # ------------------------------------------------------------ words
-    def _in_words(self, swing: Swing, cells: Array, times: Array) -> str:
-        change = np.linalg.norm(self._at_points(_weights(times) @ cells[: ORDER + 1]), axis=-1)
-        most = self.quadrature.shown_place_of_largest(change)
+    def _in_words(self, cells: Swing, body: Swing, most: str) -> str:
         return (
             "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor A "
-            f"changes by {swing.cells:.2g} r0^2 (root mean square; most at {most}), "
-            f"the displacement by {swing.body:.2g} of its size; each pass "
-            f"multiplies this by about {swing.cells_factor:.2g}. Results may be wrong from here on; set "
-            f"{self._advice(swing.cells_factor)} "
+            f"changes by {cells.size:.2g} r0^2 (root mean square; most at {most}), "
+            f"the displacement by {body.size:.2g} of its size; each pass "
+            f"multiplies this by about {cells.factor:.2g}. Results may be wrong from here on; set "
+            f"{self._advice(cells.factor)} "
             "(docs/theory.md, Stability of the pass)"
         )
 
@@ -178,11 +148,6 @@ class OverCorrection(WarnsOnce):
         return f'remodeling.coupling = "relaxed" with a relaxation_factor below {min(stable, share):.2g}'
 
 
-def _ratio(value: float, size: float) -> float:
-    """value / size; 0 where there is nothing to compare with."""
-    return value / size if size > 0.0 else 0.0
-
-
 class RestedCells(WarnsOnce):
     """Warns, once, when cells that had rested change in one pass as much as if they had remodeled all the time."""
 
@@ -190,30 +155,26 @@ class RestedCells(WarnsOnce):
 
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
-        self._moved = Earlier(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
-        self._nowhere = np.zeros(self.quadrature.shape, dtype=np.bool_)  # where memory begins anew nothing is told
+        # passes since a cell has moved, by points; 0 before it ever did
+        self._rest = Earlier(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
 
-    def started(self, step: Step) -> None:
-        """No pass yet."""
-        self._moved.forget()
+    def forget(self) -> None:
+        """Forget all passes."""
+        self._rest.forget()
         self._numbers.forget()
-        self._moved.push(self._nowhere.astype(np.float64).ravel())
 
-    def compare(self, step: Step, structures: Array, times: Array) -> None:
-        """One pass more: A of the last ones (passes, elements, points, 6), and their times, the newest first."""
-        now, *before = (structures[:-1] != structures[1:]).any(axis=-1) if len(structures) > 1 else [self._nowhere]
-        moved = self._moved.values[0].reshape(now.shape) > 0 if self._moved.known else self._nowhere
-        self._moved.push((now | moved).astype(np.float64).ravel())
+    def compare(self, step: Step, changes: Array, time_before: float) -> None:
+        """Judge one pass more: its changes of A (elements, points, 6), and the time of the one before."""
+        now = changes.any(axis=-1)
+        rest = np.reshape(self._rest.values, (self._rest.known, *now.shape)).sum(axis=0)
+        self._rest.push(np.where(now, 1.0, rest + (rest > 0)).ravel())
         # a rest without loads is the loads', and no matter of steps
-        if before and any(self.stepper.load_values(times[1]).values()):
-            # |change of A|^2 where it was made up for
-            squares = np.sum((structures[0] - structures[1]) ** 2, axis=-1)
-            self._judge(step, np.where(now & moved & ~before[0], squares, 0.0))
-
-    def _judge(self, step: Step, squares: Array) -> None:
+        if self.said or not any(self.stepper.load_values(time_before).values()):
+            return
+        # |change of A|^2 where it was made up for
+        squares = np.where(now & (rest > 1), np.square(changes).sum(axis=-1), 0.0)
         r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
-        change = np.sqrt(self.quadrature.mean(squares)) / r0**2
-        if change < RESUMED_CHANGE:
+        if (change := np.sqrt(self.quadrature.mean(squares)) / r0**2) < RESUMED_CHANGE:
             return
         share = self.quadrature.mean((squares > 0).astype(float))
         self.find(

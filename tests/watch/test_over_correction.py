@@ -129,11 +129,11 @@ class Scripted:
 def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: float) -> None:
     scripted = Scripted(factor, 4e-5)
     scripted.passes(6)
-    assert scripted.watcher.swing is not None
-    assert scripted.watcher.swing.cells_factor == pytest.approx(factor, rel=1e-6)
+    swing = scripted.watcher.swings["growing"]
+    assert swing.factor == pytest.approx(factor, rel=1e-6)
     # the third difference of f^k is f^(k-3) (f - 1)^3
     expected = 4e-5 * abs(factor) ** 3 * abs(factor - 1) ** 3 / 8
-    assert scripted.watcher.swing.cells == pytest.approx(expected, rel=1e-6)
+    assert swing.size == pytest.approx(expected, rel=1e-6)
     assert scripted.watcher.said == (factor == -3.0)
 
 
