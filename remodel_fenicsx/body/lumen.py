@@ -226,7 +226,7 @@ def _straightened(points: Array, tetrahedra: Integers) -> int:
 
 
 def _around(surface: Surface, vectors: Array, openings: Sequence[Integers]) -> Array:
-    """Unit vectors at the points, by sums over the triangles around them (triangles, 3); those of a rim in its plane."""
+    """Unit vectors at the points, sums over the triangles around them (triangles, 3); those of a rim in its plane."""
     found = np.zeros_like(surface.points)
     np.add.at(found, surface.triangles, vectors[:, None])
     for rim in openings:

@@ -26,13 +26,23 @@ from remodel_fenicsx.body.mesh_file import (
     of_gmsh,
     read_mesh,
 )
-from remodel_fenicsx.body.shape import Column, FromFile, LoadKind, Unloads, WithRegions, cauchy_columns
+from remodel_fenicsx.body.shape import (
+    Column,
+    Columns,
+    FromFile,
+    LoadKind,
+    Loads,
+    Supports,
+    Unloads,
+    WithRegions,
+    cauchy_columns,
+)
 from remodel_fenicsx.body.wall import AngleOf, Walled, angle_columns, columns_on_request
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Load, Mesh, OnFace, Support, faces_of
+from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Mesh, OnFace, Support, faces_of
 from remodel_fenicsx.schema.tables import SceneError, fault, shown
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
 
@@ -74,6 +84,9 @@ def _faces(value: Any) -> Any:
             raise fault(rule, str(name), entry)
         found[str(name)] = tuple(entries)
     return found
+
+
+Groups = Annotated[dict[str, Names], BeforeValidator(_faces), Field(json_schema_extra=_GROUPS)]
 
 
 def _files(value: Any) -> list[str]:
@@ -143,15 +156,11 @@ class FileBody(WithRegions, FromFile):
         default=None, json_schema_extra={"allowed": "one of " + ", ".join(map(repr, LENGTH_UNITS))}
     )
     """Unit of the numbers in the file, where it differs from `length_unit`."""
-    faces: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={}, json_schema_extra=_GROUPS
-    )
+    faces: Groups = {}
     """Names of faces, each with the name or number of a face in the file, or a list of them:
     `inner`, `outer`, `inlet` and `outlet` where the file has other names, and more for supports
     and loads. A surface of its own is a face too: `{ file = "lumen.vtp" }`."""
-    regions: Annotated[dict[str, tuple[str | int, ...]], BeforeValidator(_faces)] = Field(
-        default={}, json_schema_extra=_GROUPS
-    )
+    regions: Groups = {}
     """Names of regions, each with the name or number of a volume in the file, or a list of
     them. Default: the names in the file."""
     open_boundary: bool = False
@@ -318,7 +327,7 @@ class FileBody(WithRegions, FromFile):
         """Refuse faces that cannot be those of the body. On rank 0."""
 
     # ------------------------------------------------------------ supports
-    def supports_of(self, supports: Mapping[str, Support]) -> dict[str, Support]:
+    def supports_of(self, supports: Supports) -> dict[str, Support]:
         """Those of a scene, and others that the body has where it says nothing."""
         return dict(supports)
 
@@ -334,11 +343,11 @@ class FileBody(WithRegions, FromFile):
         """Whether they are all volumes of the file."""
         return bool(regions) and set(self._regions(self._mesh())) <= set(regions)
 
-    def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
+    def held_faces(self, supports: Supports) -> list[str]:
         """All but those that are free."""
         return [face for face, support in self.supports_of(supports).items() if support.kind != "free"]
 
-    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+    def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
         """Whether they are there, the body cannot move as a whole, and no support takes all of a pressure."""
         for name in supports:
             if name not in domain.faces:
@@ -352,22 +361,22 @@ class FileBody(WithRegions, FromFile):
             key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
             if face not in domain.faces:
                 raise SceneError(f"{key}: the body has no such face; it has {', '.join(domain.faces)}")
-            if load == "displacement" and kind not in HELD_ACROSS:
-                able = " or ".join(map(repr, HELD_ACROSS))
-                raise SceneError(f"{key}: its support ({kind!r}) lets it move; a face that is displaced must be {able}")
-            if load == "displacement" and domain.boundary.goes_around(face):  # type: ignore[attr-defined]
-                raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
-            if load == "displacement" and face in moved:
-                raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
-            if load == "pressure" and kind in HELD_ACROSS:
+            if load == "displacement":
+                if kind not in HELD_ACROSS:
+                    able = " or ".join(map(repr, HELD_ACROSS))
+                    rule = f"its support ({kind!r}) lets it move; a face that is displaced must be {able}"
+                    raise SceneError(f"{key}: {rule}")
+                if domain.boundary.goes_around(face):  # type: ignore[attr-defined]
+                    raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
+                if face in moved:
+                    raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
+                moved[face] = name
+            elif kind in HELD_ACROSS:
                 raise SceneError(
                     f"{key}: its support ({kind!r}) takes all of the pressure; allowed are faces that move"
                 )
-            moved |= {face: name} if load == "displacement" else {}
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
+    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
         """Hold them as a scene says, inlet and outlet guided where it does not; add pressures on them. Collective."""
         from remodel_fenicsx.body.mesh_domain import GUIDE, add_support
 
@@ -428,8 +437,8 @@ class WalledMesh(Walled):
     Faces "inner" and "outer" lie across the wall from each other, "inlet" and "outlet" across the body.
     """
 
-    columns: ClassVar[tuple[Column, ...]] = angle_columns(MEANS_ON_A_MESH)
-    columns_on_request: ClassVar[tuple[Column, ...]] = columns_on_request(MEANS_ON_A_MESH)
+    columns: ClassVar[Columns] = angle_columns(MEANS_ON_A_MESH)
+    columns_on_request: ClassVar[Columns] = columns_on_request(MEANS_ON_A_MESH)
     axis_kinds = ("local", "global")
     constant_fields = CONSTANT_FIELDS
     defaults = {"cells": {"axes": "local"}}
@@ -507,7 +516,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
                 "lost there; try mesh.refinement = 2"
             )
 
-    def supports_of(self, supports: Mapping[str, Support]) -> dict[str, Support]:
+    def supports_of(self, supports: Supports) -> dict[str, Support]:
         """Inlet and outlet are guided."""
         return {"inlet": Support(), "outlet": Support()} | dict(supports)
 

@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
     from remodel_fenicsx.fem.quadrature import Quadrature
+
+Regions = Mapping[str, Region]
+Supports = Mapping[str, Support]
+Loads = Mapping[str, Load]
 
 
 # ---------------------------------------------------------------- the columns of a history
@@ -102,6 +107,9 @@ class Column:
         """
         name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
         return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
+
+
+Columns = tuple[Column, ...]
 
 
 # ---------------------------------------------------------------- the fibre angle through a body, whatever the mesh
@@ -203,8 +211,9 @@ COLUMNS: dict[str, Column] = {
 """Columns of every shape by name, after `time` and those of the shape; a script adds its own."""
 
 
-def _turned_over(name: str, m: Any) -> float:
-    return float(m.observer.stepper.part("turnover").mean(name))
+def _of_turnover(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
+    """Make a column of a function of `evolution.turnover.Turnover`."""
+    return Column(name, unit, meaning, lambda m: float(value(m.observer.stepper.part("turnover"))), by_case=False)
 
 
 COLUMNS_ON_REQUEST: dict[str, Column] = {
@@ -239,12 +248,11 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             by_case=False,
         ),
         *(
-            Column(
+            _of_turnover(
                 name,
                 "",
                 f"{what} of the collagen over that at the start, volume mean; with remodeling.turnover",
-                partial(_turned_over, name),
-                by_case=False,
+                methodcaller("mean", name),
             )
             for name, what in (("content", "amount"), ("natural_length", "natural length"))
         ),
@@ -255,19 +263,17 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio),
             by_case=False,
         ),
-        Column(
+        _of_turnover(
             "collagen_share",
             "",
             "share of the tissue's volume that is collagen, mean over the volume at the start",
-            lambda m: m.observer.stepper.part("turnover").collagen_share(),
-            by_case=False,
+            methodcaller("collagen_share"),
         ),
-        Column(
+        _of_turnover(
             TURNOVER_POWER,
             "stress length^3 / time",
             "power that turnover releases at the F of the row, without growth",
-            lambda m: m.observer.stepper.part("turnover").power(),
-            by_case=False,
+            methodcaller("power"),
         ),
         Column(
             "processor_seconds",
@@ -289,7 +295,7 @@ def columns_of(
     regions: Iterable[str] = (),
     cases: int = 1,
     held: Iterable[str] = (),
-) -> tuple[Column, ...]:
+) -> Columns:
     """The columns of a shape's history, in the order of the file, those on request last.
 
     Where some of the others are requested too, only they are there, with time and loads.
@@ -535,8 +541,8 @@ class Shape(_Is):  # type: ignore[misc]
     """
 
     loads: ClassVar[dict[str, LoadKind]]
-    columns: ClassVar[tuple[Column, ...]]
-    columns_on_request: ClassVar[tuple[Column, ...]] = ()
+    columns: ClassVar[Columns]
+    columns_on_request: ClassVar[Columns] = ()
     angle_layers: ClassVar[dict[str, float]] = {}
     axis_kinds: ClassVar[tuple[str, ...]] = ("global",)
     number_of_elements: ClassVar[int]
@@ -668,16 +674,16 @@ class Shape(_Is):  # type: ignore[misc]
             On all ranks, if Gmsh fails.
         """
 
-    def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+    def build_with(self, regions: Regions, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """Mesh the body with the regions of a scene, where the scene draws them. Collective."""
         return self.build(mesh, comm)
 
-    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+    def region_depths(self, regions: Regions) -> dict[str, tuple[float, float]]:
         """Where regions that lie one behind the other begin and end in `depth`; empty where they do not."""
         return {}
 
     @classmethod
-    def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
+    def region_columns_on_request(cls, name: str) -> Columns:
         """Further columns that a scene may name of its region `name`."""
         return ()
 
@@ -712,7 +718,7 @@ class Shape(_Is):  # type: ignore[misc]
             if name in loads if loads is not None else known:
                 kind.add(self, loading, name)
 
-    def held_faces(self, supports: Mapping[str, Support]) -> list[str]:
+    def held_faces(self, supports: Supports) -> list[str]:
         """Faces whose supports are `[supports.NAME]`, and none of the shape's own.
 
         Parameters
@@ -737,7 +743,7 @@ class Shape(_Is):  # type: ignore[misc]
         """
         return cls.loads
 
-    def check_faces(self, domain: Domain, supports: Mapping[str, Support], loads: Mapping[str, Load]) -> None:
+    def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
         """Refuse supports of, and loads on, faces of a mesh that cannot have them. Collective.
 
         Parameters
@@ -753,9 +759,7 @@ class Shape(_Is):  # type: ignore[misc]
             On all ranks; one line that names the key.
         """
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
+    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
         """Hold faces as `[supports.NAME]` says.
 
         Parameters
@@ -821,7 +825,7 @@ class WithRegions(Shape):
     ['tube', 'mesh', 'solid']
     """
 
-    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+    def check_regions(self, regions: Regions, mesh: Mesh) -> None:
         """Refuse what the regions of a scene ask of the body and it cannot have, with the key.
 
         Parameters
@@ -868,7 +872,7 @@ def axial_dead_force(face: str) -> LoadKind:
     )
 
 
-def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
+def uniaxial_columns(top: str, length: str) -> Columns:
     """Columns of a body that is pulled along z: its stretches and its mean fibre angle.
 
     Parameters
@@ -918,7 +922,7 @@ def uniaxial_columns(top: str, length: str) -> tuple[Column, ...]:
     )
 
 
-def cauchy_columns(*names: str) -> tuple[Column, ...]:
+def cauchy_columns(*names: str) -> Columns:
     """Columns of Cauchy's stress, volume means: of "x" the normal one along x, of "xy" the shear stress.
 
     Parameters

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,8 +15,10 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body import reductions as reduced
-from remodel_fenicsx.body.shape import Column, End, LoadKind, check_lengths
+from remodel_fenicsx.body.reductions import ReducedScene
+from remodel_fenicsx.body.shape import Column, End, LoadKind, Loads, Regions, Shape, Supports, check_lengths
 from remodel_fenicsx.body.wall import (
+    FACES,
     AngleOf,
     RoundWall,
     Wall,
@@ -24,12 +26,11 @@ from remodel_fenicsx.body.wall import (
     STRESSES,
     check_layers,
     columns_on_request,
-    tube_layers,
 )
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
-from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
+from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import Array, Integers
-from remodel_fenicsx.schema.settings import Load, Mesh, Natural, Region, Support
+from remodel_fenicsx.schema.settings import Mesh
 from remodel_fenicsx.schema.tables import fault, shown
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 
@@ -46,21 +47,12 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 # ---------------------------------------------------------------- what stands for all of a tube
 
 
-def build_ray(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
-    """The wall on the x axis, as many elements as the body has through it."""
-    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:2])
-
-
-def build_half_plane(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
-    """The wall in the half-plane y = 0, x > 0, with the body's elements through the wall and along."""
-    return _in_half_plane(scene, comm, _counts(scene.mesh)[1:])
-
-
-def _in_half_plane(scene: reduced.ReducedScene, comm: MPI.Intracomm | None, counts: tuple[int, ...]) -> Domain:
+def build_in_half_plane(dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
+    """Mesh the wall on the x axis (1) or in the half-plane y = 0, x > 0 (2), with the body's elements there."""
     from remodel_fenicsx.body.domain import lattice_domain
 
-    shape, degree = scene.geometry, scene.mesh.degree
-    wall = _wall(shape, counts[0], scene.regions)
+    shape, degree, counts = scene.geometry, scene.mesh.degree, _counts(scene.mesh)[1 : dimension + 1]
+    wall = shape.wall(counts[0], scene.regions)
     along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [np.zeros(1)]
     z, radii = np.meshgrid(*along, wall.nodes(degree), indexing="ij")
     points = np.stack([radii.ravel(), np.zeros(radii.size), z.ravel()], axis=1)
@@ -75,14 +67,14 @@ def _in_half_plane(scene: reduced.ReducedScene, comm: MPI.Intracomm | None, coun
     return wall.marked(lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm))
 
 
-def build_quarter(scene: reduced.ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
+def build_quarter(scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """The body's elements with x > 0 and y > 0; one layer along z where all sections are alike."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)
     return whole_tube(scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1)
 
 
-def layers(scene: reduced.ReducedScene) -> int:
+def layers(scene: ReducedScene) -> int:
     """Elements of a quarter along z: one where nothing but u_z depends on z, which is linear in it."""
     alike = reduced.free_ends(scene) is None and reduced.same_cells(scene) is None
     return 1 if alike else PAPER[2] * scene.mesh.refinement
@@ -101,10 +93,6 @@ def _counts(mesh: Mesh) -> tuple[int, int, int]:
     return around, through, along
 
 
-def _wall(shape: Any, elements: int, regions: Mapping[str, Region]) -> Wall:
-    return Wall.of(shape.inner_radius, shape.outer_radius, elements, regions)
-
-
 def _dimensions(shape: Any) -> dict[str, float]:
     return {name: float(getattr(shape, name)) for name in ("inner_radius", "outer_radius", "length")}
 
@@ -115,7 +103,7 @@ def _in_layers(points: Array, elements: Integers) -> reduced.Body:
     return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
 
 
-def springs_across(scene: reduced.ReducedScene) -> str | None:
+def springs_across(scene: ReducedScene) -> str | None:
     """Springs along the wall pull its sections out of their planes."""
     for face, support in scene.supports.faces.items():
         if support.tangential:
@@ -123,7 +111,7 @@ def springs_across(scene: reduced.ReducedScene) -> str | None:
     return None
 
 
-def mirrored_draws(scene: reduced.ReducedScene) -> str | None:
+def mirrored_draws(scene: ReducedScene) -> str | None:
     """Random cells of the quarter stand for those of the whole tube in the mean alone, and nearly."""
     if reduced.drawn_once(scene) is None:
         return None
@@ -136,14 +124,14 @@ def mirrored_draws(scene: reduced.ReducedScene) -> str | None:
 _EVERYWHERE = (reduced.same_cells, reduced.symmetric_law)
 REDUCTIONS = {
     "radial": reduced.Reduction(
-        build_ray,
+        partial(build_in_half_plane, 1),
         lambda scene: PAPER[1] * scene.mesh.refinement,
         (*_EVERYWHERE, reduced.round_about_z, reduced.free_ends, springs_across, reduced.known_loads("radial")),
         reduced.about_z,
         lambda shape, points, lines: reduced.revolved(*reduced.extended(points, lines, shape.length)),
     ),
     "axisymmetric": reduced.Reduction(
-        build_half_plane,
+        partial(build_in_half_plane, 2),
         lambda scene: PAPER[1] * PAPER[2] * scene.mesh.refinement**2,
         (*_EVERYWHERE, reduced.round_about_z, reduced.known_loads("axisymmetric")),
         reduced.about_z,
@@ -185,10 +173,11 @@ def _mean_hoop_stress(m: Any) -> float:
 def _layer_angle(share: float) -> AngleOf:
     """Mean angle over the elements that touch R_i + share (R_o - R_i)."""
 
-    def radius(dimensions: Mapping[str, float]) -> float:
-        return (1.0 - share) * dimensions["inner_radius"] + share * dimensions["outer_radius"]
+    def mean(m: Any, angle: Array) -> float:
+        inner, outer = (m.domain.dimensions[f"{face}_radius"] for face in FACES)
+        return m.quadrature.mean_of_known(angle, m.elements_touching_radius((1.0 - share) * inner + share * outer))
 
-    return lambda m, angle: m.quadrature.mean_of_known(angle, m.elements_touching_radius(radius(m.domain.dimensions)))
+    return mean
 
 
 THICK_ELEMENTS = 0.2  # inner radii: at 0.25 the radial stress at the face of linear elements is 4 to 5 % off
@@ -291,14 +280,14 @@ class Tube(RoundWall):
             )(name, "inner"),
             "pressure on the deformed inner face, and on the caps of closed ends",
             STRESS,
-            reductions=("radial", "axisymmetric", "sector"),
+            reductions=tuple(REDUCTIONS),
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
             "engineering strain of the length (0.1: 10 % longer), prescribed, or found where the length is an unknown",
             column="axial_elongation",
             above=-1.0,
-            reductions=("radial", "axisymmetric", "sector"),
+            reductions=tuple(REDUCTIONS),
             value=_elongation,
         ),
         "axial_force": LoadKind(
@@ -306,18 +295,21 @@ class Tube(RoundWall):
             "force along z in the wall at the end z = `length`. As a load it is a dead force on the ends, beside the "
             "pressure on caps; the length is then an unknown",
             FORCE,
-            reductions=("radial", "axisymmetric", "sector"),
+            reductions=tuple(REDUCTIONS),
             frees_length=True,
             value=partial(_of_the_end, "of_the_wall"),
             area=lambda shape: shape.section_area,
         ),
     }
     columns = (
-        Column(
-            "inner_radius", "length", "mean distance from the axis over the deformed inner face", _mean_radius("inner")
-        ),
-        Column(
-            "outer_radius", "length", "mean distance from the axis over the deformed outer face", _mean_radius("outer")
+        *(
+            Column(
+                f"{face}_radius",
+                "length",
+                f"mean distance from the axis over the deformed {face} face",
+                _mean_radius(face),
+            )
+            for face in FACES
         ),
         *angle_columns(MEANS),
     )
@@ -354,8 +346,7 @@ class Tube(RoundWall):
     number_of_elements = 1536
     face_names = ("bottom", "top", "inner", "outer")
     reductions = REDUCTIONS
-    ends = {
-        "free": End(lambda shape, loading: shape.hold(loading)),
+    ends = Shape.ends | {
         "clamped": End(lambda shape, loading: shape.clamp(loading)),
         "closed": End(lambda shape, loading: shape.close(loading), frees_length=True),
     }
@@ -372,9 +363,7 @@ class Tube(RoundWall):
     length: Annotated[float, LENGTH] = Field(gt=0)
     """Length along z, in the scene's unit of length."""
 
-    def hold_faces(
-        self, loading: Loading, supports: Mapping[str, Support], modulus: float, loads: Mapping[str, Load]
-    ) -> None:
+    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
         """Springs of what surrounds it."""
         for face, support in supports.items():
             from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # which few tubes need
@@ -383,9 +372,9 @@ class Tube(RoundWall):
             if loading.kinematics.moves_rigidly:
                 warn_of_twist(face, support, loading.domain.comm)
 
-    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
-        """Where tissue or prestretch change."""
-        return tube_layers(_wall(self, max(1, len(regions)), regions), natural, tissues)
+    def wall(self, elements: int, regions: Regions) -> Wall:
+        """Return its wall with so many elements through it."""
+        return Wall.of(self.inner_radius, self.outer_radius, elements, regions)
 
     @model_validator(mode="after")
     def _has_a_wall(self) -> Tube:
@@ -410,20 +399,20 @@ class Tube(RoundWall):
 
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The paper's 16 elements around, 8 through the wall and 12 along, times the refinement."""
-        return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm)
+        return self.build_with({}, mesh, comm)
 
-    def build_with(self, regions: Mapping[str, Region], mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
+    def build_with(self, regions: Regions, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
         """The same with the scene's layers: as many elements, equally thick in each layer, none in two."""
         return whole_tube(self, _counts(mesh), mesh.element, mesh.degree, comm, regions)
 
-    def check_regions(self, regions: Mapping[str, Region], mesh: Mesh) -> None:
+    def check_regions(self, regions: Regions, mesh: Mesh) -> None:
         """Regions are layers of the wall, from the lumen outwards by their outer radii."""
         check_layers(self.inner_radius, self.outer_radius, _counts(mesh)[1], regions)
 
-    def region_depths(self, regions: Mapping[str, Region]) -> dict[str, tuple[float, float]]:
+    def region_depths(self, regions: Regions) -> dict[str, tuple[float, float]]:
         """Of the layers, from the inside outwards."""
-        wall = _wall(self, max(1, len(regions)), regions)
-        places = [(radius - wall.radii[0]) / (wall.radii[-1] - wall.radii[0]) for radius in wall.radii]
+        wall = self.wall(len(regions), regions)
+        places = ((np.array(wall.radii) - wall.radii[0]) / np.ptp(wall.radii)).tolist()
         return dict(zip(wall.names, itertools.pairwise(places), strict=True)) if regions else {}
 
     def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
@@ -476,12 +465,13 @@ class Tube(RoundWall):
 
     def strut(self, ends: str) -> reduced.Strut:
         """Its ends keep their planes; one of them moves sideways unless they are clamped."""
-
-        def squared_distances(places: Array) -> Array:
-            return np.square(places[:, :2]).sum(axis=1) / 2
-
-        factor = 0.5 if ends == "clamped" else 1.0
-        return reduced.Strut(self.length, factor, reduced.about_z, squared_distances, self.inner_radius)
+        return reduced.Strut(
+            self.length,
+            0.5 if ends == "clamped" else 1.0,
+            reduced.about_z,
+            lambda places: np.square(places[:, :2]).sum(axis=1) / 2,
+            self.inner_radius,
+        )
 
     def depth(self, coordinates: Array) -> Array:
         """From the inner (0) to the outer face (1), (...,); plane faces of elements lie inside of the cylinders."""
@@ -495,7 +485,7 @@ class Tube(RoundWall):
 
 def whole_tube(
     shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None,
-    regions: Mapping[str, Region] | None = None, quarters: int = 4,
+    regions: Regions | None = None, quarters: int = 4,
 ) -> Domain:  # fmt: skip
     """The mesh of a tube with so many elements around (a multiple of 4), through the wall and along. Collective."""
     # The nodes lie exactly on the radii, equally spaced through each layer; some are on the positive and negative x and
@@ -504,7 +494,7 @@ def whole_tube(
     from remodel_fenicsx.body.domain import build_domain
 
     around, through, along = counts
-    wall = _wall(shape, through, regions or {})
+    wall = shape.wall(through, regions or {})
 
     def draw() -> None:
         draw_tube(wall, shape.length, (around, along), element, degree, quarters)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import length_fault
-from remodel_fenicsx.body.shape import Column, Shape, Unloads, WithRegions
+from remodel_fenicsx.body.shape import Column, Columns, Regions, Shape, Unloads, WithRegions
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_share
 from remodel_fenicsx.model.energy import Tissue
@@ -36,7 +36,7 @@ class Wall(NamedTuple):
     counts: tuple[int, ...]
 
     @classmethod
-    def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> Wall:
+    def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> Wall:
         """The wall of a scene's regions with so many elements through it, as many as layers or more."""
         order = sorted(regions, key=lambda name: _outer(regions[name], outer_radius)) or ["body"]
         inside = [_outer(regions[name], outer_radius) for name in order[:-1]]
@@ -45,9 +45,8 @@ class Wall(NamedTuple):
 
     def nodes(self, degree: int) -> Array:
         """Radii of the nodes of elements of this degree, equally spaced within a layer."""
-        layers = zip(itertools.pairwise(self.radii), self.counts, strict=True)
-        parts = [np.linspace(a, b, degree * count + 1) for (a, b), count in layers]
-        return np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
+        ends = degree * np.cumsum([0, *self.counts])
+        return np.interp(np.arange(ends[-1] + 1), ends, self.radii)
 
     def marked(self, domain: Domain) -> Domain:
         """The domain with its layers as regions: an element is where the middle of its radii is."""
@@ -72,7 +71,7 @@ def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Mapping[str, Region]) -> None:
+def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> None:
     """Refuse regions that are no layers of the wall between two radii with so many elements through it."""
     # A layer is at least as thick as Gmsh can mesh (`length_fault`).
     seen: dict[float, str] = {}
@@ -100,29 +99,6 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
 
 # ---------------------------------------------------------------- tissue that is free of stress elsewhere than the mesh
 # G leads from where the tissue is free of stress to the mesh.
-
-
-def tube_layers(wall: Wall, natural: Natural, tissues: Mapping[str, Tissue]) -> list[Any]:
-    """Of a round wall: where tissue or prestretch change."""
-    from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
-
-    inner, outer = wall.radii[0], wall.radii[-1]
-    edges = set(wall.radii)
-    for layer in natural.layers:
-        edges |= {inner + share * (outer - inner) for share in layer.share}
-    apart = [a for a, b in itertools.pairwise(sorted(edges)) if b - a > 1e-9 * outer] + [outer]
-    found = []
-    for low, high in itertools.pairwise(apart):
-        middle = (low + high) / 2
-        region = wall.names[int(np.searchsorted(wall.radii[1:-1], middle))]
-        share = (middle - inner) / (outer - inner)
-        of_layer = [
-            layer.prestretch.stretches
-            for layer in natural.layers
-            if (layer.share[0] <= share < layer.share[1] if layer.region is None else layer.region == region)
-        ]
-        found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
-    return found
 
 
 def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array:
@@ -157,7 +133,7 @@ CONFIGURATIONS = {
 """Configurations, beside that of the cells, whose angles may be asked for, each with its words."""
 
 
-def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str = "") -> tuple[Column, ...]:
+def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str = "") -> Columns:
     """Of the cells' own configuration, or of another one of `CONFIGURATIONS`."""
     name = f"fibre_angle_{configuration}" if configuration else "fibre_angle"
     return tuple(
@@ -169,22 +145,18 @@ def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str =
                 if configuration
                 else f"{ANGLE_IN} {words}"
             ),
-            partial(_of, mean, name),
+            lambda m, mean=mean: mean(m, getattr(m, name)),  # type: ignore[misc]
             by_case=bool(configuration),
         )
         for where, (words, mean) in means.items()
     )
 
 
-def _of(mean: AngleOf, name: str, m: Any) -> float:
-    return mean(m, getattr(m, name))
-
-
 STRESSES = {"hoop": ("around", 0), "axial": ("along", 1), "radial": ("across", 2)}
 """Components of Cauchy's stress in the wall, by name: their direction, and where `Measurement.wall_stress` has them."""
 
 
-def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
     """Cauchy's stress in the wall: at its faces, and means where the angles are."""
     return tuple(
         Column(
@@ -192,21 +164,17 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ..
             "stress",
             f"Cauchy stress {direction} the deformed wall, "
             + (FITTED_TO_FACE if where in FACES else f"mean over the elements of `fibre_angle_{where}`"),
-            partial(_stress_at_face, where, component) if where in FACES else partial(_stress, mean, component),
+            partial(_stress, where, mean, component),
         )
         for name, (direction, component) in STRESSES.items()
         for where, (_, mean) in means.items()
     )
 
 
-def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> tuple[Column, ...]:
+def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
     """Of a body with these means: angles in other configurations, stresses, and what all walls have."""
     angles = (angle_columns(means, name) for name in CONFIGURATIONS)
     return (*itertools.chain(*angles), *stress_columns(means), *Walled.columns_on_request)
-
-
-def _stress(mean: AngleOf, component: int, m: Any) -> float:
-    return mean(m, m.wall_stress[..., component])
 
 
 FACES = ("inner", "outer")
@@ -217,8 +185,10 @@ ON_THE_FACE = 1e-6  # normalised depth: rounding of coordinates
 SECOND_LAYER = 1.5  # layers: deeper than this the third begins, and the second begins above
 
 
-def _stress_at_face(face: str, component: int, m: Any) -> float:
-    return float(m.tool_of_step(("stress at", face), lambda: _fitted_to_face(face, m))[component])
+def _stress(where: str, mean: AngleOf, component: int, m: Any) -> float:
+    if where in FACES:
+        return float(m.tool_of_step(("stress at", where), lambda: _fitted_to_face(where, m))[component])
+    return mean(m, m.wall_stress[..., component])
 
 
 def _fitted_to_face(face: str, m: Any) -> Array:
@@ -253,10 +223,6 @@ def _fitted_to_face(face: str, m: Any) -> Array:
     return np.linalg.solve(normal, right)[0]
 
 
-def _in_region(name: str) -> AngleOf:
-    return lambda m, values: m.quadrature.mean_of_known(values, m.elements_of_region(name))
-
-
 class Walled(Shape):
     """A body with a wall: angles are those in it, and a scene may give it `natural.layers`.
 
@@ -269,7 +235,7 @@ class Walled(Shape):
     ['tube', 'mesh']
     """
 
-    columns_on_request: ClassVar[tuple[Column, ...]] = (
+    columns_on_request: ClassVar[Columns] = (
         Column(
             "radial_share",
             "",
@@ -287,9 +253,10 @@ class Walled(Shape):
     angle_in_words = ("around", "along")
 
     @classmethod
-    def region_columns_on_request(cls, name: str) -> tuple[Column, ...]:
+    def region_columns_on_request(cls, name: str) -> Columns:
         """Stresses in the wall."""
-        return stress_columns({name: (f"of the region `{name}`", _in_region(name))})
+        words = f"of the region `{name}`"
+        return stress_columns({name: (words, lambda m, v: m.quadrature.mean_of_known(v, m.elements_of_region(name)))})
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Angle of the chain direction in the wall, degrees, (...,): circumferential 0, axial 90, NaN across."""
@@ -304,8 +271,31 @@ class RoundWall(Walled, WithRegions, Unloads):
     """A wall between two radii that numbers describe: regions are layers that fill it, it may close from a sector."""
 
     @abstractmethod
-    def layers_of_tissue(self, natural: Natural, regions: Mapping[str, Region], tissues: Mapping[str, Tissue]) -> Any:
-        """Where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
+    def wall(self, elements: int, regions: Regions) -> Wall:
+        """Return its wall with so many elements through it."""
+
+    def layers_of_tissue(self, natural: Natural, regions: Regions, tissues: Mapping[str, Tissue]) -> Any:
+        """Return where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
+        from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
+
+        wall = self.wall(len(regions), regions)
+        inner, outer = wall.radii[0], wall.radii[-1]
+        edges = set(wall.radii)
+        for layer in natural.layers:
+            edges |= {inner + share * (outer - inner) for share in layer.share}
+        apart = [a for a, b in itertools.pairwise(sorted(edges)) if b - a > 1e-9 * outer] + [outer]
+        found = []
+        for low, high in itertools.pairwise(apart):
+            middle = (low + high) / 2
+            region = wall.names[int(np.searchsorted(wall.radii[1:-1], middle))]
+            share = (middle - inner) / (outer - inner)
+            of_layer = [
+                layer.prestretch.stretches
+                for layer in natural.layers
+                if (layer.share[0] <= share < layer.share[1] if layer.region is None else layer.region == region)
+            ]
+            found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
+        return found
 
     def fills(self, regions: Collection[str]) -> bool:
         """The outermost ends at the outer radius."""

@@ -226,9 +226,8 @@ def _volumes(corners: Places) -> Places:
     """Shares of hexahedra (m, 8, 3), by their middles, or of tetrahedra (m, 4, 3) in their sum."""
     sides = corners[:, 1:4] - corners[:, :1]
     if corners.shape[1] == 8:
-        faces = corners[:, [[1, 2, 5, 6], [0, 3, 4, 7], [2, 3, 6, 7], [0, 1, 4, 5], [4, 5, 6, 7], [0, 1, 2, 3]]]
-        middles = faces.mean(axis=2)
-        sides = middles[:, ::2] - middles[:, 1::2]
+        grid = corners[:, [0, 1, 3, 2, 4, 5, 7, 6]].reshape(-1, 2, 2, 2, 3)
+        sides = np.stack([np.diff(grid, axis=k).mean(axis=(1, 2, 3)) for k in (1, 2, 3)], axis=1)
     total = np.abs(np.linalg.det(sides))
     return np.asarray(total / total.sum())
 
@@ -501,17 +500,13 @@ def warnings(run: ReportedRun) -> Card:
     numbers = {text: "once" if count == 1 else f"{count} times" for text, count in found.items()}
     items = "".join(f'<li>{escape(text)} <span class="note">({n})</span></li>' for text, n in numbers.items())
     said = f"<ul>{items}</ul>" if found else '<p class="note">None: the run raised no warnings.</p>'
-    files = _files(run)
+    files = {name: read_regular(run.recording.path / name, LARGEST_HISTORY) for name in (SCENE, HISTORY)}
+    # a history that is larger than a page may be stays where it is
+    files = {name: data for name, data in files.items() if len(data) <= LARGEST_DOWNLOAD}
     buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a> ' for file in files)
     html = section(f"Warnings ({sum(found.values())})", f"{said}<h2>Files of the run</h2><p>{buttons}</p>")
     arrays = {file: Array(np.frombuffer(data, dtype=np.uint8)) for file, data in files.items()}
     return Card("warnings", html, {"files": list(arrays)}, arrays)
-
-
-def _files(run: ReportedRun) -> dict[str, bytes]:
-    """The downloads; a history that is larger than a page may be stays where it is."""
-    found = {name: read_regular(run.recording.path / name, LARGEST_HISTORY) for name in (SCENE, HISTORY)}
-    return {name: data for name, data in found.items() if len(data) <= LARGEST_DOWNLOAD}
 
 
 def scene(run: ReportedRun) -> Card:

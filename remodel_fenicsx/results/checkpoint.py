@@ -76,8 +76,8 @@ class Checkpoints(Watcher):
                 number=state.number,
                 scene=self.scene_text,
                 versions=self._versions,
-                loads=marked({mark: case.loading.values for mark, case in state.each_case().items()}),
-                numbers=marked({mark: case.numbers for mark, case in state.each_case().items()}),
+                loads=marked(state, lambda case: case.loading.values),
+                numbers=marked(state, lambda case: case.numbers),
                 functions=list(arrays),
                 arrays={f"function/{name}": values for name, values in arrays.items()} | self._mesh,
             )
@@ -126,7 +126,7 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
     wanted = {n: (domain.number_of_elements, _places(one).shape[1]) for n, one in state.functions().items()}
     begins_anew = {name: shape for name, shape in wanted.items() if name in counts}
     found = {name: arrays[f"function/{name}"].shape for name in checkpoint.functions}
-    own = marked({mark: case.loading.values for mark, case in state.each_case().items()})
+    own = marked(state, lambda case: case.loading.values)
     loads = {name for name, value in checkpoint.loads.items() if value}  # earlier versions kept all, zero or not
     if not wanted.items() <= (begins_anew | found).items() or not loads <= own.keys():
         there, here = (f"functions {a} and loads {sorted(b)}" for a, b in ((found, loads), (wanted, own)))
@@ -138,9 +138,10 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
         raise CheckpointError(words)
 
 
-def marked(values: Mapping[str, Mapping[str, T]]) -> dict[str, T]:
-    """Values by name of all load cases in one, each name with the mark of its case."""
-    return {f"{name}{mark}": value for mark, of_case in values.items() for name, value in of_case.items()}
+def marked(state: State, values: Callable[[State], Mapping[str, T]]) -> dict[str, T]:
+    """Return values by name of all load cases in one, each name with the mark of its case."""
+    cases = state.each_case().items()
+    return {f"{name}{mark}": value for mark, case in cases for name, value in values(case).items()}
 
 
 def with_mark(values: Mapping[str, T], mark: str) -> dict[str, T]:

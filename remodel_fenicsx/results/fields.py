@@ -9,13 +9,13 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.results.columns import Measurement, Observer
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
@@ -23,7 +23,6 @@ from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, NO_PRESTRETCH, REGION, UNLOADED
 from remodel_fenicsx.system.files import ClosedAtEnd
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacement", "chains"))
@@ -161,11 +160,9 @@ class Fields(Watcher, ClosedAtEnd):
         if points is not None and elements is not None:
             geometry = domain.mesh.geometry.cmap
             cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), geometry.degree, elements)
-            self._grid = _continued(folder / FIELDS, after)
-            self._grid = self._grid or TransientGrid(folder / FIELDS, points, cells, cell_type)
+            self._grid = _continued(folder / FIELDS, after) or TransientGrid(folder / FIELDS, points, cells, cell_type)
             self._chains = _continued(folder / CHAIN_LINES, after) if "chains" in self.names else None
-            self._centres = points[elements].mean(axis=1)
-            self._elements = elements
+            self._mesh = points, elements
             # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
             self._scale = 0.4 * quadrature.extent
 
@@ -206,10 +203,8 @@ class Fields(Watcher, ClosedAtEnd):
         constant = {name: values for name, values in self._constant.items() if values is not None}
         self._grid.append(time, at_nodes, changing, constant=constant)
         if "chains" in self.names:
-            grid, middle = self._chains or self._grid.path.with_name(CHAIN_LINES), displacement[self._elements].mean(
-                axis=1
-            )
-            self._chains = append_chains(grid, time, self._centres, self._scale, middle, fields)
+            grid = self._chains or self._grid.path.with_name(CHAIN_LINES)
+            self._chains = append_chains(grid, time, *self._mesh, self._scale, displacement, fields)
 
     def close(self) -> None:
         """Let readers see all that is written so far, and a run go on with it that is killed from here on."""

@@ -89,19 +89,21 @@ def chain_displacement(points: Array, centres: Array, displacement: Array, defor
 def append_chains(
     grid: TransientGrid | Path,
     time: float,
-    centres: Array,
+    points: Array,
+    elements: Numbers,
     scale: float,
     displacement: Array,
     fields: Mapping[str, Array],
 ) -> TransientGrid:
     """Add a step to a file of chain lines; it is made at its first step, where `grid` is still its path."""
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
-    points, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
-    moved = chain_displacement(points, centres, displacement, fields["deformation_gradient"].reshape(-1, 3, 3))
+    centres, middle = (values[elements].mean(axis=1) for values in (points, displacement))
+    ends, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
+    moved = chain_displacement(ends, centres, middle, fields["deformation_gradient"].reshape(-1, 3, 3))
     if isinstance(grid, Path):
-        grid = TransientGrid(grid, points, lines, LINE, point_dtype=np.float32)
-    angle = np.repeat(fields["fibre_angle"], len(lines) // len(centres))
-    grid.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=points)
+        grid = TransientGrid(grid, ends, lines, LINE, point_dtype=np.float32)
+    angle = np.repeat(fields["fibre_angle"], 4)
+    grid.append(time, {"displacement": moved}, {"fibre_angle": angle}, points=ends)
     return grid
 
 
@@ -191,7 +193,7 @@ def revolve(folder: Path | str) -> list[Path]:
             displacement, fields = whole.fields(float(time))
             grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
             if displacement is not None and set(OF_CHAINS) <= set(fields):
-                middle = displacement[whole.elements].mean(axis=1)
-                new = append_chains(chains or paths[1], float(time), whole.centres, scale, middle, fields)
+                place, body = chains or paths[1], (whole.points, whole.elements)
+                new = append_chains(place, float(time), *body, scale, displacement, fields)
                 chains = chains or stack.enter_context(new)
     return [path for path in paths if path.exists()]

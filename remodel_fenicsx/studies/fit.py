@@ -258,8 +258,7 @@ def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
 
 
 def _read_columns(path: Path, place: str, scene: Scene) -> Columns:
-    own = scene.columns(column.name for column in scene.geometry.columns_on_request)
-    known = {column.name for column in own} - {"seconds", "substeps"}
+    known = {*dimensions(scene)} - {"seconds", "substeps"}
     strains = {name.replace("elongation", "stretch"): name for name in scene.load_kinds if "elongation" in name}
     allowed = sorted({*scene.loads, *known, "time", *strains})
     try:
@@ -782,10 +781,17 @@ class Fit(Answer):
         """A row for each unknown."""
         lower, upper = np.exp(self.band)
         profiles = np.transpose([self.profiles.get(key, [np.nan, np.nan]) for key in self.keys])
-        columns = {"key": self.keys, "value": self.values, "lower": lower, "upper": upper, "open": self.open}
-        columns["limited_by"] = [self.limited_by] * len(self.keys)
-        columns |= dict(zip(("profile_lower", "profile_upper"), profiles, strict=True))
-        return columns | {"start": [unknown.start for unknown in self.problem.unknowns.values()]}
+        return {
+            "key": self.keys,
+            "value": self.values,
+            "lower": lower,
+            "upper": upper,
+            "open": self.open,
+            "limited_by": [self.limited_by] * len(self.keys),
+            "profile_lower": profiles[0],
+            "profile_upper": profiles[1],
+            "start": [unknown.start for unknown in self.problem.unknowns.values()],
+        }
 
     def verdict(self) -> str:
         """How far the model is off, how many starts agree, and which unknowns go together."""

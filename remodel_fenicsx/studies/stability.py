@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.laws import LAWS, relaxed
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, SceneError
@@ -26,7 +26,6 @@ from remodel_fenicsx.studies.study import COLOURS, Answer
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 GROWS = 1.001  # factor: changes that no pass touches, where tension is missing, keep their size to what was iterated
 SIZE = 1e-5  # of a change of A, over tr A
@@ -104,7 +103,7 @@ def stability(
         raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")
     if scene.cases[1:]:
         raise SceneError("cases: the analysis takes one load case; leave out [[cases]]")
-    if scene.time.tolerance is not None and not scene.time.is_equilibrium:
+    if scene.time.chooses:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; leave it out")
     place = chosen_folder(folder, f"{scene.name}-stability", comm)
     steps, made = scene.time.number_of_steps, list[FactorWatcher]()

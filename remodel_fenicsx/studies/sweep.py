@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import only_for_means
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.tables import shown
 from remodel_fenicsx.studies.study import (
@@ -30,7 +30,6 @@ from remodel_fenicsx.studies.study import (
 )
 from remodel_fenicsx.system.files import MOST_RUNS
 
-Array = NDArray[np.float64]
 Number = int | float
 Point = Mapping[str, Number]
 
@@ -305,7 +304,7 @@ def ensemble(
         raise SceneError(f"--seeds {seeds}: allowed is a whole number at least {FEWEST_RUNS}")
     if not scene.has_random_cells:
         raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells")
-    if scene.time.tolerance is not None and not scene.time.is_equilibrium:
+    if scene.time.chooses:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
     first = scene.cells.seed
     points = {f"seed-{n}": {"cells.seed": n} for n in range(first, first + seeds)}

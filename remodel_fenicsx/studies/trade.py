@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import AUTO, choice, is_for_means, objections, step_cost
 from remodel_fenicsx.body.shape import FromFile, PROFILE
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
@@ -25,8 +25,6 @@ from remodel_fenicsx.studies.study import COLOURS, FEWEST_RUNS, Answer, Study, T
 from remodel_fenicsx.system.files import make_own_folder, write_whole
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- settings of a scene from coarse to fine

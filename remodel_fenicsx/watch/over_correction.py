@@ -8,17 +8,14 @@ from typing import NamedTuple, TYPE_CHECKING
 import dolfinx.la
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
 from remodel_fenicsx.fem.assembly import over_ranks
-from remodel_fenicsx.model import tensors
+from remodel_fenicsx.model.tensors import Array, to_mandel
 from remodel_fenicsx.state import Earlier
 
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 # Order of the difference over passes. It removes a smooth course, and keeps a part that changes its
 # sign in each pass.
@@ -88,7 +85,7 @@ class OverCorrection(WarnsOnce):
 
     def completed(self, step: Step) -> None:
         """Check the new pass, and record it. Collective."""
-        structure = tensors.to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
+        structure = to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
         cells, known, numbers = [structure, *self._cells.values], self._cells.known, self._numbers
         structures = np.reshape(cells, (len(cells), *self.quadrature.shape, 6))
         times = [step.time, *(numbers[f"time_{age}"] for age in range(ORDER + 1))]
@@ -108,15 +105,23 @@ class OverCorrection(WarnsOnce):
         of_cells = (cells[:, : len(scale)] * scale).reshape(len(cells), -1)
         of_body = np.array([self.state.unknown.x.array, *self._body.values])[:, : self.state.number_of_owned_unknowns]
         of_body /= dolfinx.la.norm(self.state.unknown.x) or 1.0
-        swings = self.swings = {"growing": self._swing(times, of_cells), "sustained": self._swing(times, of_body)}
+        cells_swing, body_swing = self._swing(times, of_cells), self._swing(times, of_body)
+        self.swings = {"growing": cells_swing, "sustained": body_swing}
         tells, found = self._tells(step, cells, times), False
-        for (name, swing), (factor, passes) in zip(swings.items(), (GROWING, SUSTAINED), strict=True):
+        for (name, swing), (factor, passes) in zip(self.swings.items(), (GROWING, SUSTAINED), strict=True):
             self._numbers[name] = self._numbers[name] + 1 if tells and swing.factor < factor else 0
             after_one_more = swing.size * abs(swing.factor)
             found |= self._numbers[name] >= passes and after_one_more >= TOLERANCE
         if found and not self.said:
             most = quadrature.shown_place_of_largest(np.linalg.norm(_difference(times, cells), axis=-1))
-            self.find(step, self._in_words(*swings.values(), most))
+            self.find(
+                step,
+                "the remodeling pass overshoots: the cells oscillate from pass to pass. "
+                f"The structure tensor A changes by {cells_swing.size:.2g} r0^2 (RMS; maximum at "
+                f"{most}), the displacement by {body_swing.size:.2g} of its size; "
+                f"each pass multiplies this by about {cells_swing.factor:.2g}. Results may be wrong from here on; set "
+                f"{self._advice(cells_swing.factor)} (docs/theory.md, Stability of the pass)",
+            )
 
     def _swing(self, times: Array, values: Array) -> Swing:
         """Return the oscillation of this rank's values (passes, n), in their norm. Collective."""
@@ -133,16 +138,6 @@ class OverCorrection(WarnsOnce):
             np.all(np.abs(_difference(times, loads)) <= LOAD_JUMP * GAIN * np.abs(loads[0]))
             and lengths.max() <= UNEVEN * lengths.min()
             and max(map(self.quadrature.mean, rested)) <= RESTED_SHARE
-        )
-
-    # ------------------------------------------------------------ messages
-    def _in_words(self, cells: Swing, body: Swing, most: str) -> str:
-        return (
-            "the remodeling pass overshoots: the cells oscillate from pass to pass. The structure "
-            f"tensor A changes by {cells.size:.2g} r0^2 (RMS; maximum at {most}), the displacement "
-            f"by {body.size:.2g} of its size; each pass multiplies this by about "
-            f"{cells.factor:.2g}. Results may be wrong from here on; set "
-            f"{self._advice(cells.factor)} (docs/theory.md, Stability of the pass)"
         )
 
     def _advice(self, factor: float) -> str:
@@ -186,8 +181,8 @@ class RestedCells(WarnsOnce):
         self.find(
             step,
             "cells resume remodeling after a phase without tension; an absolute-time law makes up "
-            f"the delay in one pass. In {100 * share:.2g} % of the body the structure tensor A changes "
-            f"by {change:.2g} r0^2 (RMS over the body; maximum at "
+            f"the delay in one pass. In {100 * share:.2g} % of the body the structure tensor A "
+            f"changes by {change:.2g} r0^2 (RMS over the body; maximum at "
             f"{self.quadrature.shown_place_of_largest(squares)}). This depends on time.step; set "
             'remodeling.coupling = "relaxed", or a remodeling.law that is a rate '
             "(docs/theory.md, Stability of the pass)",

@@ -101,8 +101,8 @@ class EquilibriumStability(Watcher):
         if now <= unloaded:
             self._say(
                 logging.INFO,
-                f"{step.moment}: {eigenvalues(now)} of the tangent. The unloaded body has {unloaded}, "
-                "from the stress of its initial cells: the equilibrium is not lost",
+                f"{step.moment}: {eigenvalues(now)} of the tangent. The unloaded body has "
+                f"{unloaded}, from the stress of its initial cells: the equilibrium is not lost",
             )
             return
         text = f"{eigenvalues(now)} of the tangent (before: {before}); " f"{described(self.inertia.lowest(), scale)}"

@@ -108,7 +108,7 @@ class LockingWarning(ElementWarning):
         return self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2) if elongation else 0.0
 
     def energies(self) -> tuple[float, float, float]:
-        """Return energies: with mean J per element, of varying J, of varying F twice. Collective."""
+        """Return energies: with mean J per element, of varying J, twice of varying F. Collective."""
         quadrature, (stiffness, shear) = self.quadrature, self.stiffnesses
         look = self.stepper.coupling.equilibrium.look()
         logarithm, F = np.log(look.jacobians), look.gradients.reshape(*stiffness.shape, 9)
@@ -274,8 +274,8 @@ class WeakTension(WarnsOnce):
         if step.is_last and not self.said and (weakness := self.stepper.remodeling.weakness()) > WEAK:
             self.find(
                 step,
-                f"loads too small: stresses near the rounding threshold ({weakness:.2g} of the largest "
-                "stress) remodel at half speed or less, so the cells reorient too slowly. "
+                f"loads too small: stresses near the rounding threshold ({weakness:.2g} of the "
+                "largest stress) remodel at half speed or less, so the cells reorient too slowly. "
                 "Use loads with larger strains",
             )
 
