@@ -6,9 +6,9 @@ that C leaves open. For a debugger it runs in place of C, with ``REMODEL_FENICSX
 the environment. The functions of `factor`, which call CHOLMOD, replace none: without them
 factorisations are PETSc's, in double precision.
 
-=================== =====================================================================================
+=================== ============================================================
 in C                replaces
-=================== =====================================================================================
+=================== ============================================================
 principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
@@ -21,7 +21,7 @@ factor_new          kernels.SingleFactor
 factor_renew        kernels.SingleFactor.renew
 factor_solve        kernels.SingleFactor.solve
 factor_free         kernels.SingleFactor.close
-=================== =====================================================================================
+=================== ============================================================
 """
 
 from __future__ import annotations

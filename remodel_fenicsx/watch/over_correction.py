@@ -119,8 +119,9 @@ class OverCorrection(WarnsOnce):
                 "the remodeling pass overshoots: the cells oscillate from pass to pass. "
                 f"The structure tensor A changes by {cells_swing.size:.2g} r0^2 (RMS; maximum at "
                 f"{most}), the displacement by {body_swing.size:.2g} of its size; "
-                f"each pass multiplies this by about {cells_swing.factor:.2g}. Results may be wrong from here on; set "
-                f"{self._advice(cells_swing.factor)} (docs/theory.md, Stability of the pass)",
+                f"each pass multiplies this by about {cells_swing.factor:.2g}. "
+                f"Results may be wrong from here on; set {self._advice(cells_swing.factor)} "
+                "(docs/theory.md, Stability of the pass)",
             )
 
     def _swing(self, times: Array, values: Array) -> Swing:

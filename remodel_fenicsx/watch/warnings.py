@@ -108,7 +108,7 @@ class LockingWarning(ElementWarning):
         return self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2) if elongation else 0.0
 
     def energies(self) -> tuple[float, float, float]:
-        """Return energies: with mean J per element, of varying J, twice of varying F. Collective."""
+        """Return energies: with mean J per element, of varying J, twice varying F. Collective."""
         quadrature, (stiffness, shear) = self.quadrature, self.stiffnesses
         look = self.stepper.coupling.equilibrium.look()
         logarithm, F = np.log(look.jacobians), look.gradients.reshape(*stiffness.shape, 9)
