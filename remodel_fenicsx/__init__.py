@@ -1,4 +1,4 @@
-"""Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007) with FEniCSx."""
+"""Prediction of collagen remodeling in living tissue under load (Kuhl & Holzapfel 2007)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.simulation import Simulation as Simulation
     from remodel_fenicsx.unloading import unloaded as unloaded
 
-_PLACES = {  # imported when they are asked for: scenes and recordings need no dolfinx
+_PLACES = {  # imported on first access, because scenes and recordings need no dolfinx
     "Recording": "recording",
     "RecordingError": "results.recording",
     "RemodelError": "errors",
@@ -31,5 +31,5 @@ _PLACES = {  # imported when they are asked for: scenes and recordings need no d
     "unloaded": "unloading",
 }
 __getattr__ = on_demand(__name__, _PLACES)
-if not TYPE_CHECKING:  # type checkers go by the imports
+if not TYPE_CHECKING:  # type checkers use the imports
     __all__ = sorted(["__version__", *_PLACES])

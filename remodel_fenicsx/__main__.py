@@ -1,4 +1,4 @@
-"""``python -m remodel_fenicsx`` is the command remodel-fenicsx."""
+"""Entry point of ``python -m remodel_fenicsx``, the command remodel-fenicsx."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Names that are imported when they are first asked for: a leaf."""
+"""Imports on first access, without imports of the package."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def on_demand(module: str, places: Mapping[str, str]) -> Callable[[str], Any]:
-    """The `__getattr__` of a module (PEP 562)."""
+    """Return a module's `__getattr__` (PEP 562) that imports names on first access."""
 
     def imported(name: str) -> Any:
         if name not in places:
@@ -21,18 +21,18 @@ def on_demand(module: str, places: Mapping[str, str]) -> Callable[[str], Any]:
 
 
 def resolved(maker: Callable[..., Any] | str) -> Callable[..., Any]:
-    """A class or function that a registry names: itself, or what its dotted name stands for."""
+    """Return the class or function of a registry, which may be its dotted name."""
     return _named(maker) if isinstance(maker, str) else maker
 
 
-@functools.cache  # points ask for it at every iteration
+@functools.cache  # called in every iteration
 def _named(place: str) -> Callable[..., Any]:
     found: Callable[..., Any] = pkgutil.resolve_name(place)
     return found
 
 
 class Late:
-    """A module of others that is imported when something of it is asked for."""
+    """Third-party module that is imported on first access to one of its names."""
 
     def __init__(self, name: str):
         self._name = name

@@ -1,22 +1,23 @@
-"""What is said to a user in one line, and the exit code of the command that ends with it: a leaf."""
+"""Errors for users, in one line, with the exit code of the command."""
 
 from __future__ import annotations
 
 import re
 
-LONGEST_MESSAGE = 900  # characters: of longer ones the ends are said
+LONGEST_MESSAGE = 900  # characters; longer messages lose their middle
 BAD_INPUT, SOLVE_FAILED, PAUSED, BAD_ENVIRONMENT = 2, 3, 4, 5
 
 
 class RemodelError(Exception):
-    """The base of all errors that are meant for a user: what is wrong stands in its one line.
+    """Base class of all errors for users, with a message of one line.
 
     Attributes
     ----------
     exit_code : int
-        Of a command that it ends (docs/commands.md): 2 for bad input, 3 for a solve that failed, and so on.
+        Exit code of the command (docs/commands.md): 2 for invalid input, 3 for a failed solve, and
+        so on.
     on_all_ranks : bool
-        Whether every rank of a run has it.
+        Whether the error is raised on every rank of a run.
 
     Examples
     --------
@@ -32,7 +33,7 @@ class RemodelError(Exception):
     on_all_ranks = True
 
     def in_words(self) -> str:
-        """All that the command line says of it.
+        """Return the whole message of the command line.
 
         Returns
         -------
@@ -43,11 +44,11 @@ class RemodelError(Exception):
 
 
 class UnreadableFile(RemodelError, ValueError):  # noqa: N818
-    """What is wrong with a file of others; one line."""
+    """Error of an untrusted file, with a message of one line."""
 
 
 class FigureError(RemodelError, ValueError):
-    """No figure for a reason that its one line names."""
+    """Error that prevents a figure, with a message of one line."""
 
     def __init__(self, message: str, exit_code: int = BAD_INPUT):
         super().__init__(message)
@@ -55,10 +56,10 @@ class FigureError(RemodelError, ValueError):
 
 
 def printable(text: str) -> str:
-    """Text on one line: control characters and line ends become spaces."""
+    """Return text on one line: control characters and line ends become spaces."""
     return re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)
 
 
 def shortened(text: str, most: int = LONGEST_MESSAGE) -> str:
-    """A text without its middle where it is longer: its ends say where and why."""
+    """Return the text, without its middle if it is too long: its ends have position and reason."""
     return text if len(text) <= most else f"{text[: most // 2 - 3]} ... {text[-(most // 2 - 2) :]}"

@@ -1,48 +1,55 @@
-"""Registries, and what is put into them: a scene then knows the name. CONTRIBUTING.md says which to use for what.
+"""Registries of the package, and the types of their entries, whose names scenes may use.
 
-Importing this needs no dolfinx; asking for couplings, measurements, linear solvers, `WarnsOnce` or `form` does.
+CONTRIBUTING.md says which registry to use. Importing this module needs no dolfinx. Access to
+couplings, measurements, linear solvers, `WarnsOnce` or `form` does.
 
 Attributes
 ----------
 AXES
-    Initial axes of the cells by name (`cells.axes`): functions of a `LocalAxes` that give rows n_I, (..., 3, 3).
+    Initial axes of the cells by name (`cells.axes`): functions of a `LocalAxes` that return rows
+    n_I, (..., 3, 3).
 CHAINS
     Laws of a single chain by name (`material.chain`): `Chain`.
 COLUMNS, COLUMNS_ON_REQUEST
-    Columns of every shape's history by name, those that are always there and those that `output.columns` may name:
+    Columns of every shape's history by name, always present or on request by `output.columns`:
     `Column`.
 COUPLINGS
-    How equilibrium and remodeling are coupled, by name (`remodeling.coupling`): `CouplingKind`.
+    Couplings of equilibrium and remodeling by name (`remodeling.coupling`): `CouplingKind`.
 DRIVERS
     Driving tensors by name (`remodeling.driver`; paper, eq. 8): `Driver`.
 FORMULATIONS
-    Where elements take the change of volume, by name (`mesh.formulation`): `Formulation`.
+    Formulations of the volumetric energy in elements by name (`mesh.formulation`): `Formulation`.
 FRAMES
-    What becomes of the eigenvectors of a spatial driver, by name (`remodeling.frame`; paper, eq. 9): `Frame`.
+    Maps from eigenvectors of a spatial driver to axes by name (`remodeling.frame`; paper, eq. 9):
+    `Frame`.
 KINEMATICS
-    What the unknowns mean, by name (`model.kinematics`): `Kinematics`.
+    Kinematics by name (`model.kinematics`): `Kinematics`.
 LAWS
     Evolution laws by name (`remodeling.law`; paper, eqs. 10 and 11): `Law`.
 MATRICES
-    Energies of the matrix by name (`material.matrix`): functions of F, lambda and mu; `Matrix` for all formulations.
+    Energies of the matrix by name (`material.matrix`): functions of F, lambda and mu; `Matrix` for
+    all formulations.
 PAIRINGS
-    Which principal value belongs to which dimension, by name (`remodeling.pairing`): functions like `principal`.
+    Pairings of principal values and dimensions by name (`remodeling.pairing`): functions like
+    `principal`.
 REMODELS
-    What remodels beside the cells, by the name of its table in `[remodeling]`: `RemodelsKind`.
+    Remodeling processes in addition to the cells, by the name of their table in `[remodeling]`:
+    `RemodelsKind`.
 REPULSIONS
     Forms of the repulsive energy by name (`material.repulsion`): `Repulsion`.
 SHAPES
     Bodies by name (`geometry.shape`): subclasses of `Shape`.
 SOLVER_METHODS
-    How the nonlinear problem is solved, by name (`solver.method`): `SolverMethod`.
+    Methods for the nonlinear problem by name (`solver.method`): `SolverMethod`.
 WATCHERS
-    Who looks on and warns in every run, by name: `WatcherKind`, most often of a `WarnsOnce`.
+    Watchers of every run by name: `WatcherKind`, usually of a `WarnsOnce`.
 neo_hookean
     The paper's matrix, W = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a): a `Matrix`.
 AREA, FORCE, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
-    What a number of a scene measures, for the field of a table: ``side: Annotated[float, LENGTH]``; a `Dimension`.
+    Dimension of a scene's number, for the field of a table: ``side: Annotated[float, LENGTH]``; a
+    `Dimension`.
 LENGTH_UNIT, STRESS_UNIT
-    The keys that choose a scene's units, for a `Dimension` of one's own.
+    Keys that set a scene's units, for a custom `Dimension`.
 
 Examples
 --------
@@ -136,6 +143,6 @@ _LATE = {
     "form": "fem.jit",
 }
 __getattr__ = on_demand(__name__, _LATE)
-if not TYPE_CHECKING:  # type checkers go by the imports
+if not TYPE_CHECKING:  # type checkers use the imports
     _HELPERS = ("annotations", "TYPE_CHECKING", "on_demand")
     __all__ = sorted(name for name in {*globals(), *_LATE} if name not in _HELPERS and not name.startswith("_"))

@@ -1,7 +1,7 @@
-"""What a script assembles a simulation from, where a scene does not say it: see demos/artery.py.
+"""Parts from which scripts assemble a simulation without a scene, as in demos/artery.py.
 
-Stresses, lengths and times are in the script's own units, the same everywhere; dimensions of unit cells and lengths of
-chains are in link lengths, angles in degrees.
+Stresses, lengths and times are in the script's units, which must be consistent. Dimensions of unit
+cells and lengths of chains are in link lengths, angles in degrees.
 
 Examples
 --------
@@ -42,5 +42,5 @@ from remodel_fenicsx.solver.continuation import StepFailure as StepFailure
 from remodel_fenicsx.state import State as State, UnitCells as UnitCells
 from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception as end_all_ranks_on_exception
 
-if not TYPE_CHECKING:  # type checkers go by the imports
+if not TYPE_CHECKING:  # type checkers use the imports
     __all__ = sorted(name for name in globals() if name != "TYPE_CHECKING" and not name.startswith("_"))

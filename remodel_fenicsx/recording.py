@@ -1,4 +1,4 @@
-"""A recorded run in scripts and notebooks: what it recorded, its page, its body in PyVista, its pictures."""
+"""Recorded runs in scripts and notebooks: results, report, body in PyVista, pictures."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ if TYPE_CHECKING:
     import pyvista
     from numpy.typing import ArrayLike
 
-NOTEBOOK_SIZE = 5.0  # MB that a page has at most in a notebook, which is saved with all of them
+# Largest page in a notebook, in MB, because notebooks are saved with their pages.
+NOTEBOOK_SIZE = 5.0
 FRAME_STYLE = "width: 100%; height: 48em; border: 1px solid #888"
 
 
 class Recording(RecordedRun):
-    """The folder of a run, finished or under way. In a notebook it shows its report.
+    """Results of a run, finished or not, from its folder. In a notebook it shows its report.
 
-    Everything is read when it is first asked for, and once: a new `Recording` sees what has been added since.
+    Each result is read once, on first access. A new `Recording` reads steps that were added since.
 
     Parameters
     ----------
     folder
-        What `remodel-fenicsx run -o` was given.
+        Folder of the run, as of `remodel-fenicsx run -o`.
 
     Attributes
     ----------
     path : Path
-        The folder.
+        Folder of the run.
 
     Raises
     ------
     RecordingError
-        If it is no folder of a run.
+        If it is not the folder of a run.
 
     Examples
     --------
@@ -54,64 +55,67 @@ class Recording(RecordedRun):
     >>> recording.fields(2.0)["displacement"].shape  # (nodes, 3)
     (8, 3)
 
-    In a notebook `recording` alone shows the report, and `recording.plot(layers=2).show()` the body.
+    In a notebook `recording` alone shows the report, and `recording.plot(layers=2).show()` the
+    body.
     """
 
     def _repr_html_(self) -> str:
         from remodel_fenicsx.report import page_of
 
         page = escape(page_of(self, NOTEBOOK_SIZE))
-        sandbox = "allow-scripts allow-downloads"  # no origin of its own: it reaches nothing of the notebook
+        # The page has no origin of its own, so that it cannot access the notebook.
+        sandbox = "allow-scripts allow-downloads"
         return f'<iframe srcdoc="{page}" sandbox="{sandbox}" style="{FRAME_STYLE}" title="report of a run"></iframe>'
 
     def report(self, path: Path | None = None) -> Path:
-        """Make the page of the run for a browser, as `remodel-fenicsx report` does.
+        """Write the report of the run for a browser, like `remodel-fenicsx report`.
 
         Parameters
         ----------
         path
-            A new file; default: report.html in the folder, which is made anew.
+            New file. Default: report.html in the folder, which is replaced.
 
         Returns
         -------
         Path
-            The file.
+            Path of the file.
 
         Raises
         ------
         ReportError
-            If this package has not made the report.html that is there; a ValueError.
+            If report.html exists and was not written by this package. It is a ValueError.
         FileExistsError
-            If the file is there already; a ValueError too.
+            If the file already exists. It is a ValueError too.
         RecordingError
-            If the folder is damaged.
+            If the folder is corrupt.
         OSError
-            If it cannot be written.
+            If the file cannot be written.
         """
         from remodel_fenicsx.report import write_report
 
         return write_report(self.path, path)
 
     def grid(self, time: float | None = None) -> pyvista.UnstructuredGrid:
-        """The whole body at a recorded time for PyVista; of a reduction it is turned into the body.
+        """Return the whole body at a recorded time for PyVista, also that of a reduction.
 
         Parameters
         ----------
         time
-            As recorded; default: the last.
+            Recorded time. Default: the last one.
 
         Returns
         -------
         pyvista.UnstructuredGrid
-            The reference body. Its points have `displacement`, (n, 3), where that was recorded, and
-            `grid.warp_by_vector("displacement")` is the deformed body. Its elements have all other fields, and `layer`.
+            Body in the reference configuration. Its points have `displacement`, (n, 3), if
+            recorded, and `grid.warp_by_vector("displacement")` is the deformed configuration. Its
+            elements have all other fields, and `layer`.
 
         Raises
         ------
         RecordingError
-            If no fields of a body are recorded at this time, or they are damaged.
+            If no fields of a body are recorded at this time, or if they are corrupt.
         ImportError
-            If there is no PyVista.
+            If PyVista is missing.
         """
         from remodel_fenicsx.pictures import WholeBody, grid
 
@@ -122,41 +126,46 @@ class Recording(RecordedRun):
         cut: str | None = None, elements: ArrayLike | None = None, chains: bool = True,
         plotter: pyvista.Plotter | None = None, **options: object,
     ) -> pyvista.Plotter:  # fmt: skip
-        """Put the deformed body at a recorded time into a plotter of PyVista: `recording.plot().show()`.
+        """Add the deformed configuration at a recorded time to a plotter of PyVista.
+
+        ``recording.plot().show()`` shows it.
 
         Parameters
         ----------
         time
-            As recorded; default: the last.
+            Recorded time. Default: the last one.
         name
-            The field that colours the elements; of vectors and tensors PyVista shows the magnitude. Fibre angles have
-            the colours of the report and of the paper's figures.
+            Field that colours the elements; PyVista shows the magnitude of vectors and tensors.
+            Fibre angles have the colours of the report and of the paper's figures.
         layers
-            Show so many, from the inside of a tube, from the bottom of others; default: all.
+            Number of layers to show, from the inside of a tube or the bottom of other bodies.
+            Default: all.
         cut
-            "half" or "quarter": leave out what is in front.
+            "half" or "quarter" to remove the part in front.
         elements
-            Show of these alone: which ones of `grid()`, a mask (elements,).
+            Elements of `grid()` to show, a mask (elements,).
         chains
-            Whether the four chains of each element are drawn on the faces that are seen, where cells were recorded.
+            Whether to draw the four chains of each element on visible faces, if cells were
+            recorded.
         plotter
-            To put it into; default: a new one.
+            Plotter to use. Default: a new one.
         options
-            For `pyvista.Plotter.add_mesh`, which draws the body.
+            Options of `pyvista.Plotter.add_mesh`, which draws the body.
 
         Returns
         -------
         pyvista.Plotter
-            Not shown yet.
+            Plotter, not shown yet.
 
         Raises
         ------
         RecordingError
-            If the field, or any, was not recorded at this time.
+            If the field, or any field, was not recorded at this time.
         FigureError
-            If there are no such layers or elements, or nothing is left by the cut; a ValueError.
+            If these layers or elements do not exist, or if the cut removes all of them. It is a
+            ValueError.
         ImportError
-            If there is no PyVista.
+            If PyVista is missing.
         """
         from remodel_fenicsx import pictures
 
@@ -164,13 +173,13 @@ class Recording(RecordedRun):
         shown = pictures.shown_elements(whole, pictures.Viewing(layers, cut))
         if elements is not None:
             if np.shape(elements) != shown.shape:
-                rule = f"allowed is a mask of all {len(shown)}"
+                rule = f"must be a mask of all {len(shown)}"
                 raise pictures.FigureError(f"elements of shape {np.shape(elements)}: {rule}")
             shown &= np.asarray(elements, dtype=bool)
         found = pictures.grid(whole, self._time(time), shown)
         if name not in found.cell_data:
             there = ", ".join(found.cell_data)
-            raise RecordingError(f"{self.path}: no field {name!r} of elements; there are {there}")
+            raise RecordingError(f"{self.path}: no field {name!r} of elements; recorded: {there}")
         plotter = plotter or pictures.new_plotter()
         pictures.add_body(plotter, pictures.deformed(found), name, chains, **options)
         return plotter
@@ -179,32 +188,34 @@ class Recording(RecordedRun):
         self, path: str | os.PathLike[str] | None = None, times: Sequence[float] | None = None, *,
         layers: int | None = None, cut: str | None = None, view: str = "front",
     ) -> Path:  # fmt: skip
-        """Draw the body into a file, as `remodel-fenicsx picture` does: it needs no display.
+        """Draw the body into a file, like `remodel-fenicsx picture`, without a display.
 
         Parameters
         ----------
         path
-            A new file: .png or .pdf; default: NAME-tTIME.png in the folder, numbered when taken.
+            New file with the suffix .png or .pdf. Default: NAME-tTIME.png in the folder, with a
+            number if it exists.
         times
-            To show beside each other; the nearest recorded ones are taken. Default: the last.
+            Times to show next to each other; the nearest recorded ones are used. Default: the last
+            one.
         layers, cut
-            As of `plot`.
+            See `plot`.
         view
-            "front", "above" or "X,Y,Z": where the eye is, from the middle of the body.
+            "front", "above" or "X,Y,Z": position of the viewer from the centre of the body.
 
         Returns
         -------
         Path
-            The file.
+            Path of the file.
 
         Raises
         ------
         FigureError
-            One line: what is not allowed, or that nothing can be drawn here; a ValueError.
+            If an argument is not allowed, or if drawing is impossible here. It is a ValueError.
         FileExistsError
-            If the file is there already; a ValueError too.
+            If the file already exists. It is a ValueError too.
         RecordingError
-            If the folder is damaged.
+            If the folder is corrupt.
         OSError
             If the file cannot be written.
         """
@@ -213,5 +224,5 @@ class Recording(RecordedRun):
         return draw_picture(self.path, times, Viewing(layers, cut, view), None if path is None else Path(path))
 
     def _time(self, time: float | None) -> float:
-        """A time with fields: this one or the last."""
+        """Return this time, or the last one by default."""
         return float(self.times[-1]) if time is None else time

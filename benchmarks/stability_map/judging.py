@@ -16,7 +16,7 @@ CAUSES = re.compile(
 )
 UNSTABLE = re.compile(
     r"negative eigenvalue|unstable equilibrium|equilibrium is unstable|no longer a minimum|lost (its )?stability|"
-    r"would buckle",
+    r"would buckle|expected buckling",
     re.I,
 )
 # warnings about what is asked for, units and compressible tissue, which say nothing about whether the answer is right

@@ -1,1 +1,1 @@
-"""dolfinx, and nothing of the tissue: versions, compilation, quadrature points, kinematics, PETSc options."""
+"""Finite elements without tissue: versions, compilation, quadrature, kinematics, PETSc options."""

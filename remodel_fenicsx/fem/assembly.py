@@ -1,8 +1,4 @@
-"""Forms and their numbers: what dolfinx and UFL leave to do so that a small problem is fast.
-
-Sums over ranks, parameters as arguments of compiled kernels, values that are computed once for each state, tangents of
-energies in few operations, matrices in memory that dolfinx and PETSc share.
-"""
+"""Reductions over ranks, coefficients, cached values, tangents, matrices and linear solves."""
 
 from __future__ import annotations
 
@@ -36,14 +32,15 @@ if TYPE_CHECKING:
     from remodel_fenicsx.fem.quadrature import Quadrature
 
 
-# ---------------------------------------------------------------- a linear equation with a positive definite form
+# ---------------------------------------------------------------- linear equations
 
-TOLERANCE = 1e-12  # relative, of the linear solve: what comes of it has ten digits on any number of ranks
-ITERATION_LIMIT = 20_000  # lines of a thousand elements need some thousands
+# Relative tolerance of the linear solve. Its results have ten digits on any number of ranks.
+TOLERANCE = 1e-12
+ITERATION_LIMIT = 20_000  # a thousand elements in a line need some thousands
 
 
 def rigid_motions(space: FunctionSpace, matrix: PETSc.Mat) -> PETSc.NullSpace:
-    """Those of the space of a vector, which multigrid must know of its matrix."""
+    """Return a vector space's rigid body modes, the near null space of multigrid. Collective."""
     place = matrix.createVecRight()
     place.array[:] = space.tabulate_dof_coordinates()[: place.getLocalSize() // 3].ravel()
     motions = PETSc.NullSpace().createRigidBody(place)
@@ -52,7 +49,7 @@ def rigid_motions(space: FunctionSpace, matrix: PETSc.Mat) -> PETSc.NullSpace:
 
 
 def degree_one(space: FunctionSpace) -> tuple[FunctionSpace, PETSc.Mat]:
-    """The same functions of degree 1, and the matrix that interpolates them. Collective."""
+    """Return the space of degree 1, and the matrix that interpolates from it. Collective."""
     below = lagrange(space.mesh, 1, tuple(space.value_shape)).function_space
     prolongation = dolfinx.fem.petsc.interpolation_matrix(below, space)
     prolongation.assemble()
@@ -60,7 +57,9 @@ def degree_one(space: FunctionSpace) -> tuple[FunctionSpace, PETSc.Mat]:
 
 
 class DegreeOne:
-    """Multigrid for elements of degree 2 whose next level is `degree_one`: all others then cost little. Collective."""
+    """Multigrid for elements of degree 2, with `degree_one` as the next level. Collective."""
+
+    # All coarser levels then cost little.
 
     def __init__(
         self,
@@ -80,7 +79,8 @@ class DegreeOne:
         pc.setMGType(PETSc.PC.MGType.ADDITIVE)
         pc.setMGInterpolation(1, self._prolongation)
         fine, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
-        fine.setOptionsPrefix(self._options.prefix + "fine_")  # not those of GAMG's levels
+        # A prefix of its own: GAMG's options are not for this level.
+        fine.setOptionsPrefix(self._options.prefix + "fine_")
         fine.setType("preonly")
         fine.getPC().setType("pbjacobi")
         coarse.setOperators(self._coarse)
@@ -88,7 +88,7 @@ class DegreeOne:
         self._options.apply(coarse.getPC())
 
     def renew(self, matrix: PETSc.Mat) -> None:
-        """The next level of another matrix."""
+        """Compute the next level for another matrix. Collective."""
         matrix.PtAP(self._prolongation, result=self._coarse)
 
     def destroy(self) -> None:
@@ -98,11 +98,11 @@ class DegreeOne:
 
 
 class SolveStopped(ArithmeticError):
-    """The iterations did not converge."""
+    """Failure of an iterative linear solve to converge."""
 
 
 class Positive:
-    """A positive definite form, which several solves share. Collective."""
+    """Linear solver for a positive definite form, used by several solves. Collective."""
 
     def __init__(self, bilinear: ufl.Form):
         self._form, self.space = jit.form(bilinear), bilinear.arguments()[0].ufl_function_space()
@@ -110,7 +110,7 @@ class Positive:
 
     @cached_property
     def _degree_one(self) -> tuple[FunctionSpace, PETSc.Mat]:
-        """For all solves. Collective."""
+        """Space of degree 1 and its interpolation, for all solves. Collective on first access."""
         return degree_one(self.space)
 
     def solve(
@@ -119,9 +119,9 @@ class Positive:
         conditions: Sequence[DirichletBC] = (),
         multigrid: bool = False,
     ) -> Function:
-        """The function u with bilinear(u, v) = linear(v) for all v; linear is 0 where it is None. Collective."""
-        # Conjugate gradients, with no memory for factors. Multigrid is for where what is held is far away; it cannot be
-        # where all is held.
+        """Return u with bilinear(u, v) = linear(v) for all v; None stands for 0. Collective."""
+        # Conjugate gradients need no memory for a factorisation. Multigrid helps if the constrained
+        # dofs are far away. It does not work if all dofs are constrained.
         unknown, matrix = dolfinx.fem.Function(self.space), self._matrix
         answer = unknown.x.petsc_vec
         load, conditions = answer.duplicate(), list(conditions)
@@ -150,7 +150,7 @@ class Positive:
         for thing in (solver, load, *([levels] if levels else [])):
             thing.destroy()
         if reason < 0:
-            raise SolveStopped(f"the linear solve stopped after {iterations} iterations (reason {reason} of PETSc)")
+            raise SolveStopped(f"no convergence in {iterations} iterations of the linear solve (reason {reason})")
         return unknown
 
 
@@ -160,23 +160,24 @@ T = TypeVar("T")
 
 
 def over_ranks(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
-    """The operation over the values of all ranks, on all ranks. Collective."""
-    # A run of one rank makes some ten of these in a Newton iteration, and a small problem has no time for them.
+    """Return the reduction of the values of all ranks, on all ranks. Collective."""
+    # A Newton iteration needs about ten reductions, and a small problem on one rank has no time for
+    # them.
     return value if comm.size == 1 else comm.allreduce(value, operation)
 
 
 def integral(form: Form) -> float:
-    """Value of a compiled form without arguments, over all ranks. Collective."""
+    """Return the value of a compiled form without arguments, over all ranks. Collective."""
     return float(form.mesh.comm.allreduce(np.real(dolfinx.fem.assemble_scalar(form)), MPI.SUM))
 
 
 def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:
-    """The values of all ranks, on all ranks. Collective."""
+    """Return the values of all ranks, on all ranks. Collective."""
     return [value] if comm.size == 1 else comm.allgather(value)
 
 
 def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
-    """What `make` makes on every rank; what one of them refuses with a ValueError is refused on all. Collective."""
+    """Return the result of `make`; raise a ValueError of any rank on all ranks. Collective."""
     made = refusal = None
     try:
         made = make()
@@ -192,13 +193,13 @@ def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
 
 
 def coefficient(mesh: Mesh, name: str, value: float | Constant | Function) -> Constant | Function:
-    """The value as forms take it, so that another value compiles nothing."""
+    """Return a coefficient of forms, so that another value compiles nothing. Collective."""
     if isinstance(value, Real) and not isinstance(value, (bool, np.bool_)):
         value = dolfinx.fem.Constant(mesh, PETSc.ScalarType(float(value)))
     if not isinstance(value, (dolfinx.fem.Constant, dolfinx.fem.Function)):
         raise TypeError(
-            f"{name} = {value!r:.60}: must be a number, a dolfinx Constant or a DG0 Function of this mesh, "
-            f"not a {type(value).__name__}"
+            f"{name} = {value!r:.60}: must be a number, a dolfinx Constant "
+            f"or a DG0 Function of this mesh, not a {type(value).__name__}"
         )
     domain = extract_unique_domain(value)
     if domain is None or domain.ufl_cargo() is not mesh.ufl_domain().ufl_cargo():
@@ -219,27 +220,29 @@ def coefficient(mesh: Mesh, name: str, value: float | Constant | Function) -> Co
 
 
 def point_values(value: Constant | Function, quadrature: Quadrature) -> NDArray[np.float64]:
-    """Values of a coefficient at the quadrature points, (elements, points); ghosts included."""
+    """Return a coefficient's values at the quadrature points, (elements, points), with ghosts."""
     if isinstance(value, dolfinx.fem.Function):
         dofs = value.function_space.dofmap.list.reshape(-1)
-        if dofs.size == np.prod(quadrature.shape):  # one at each point (as DG0 with one point an element)
+        # One value per point, also DG0 with one point per element.
+        if dofs.size == np.prod(quadrature.shape):
             return quadrature.values(value, ()).copy()
         return np.repeat(np.real(value.x.array[dofs])[:, None], quadrature.shape[1], axis=1)
     return np.full(quadrature.shape, float(np.real(value.value)))
 
 
-# ---------------------------------------------------------------- values computed once for each state
+# ---------------------------------------------------------------- cached values
 
 
 class Remembered(Generic[T]):
-    """The last value, as long as nothing has changed that it depends on."""
+    """Cache of one value, valid until a function or constant of the expressions changes."""
 
     def __init__(self, comm: MPI.Intracomm | None, *expressions: Expr):
         self._comm = comm
         terminals = {terminal for expression in expressions for terminal in traverse_unique_terminals(expression)}
         functions = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Function)]
         constants = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Constant)]
-        # their own memory; what is small is asked first, for one difference is enough
+        # Arrays are the functions' own memory. Small ones come first, because one difference is
+        # enough.
         self._arrays: list[NDArray[np.float64]] = sorted((f.x.array for f in functions), key=lambda array: array.size)
         self._numbers = [np.asarray(c.value) for c in constants]
         self._seen: list[NDArray[np.float64]] = []
@@ -247,19 +250,19 @@ class Remembered(Generic[T]):
         self._value: T
 
     def __call__(self, make: Callable[[], T]) -> T:
-        """The value, of `make` where it is not known yet."""
+        """Return the cached value, or compute it with `make`. Collective with a communicator."""
         numbers = [number.tobytes() for number in self._numbers]
         known = numbers == self._seen_numbers and all(map(np.array_equal, self._arrays, self._seen))
         if self._comm is not None:
             known = bool(over_ranks(self._comm, known, MPI.LAND))
         if not known:
-            self.forget()  # should `make` fail
+            self.forget()  # in case `make` fails
             self._value = make()
             self._remember(numbers)
         return self._value
 
     def forget(self) -> None:
-        """The next value is made anew."""
+        """Invalidate the cache: the next call computes the value again."""
         self._seen_numbers = None
 
     def _remember(self, numbers: list[bytes]) -> None:
@@ -275,10 +278,11 @@ class Remembered(Generic[T]):
 
 
 def second_derivative(energy: ufl.Form, unknown: Function, test: Expr, trial: Expr) -> ufl.Form:
-    """Derivative of an energy by its unknowns, twice; its kernel takes a third of the time."""
-    # An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d I_m D I_n. Left to
-    # itself UFL puts test and trial function through every operation of W, and each of these is then 81 at a point in
-    # three dimensions. Here they are operations on numbers, and each pair of invariants that W couples has one dyad.
+    """Return the second derivative of an energy; its kernel takes a third of the time of UFL's."""
+    # An energy W(I_1, I_2, ...) of scalar invariants of F has sum_m W_m D(d I_m) + sum_mn W_mn d
+    # I_m D I_n. UFL alone differentiates every operation of W by test and trial function, which
+    # makes 81 operations of each at a point in three dimensions. Here these are operations on
+    # numbers, and each pair of invariants that W couples has one dyad.
     return map_integrands(lambda density: _of_density(density, unknown, test, trial), energy)
 
 
@@ -299,10 +303,10 @@ def _of_density(density: Expr, unknown: Function, test: Expr, trial: Expr) -> Ex
 
 
 def invariants(density: Expr, unknown: Function) -> list[Expr]:
-    """Scalar products, determinants."""
-    # The outermost ones; none at all where it depends on the unknown in another way too.
+    """Return the outermost scalar products, determinants, traces and radicands of a density."""
+    # The list is empty if the density depends on the unknown in another way too.
     depends: set[Expr] = set()
-    for part in unique_post_traversal(density):  # operands come before what is made of them
+    for part in unique_post_traversal(density):  # operands come before their results
         if part == unknown or any(operand in depends for operand in part.ufl_operands):
             depends.add(part)
     found: dict[Expr, None] = {}
@@ -324,14 +328,14 @@ def invariants(density: Expr, unknown: Function) -> list[Expr]:
 
 
 # ---------------------------------------------------------------- matrices
-SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's own, with the starts of its rows and the column numbers
+SHARED = "dolfinx"  # attribute of a PETSc matrix: dolfinx's matrix, row starts and column numbers
 
 
 def create_matrix(form: Form) -> PETSc.Mat:
-    """An empty PETSc matrix with the pattern of a compiled bilinear form. Collective."""
-    # Forms are assembled into a `dolfinx.la.MatrixCSR`. On one rank its memory is that of the matrix; on several ranks
-    # the matrix takes its values as a whole. Either way none goes through PETSc's insertion, which takes as long as the
-    # kernels.
+    """Return an empty PETSc matrix with the pattern of a compiled bilinear form. Collective."""
+    # Forms are assembled into a `dolfinx.la.MatrixCSR`. On one rank the matrix uses its memory. On
+    # several ranks the matrix takes all values in one call. Both avoid PETSc's insertion, which
+    # takes as long as the kernels.
     shared = dolfinx.fem.create_matrix(form, dolfinx.la.BlockMode.expanded)
     block, matrix = form.function_spaces[0].dofmap.index_map_bs, PETSc.Mat()
     rows, columns = (shared.index_map(axis) for axis in (0, 1))
@@ -353,10 +357,11 @@ def assemble_matrix(
     forms: Sequence[Form],
     conditions: Sequence[DirichletBC],
 ) -> None:
-    """The sum of compiled bilinear forms; zero in the rows and columns of conditions, one on their diagonal."""
+    """Assemble the sum of bilinear forms; conditions zero rows and columns, with unit diagonal."""
     shared, starts, numbers = matrix.getAttr(SHARED)
     shared.set_value(0.0)
-    assemble: Any = dolfinx.fem.assemble_matrix  # mypy sees one overload of a single-dispatch function
+    # Mypy sees one overload of a single-dispatch function.
+    assemble: Any = dolfinx.fem.assemble_matrix
     for form in forms:
         assemble(shared, form, bcs=list(conditions))
     if matrix.comm.size > 1:

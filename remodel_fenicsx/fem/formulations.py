@@ -1,9 +1,8 @@
-"""Formulations: where an element takes the change of volume, which decides whether it locks in a stiff bulk.
+"""Formulations: the points at which elements take J, which decide whether they lock."""
 
-An element of low degree cannot keep J = 1 at all of its points and bend; where lambda is much larger than every
-stiffness against shear it then hardly moves (docs/theory.md, Volumetric locking). dolfinx is imported when needed:
-scenes, which name formulations, are read without it.
-"""
+# An element of low degree cannot keep J = 1 at all of its points and bend. It hardly deforms if
+# lambda is much larger than every stiffness against shear (docs/theory.md, Volumetric locking).
+# dolfinx is imported when needed: scenes, which name formulations, are read without it.
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ Array = NDArray[np.float64]
 
 
 class Dilatation:
-    """A formulation on a mesh: the energy's integral, and stresses and J to go with it; here J at all points."""
+    """Formulation on a mesh: energy, stresses and J that belong together; here J at all points."""
 
     jacobian: Any = None
 
@@ -46,8 +45,9 @@ class Dilatation:
         cells: Sequence[UnitCell],
         weight: Expr | float,
     ) -> list[Form]:
-        """UFL forms whose sum is the integral of W over the body; `weight` is the body's volume per unit of mesh."""
-        # They are compiled one by one: FFCx mixes up values of two quadrature rules that meet in one kernel.
+        """Return UFL forms that sum to the integral of W; `weight`: volume per unit of mesh."""
+        # Each form is compiled by itself, because FFCx mixes up values of two quadrature rules in
+        # one kernel.
         return [tissue.strain_energy(deformation_gradient, cells) * weight * self.quadrature.dx]
 
     def stresses(
@@ -56,28 +56,29 @@ class Dilatation:
         deformation_gradient: Expr,
         cells: Sequence[UnitCell],
     ) -> Stresses:
-        """Stresses (UFL) at the quadrature points, as the residual has them. They belong to the last `refresh`."""
+        """Return the residual's UFL stresses at the points, which belong to the last `refresh`."""
         return tissue.stresses(deformation_gradient, cells)
 
     def refresh(self) -> None:
-        """Take what `stresses` needs beside F from the present unknowns."""
+        """Update what `stresses` needs in addition to F from the present unknowns."""
 
     def jacobians(self) -> Array:
-        """J of the present unknowns where the formulation takes it beside the quadrature points, (elements, any)."""
+        """Return J at the formulation's own points, (elements, any), if it has any."""
         return np.empty((len(self.quadrature.elements), 0))
 
 
 class Formulation:
-    """What scenes, states and warnings ask of a formulation.
+    """Formulation of elements: the points at which they take the volumetric part of the energy.
 
     Attributes
     ----------
     meaning
-        What it does, for docs/scene.md.
+        Description for docs/scene.md.
     takes_parts
-        Whether it needs a matrix energy whose volumetric part is told apart (`model.energy.Matrix`).
+        Whether it needs a matrix energy with a separate volumetric part (`model.energy.Matrix`).
     locks
-        Whether differences of J inside an element cost energy: elements lock where the bulk is stiff.
+        Whether differences of J inside an element cost energy, so that nearly incompressible
+        elements lock.
 
     Examples
     --------
@@ -94,41 +95,41 @@ class Formulation:
     locks: bool = True
 
     def has(self, element: str, degree: int) -> bool:
-        """Whether it changes anything for such an element.
+        """Return whether the formulation changes anything for an element.
 
         Parameters
         ----------
         element
             "hexahedron" or "tetrahedron".
         degree
-            Of the displacement.
+            Degree of the displacement.
         """
         return True
 
     def pays_above(self, element: str, degree: int) -> float:
-        """The lambda/mu from which on "auto" takes it for such an element.
+        """Return the lambda/mu above which "auto" takes the formulation for an element.
 
         Parameters
         ----------
         element, degree
-            As in `has`.
+            See `has`.
         """
         return np.inf
 
     def on(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> Dilatation:
-        """The formulation for these unknowns at these points.
+        """Return the formulation for these unknowns at these quadrature points.
 
         Parameters
         ----------
         kinematics, unknown, quadrature
-            What the unknowns mean, their dolfinx function, and the points.
+            Kinematics, dolfinx function of the unknowns, and quadrature points.
         """
         return Dilatation(quadrature)
 
 
 @dataclass(frozen=True)
 class AtAllPoints(Formulation):
-    """W as it stands, at all quadrature points."""
+    """Formulation with the whole energy W at all quadrature points."""
 
     meaning: str
 
@@ -138,18 +139,22 @@ class AtAllPoints(Formulation):
 
 @dataclass(frozen=True)
 class Selective(Formulation):
-    """The volumetric part by a rule of fewer points; in between, its J is the polynomial through them.
+    """Selective integration: the volumetric part by a rule of fewer points.
+
+    Between the points of the rule J is their interpolating polynomial.
 
     Parameters
     ----------
     meaning
-        What it does, for docs/scene.md.
+        Description for docs/scene.md.
     degrees
-        Degree of that rule by element and degree; what is not in it would lock all the same.
+        Degree of that rule by element and degree. Elements without an entry would lock all the
+        same.
     pays
-        Least lambda/mu for which "auto" takes it, by element; it never does for one that is not in it.
+        Largest lambda/mu for which "auto" still takes J at all points, by element. Without an entry
+        "auto" always does.
     takes_parts, locks
-        As in `Formulation`.
+        See `Formulation`.
 
     Examples
     --------
@@ -166,15 +171,15 @@ class Selective(Formulation):
     locks: bool = False
 
     def has(self, element: str, degree: int) -> bool:
-        """Where there is a rule."""
+        """Return whether there is a rule for the element."""
         return (element, degree) in self.degrees
 
     def pays_above(self, element: str, degree: int) -> float:
-        """By element, where there is a rule."""
+        """Return `pays` of the element, or infinity if there is no rule for it."""
         return self.pays.get(element, np.inf) if self.has(element, degree) else np.inf
 
     def on(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> Dilatation:
-        """With J at the points of the rule."""
+        """Return the formulation with J at the points of the rule."""
         degree = self.degrees[quadrature.element_kind, quadrature.element_degree]
         return _PartsApart(kinematics, unknown, quadrature, degree)
 
@@ -197,7 +202,8 @@ class _PartsApart(Dilatation):
         jacobian = ufl.det(kinematics.elastic_gradient(unknown))
         self._expression = jit.expression(jacobian, points, "J where the formulation takes it")
         there, here = (shape_functions(kind.name, degree // 2, p)[0] for p in (points, quadrature.points))
-        self._interpolation = here @ np.linalg.pinv(there)  # exactly one and the same where the rule has one point
+        # Exactly one value if the rule has one point.
+        self._interpolation = here @ np.linalg.pinv(there)
         self.jacobian = quadrature.function("jacobian_of_the_formulation", ())
         self.refresh()
 
@@ -229,12 +235,13 @@ class _PartsApart(Dilatation):
 
 NOT_LOCKING = "selective-integration"
 STIFF_BULK = {"hexahedron": 10.0, "tetrahedron": 300.0}
-"""Largest lambda/mu with which "auto" takes J at all points (docs/what_may_go_wrong.md, Cells that turn). Of tubes that
-remodel linear hexahedra lost 0.1 degrees at 8.8, 2 degrees at 20, 21 degrees and 8 % of the radii at 100. Quadratic
-tetrahedra lost 0.6 degrees at 300; with U at one point they have 0.3 % of error of their own."""
+"""Largest lambda/mu for which "auto" takes J at all points (docs/what_may_go_wrong.md, Spurious
+reorientation by pressure noise). In remodeling tubes linear hexahedra had errors of 0.1 degrees at
+8.8, 2 degrees at 20, and 21 degrees and 8 % of the radii at 100. Quadratic tetrahedra had 0.6
+degrees at 300; with U at one point their own error is 0.3 %."""
 
 FORMULATIONS: dict[str, Formulation] = {
-    # docs/what_may_go_wrong.md, Elements that lock, has the measurements behind these numbers
+    # The measurements behind these numbers are in docs/what_may_go_wrong.md, Elements that lock.
     "displacement": AtAllPoints("at all quadrature points; a run whose elements lock warns"),
     NOT_LOCKING: Selective(
         "the volumetric part of the matrix at fewer points; not for tetrahedra of degree 1",
@@ -243,4 +250,4 @@ FORMULATIONS: dict[str, Formulation] = {
         STIFF_BULK,
     ),
 }
-"""Formulations by the name that a scene gives them."""
+"""Formulations by their name in scenes."""

@@ -1,4 +1,4 @@
-"""How forms and expressions are compiled: one place for compiler flags, the cache, and what a compilation says."""
+"""Compilation of forms, expressions and C functions: compiler flags, cache and log messages."""
 
 from __future__ import annotations
 
@@ -43,30 +43,34 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TIMEOUT = 600  # seconds that FFCx waits for another process to compile a form; none was cut off (_compiling)
-COMPILED = "REMODEL_FENICSX_COMPILED"  # names a file that gets a line for each kernel that is really compiled
+TIMEOUT = 600  # seconds that FFCx waits for another process; `_compiling` removes what was cut off
+# Environment variable: file that gets a line per compiled kernel.
+COMPILED = "REMODEL_FENICSX_COMPILED"
 
-# NaN and infinity keep their meaning, which the guards rely on: no -ffast-math. Its name alone, defined for glibc's
-# headers, declares their SIMD logarithm (at most 4 ulp off): the loops over the points of an element become vectors.
-# -g0: Python's own flags have -g, and their table takes up to half of the compiler's time; the same machine code
+# There is no -ffast-math: NaN and infinity keep their meaning, which the guards rely on. Its macro
+# alone makes glibc's headers declare their SIMD logarithm (error at most 4 ulp), which vectorises
+# the loops over the points of an element. -g0: Python's own flags have -g, whose table takes up to
+# half of the compiler's time. The machine code is the same.
 COMPILER_FLAGS = (
     "-O3 -D__FAST_MATH__ -g0 -march=native -fno-math-errno -fno-trapping-math "
     "-fno-signed-zeros -freciprocal-math -fassociative-math -w"
 ).split()
 
-# Of tangents: their time is that of sums over pairs of unknowns, which -O2 makes vectors of as -O3 does if it may count
-# the turns of a loop. They run as fast (21 and 357 ms for the artery of degree 1 and 2), and the compiler takes two
-# thirds of the time.
+# Flags of tangents. Sums over pairs of unknowns take most of their time. With a dynamic cost model
+# -O2 vectorises these sums as -O3 does. Tangents run as fast (21 and 357 ms for the artery of
+# degree 1 and 2), and the compiler takes two thirds of the time.
 TANGENT_FLAGS = ["-O2", "-ftree-vectorize", "-fvect-cost-model=dynamic", *COMPILER_FLAGS[1:]]
 
-# Components of a vector in one kernel: stores this far apart GCC makes from vectors of points, others point by point.
-# Eleven in one kernel took 0.65 ms of 12,288 points, eight and three 0.20.
+# Numbers of components in one kernel. GCC vectorises stores this far apart over the points, all
+# others not. Eleven components in one kernel took 0.65 ms for 12,288 points, eight and three 0.20
+# ms.
 SIMD_COMPONENTS = (16, 8, 4, 3, 2, 1)
 
-# of our own C functions: no sum is taken in another order than it is written in
+# Flags of the package's C functions: all sums keep the order in which they are written.
 LIBRARY_FLAGS = "-std=c17 -O3 -g0 -march=native -fno-math-errno -fno-trapping-math -Wall -Wextra".split()
 
-# By number of arguments: what a form is, the seconds that it takes (the energy here, hexahedra, one core), and flags
+# By number of arguments: name of a form, seconds of its compilation (this energy, hexahedra, one
+# core), and flags.
 _KINDS = {
     0: ("an integral", 1, COMPILER_FLAGS),
     1: ("the residual", 1, COMPILER_FLAGS),
@@ -77,19 +81,20 @@ _compiled: list[str] = []
 
 
 def compiled_kernels() -> tuple[str, ...]:
-    """Names of the kernels that this process has really compiled, not found in the cache."""
+    """Return the names of the kernels that this process has compiled, not those from the cache."""
     return tuple(_compiled)
 
 
 @functools.cache
 def cache_folder() -> Path:
-    """Folder of compiled kernels: per processor type, because -march=native code must not meet another processor."""
-    # Below XDG_CACHE_HOME or ~/.cache; where that cannot be written or is another user's, in a private temporary
-    # folder, with a warning.
+    """Return the folder of compiled kernels, one per processor type because of -march=native."""
+    # The folder is below XDG_CACHE_HOME or ~/.cache. If that is not writable or belongs to another
+    # user, it is a private temporary folder, with a warning.
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        processor = next((line for line in lines if line.startswith(("flags", "Features"))), "")  # the latter of ARM
+        # "Features" on ARM.
+        processor = next((line for line in lines if line.startswith(("flags", "Features"))), "")
     except OSError:  # on macOS
         processor = platform.processor()
     name = f"remodel-{hashlib.sha256((platform.machine() + processor).encode()).hexdigest()[:8]}"
@@ -97,21 +102,22 @@ def cache_folder() -> Path:
     for folder in places:
         with suppress(OSError):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():  # what is there is run
+            # Its files are executed.
+            if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():
                 return folder
         log.warning("cannot write to %s, or it belongs to another user: forms are compiled below %s", *places)
-    raise PermissionError(f"{folder}: belongs to another user; set TMPDIR to a folder of your own")
+    raise PermissionError(f"{folder}: belongs to another user; set TMPDIR to a private folder")
 
 
-# dolfinx and FFCx read the options of the user's own folder, once, and none of the working folder: that may be somebody
-# else's, and its files would choose libraries to load and change numbers
+# dolfinx and FFCx read the user's own options once, and none of the working folder. That folder may
+# belong to somebody else, and its files would choose libraries to load and change numbers.
 with chdir("/"):
     dolfinx.jit.get_options()
     ffcx.options.get_options()
 
 
 def jit_options(flags: list[str] = COMPILER_FLAGS) -> dict[str, object]:
-    """Options for compiled forms and expressions."""
+    """Return the options for compiled forms and expressions."""
     return {"cffi_extra_compile_args": flags, "cache_dir": cache_folder(), "timeout": TIMEOUT}
 
 
@@ -123,17 +129,17 @@ def form(ufl_form: Form, name: str | None = None) -> dolfinx.fem.Form:
     ufl_form
         The form.
     name
-        What is being compiled, for people: "the mass matrix". Default: by the number of its arguments.
+        Name for the log, such as "the mass matrix". Default: by the number of arguments.
 
     Returns
     -------
     dolfinx.fem.Form
-        Compiled, for dolfinx to assemble.
+        Compiled form, for dolfinx to assemble.
 
     Raises
     ------
     Interrupted
-        If a `StopRequest` is waiting for signals and one came while it was compiled.
+        If a signal arrives during the compilation while a `StopRequest` waits for signals.
     RuntimeError
         If the kernel does not compile.
 
@@ -147,7 +153,8 @@ def form(ufl_form: Form, name: str | None = None) -> dolfinx.fem.Form:
     >>> import ufl
     >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
     >>> F = simulation.state.kinematics.deformation_gradient(simulation.unknown)
-    >>> round(dolfinx.fem.assemble_scalar(form(ufl.det(F) * simulation.quadrature.dx, "the volume")), 12)
+    >>> volume = form(ufl.det(F) * simulation.quadrature.dx, "the volume")
+    >>> round(dolfinx.fem.assemble_scalar(volume), 12)
     1.0
     """
     kind, seconds, flags = _KINDS[len(ufl_form.arguments())]
@@ -160,7 +167,7 @@ def expression(
     points: NDArray[np.float64],
     name: str | None = None,
 ) -> PointValues:
-    """Compile a UFL expression for evaluation at reference points of shape (n, 3); otherwise like `form`."""
+    """Compile a UFL expression for evaluation at reference points, (n, 3). See `form`."""
     flat = [ufl_expression[place] if place else ufl_expression for place in np.ndindex(ufl_expression.ufl_shape)]
     parts, sizes, comm = [], [], extract_unique_domain(ufl_expression).ufl_cargo().comm
     while flat:
@@ -174,14 +181,14 @@ def expression(
 
 
 class PointValues:
-    """An expression at reference points of elements, compiled in parts of some components each (`expression`)."""
+    """Compiled expression at reference points of elements, in kernels of some components each."""
 
     def __init__(self, parts: list[dolfinx.fem.Expression], sizes: list[int], points: int):
         self._parts, self._sizes, self._points = parts, sizes, points
         self.components = sum(sizes)
 
     def eval(self, mesh: Mesh, elements: NDArray[np.int32]) -> NDArray[np.float64]:
-        """The components, in their order, at the points of each element: (elements, points, components)."""
+        """Return the components at the points of each element, (elements, points, components)."""
         values = [
             part.eval(mesh, elements).reshape(len(elements), self._points, size)
             for part, size in zip(self._parts, self._sizes, strict=True)
@@ -198,7 +205,7 @@ def library(
     include: Path | None = None,
     libraries: tuple[str, ...] = (),
 ) -> ModuleType:
-    """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does."""
+    """Compile the package's C functions, or take them from the cache. See `form`. Collective."""
     text = "\0".join([declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()])
     name = f"libremodel_{hashlib.sha256(text.encode()).hexdigest()[:40]}"
     failure: BaseException | None = None
@@ -210,9 +217,10 @@ def library(
                 folders = {"include_dirs": [f"{include}"], "library_dirs": [f"{include}/../lib"]} if include else {}
                 names = ["m", *libraries]
                 builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=names, **folders)
-                if not _is_cached(name):  # else by the run that this one has waited for
+                if not _is_cached(name):  # unless the run that this one waited for has compiled it
                     builder.compile(tmpdir=str(cache_folder()))
-                    (cache_folder() / f"{name}.c.cached").touch()  # as FFCx does: last the end mark
+                    # The end mark comes last, as in FFCx.
+                    (cache_folder() / f"{name}.c.cached").touch()
         except BaseException as error:
             failure = error
     if comm.bcast(failure is not None):
@@ -231,7 +239,7 @@ def _loaded(name: str) -> ModuleType:
 
 
 class _OwnLabels(MultiFunction):
-    """Numbers the variables (`ufl.variable`) of an expression from 0."""
+    """Numbering of the variables (`ufl.variable`) of an expression from 0."""
 
     expr = MultiFunction.reuse_if_untouched
 
@@ -240,17 +248,18 @@ class _OwnLabels(MultiFunction):
         self.labels: dict[Label, Label] = {}
 
     def label(self, label: Label) -> Label:
-        """The next number, or the one that this label has got."""
+        """Return the label with its number, the next one for a new label."""
         return self.labels.setdefault(label, Label(len(self.labels)))
 
 
 @contextmanager
 def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[None]:
-    """Within, what is not in the cache is compiled, each kernel by one process, and said."""
-    # FFCx computes a kernel's name and looks for it by `get_cached_module`: nothing else knows without doing that work
-    # twice whether the compiler is going to run. So this stands before that function. What is in the cache passes at
-    # once: no lock, no waiting, and no list of the cache's thousands of files, which FFCx makes at every look. Of
-    # several ranks the first compiles; the others ask when it is done.
+    """Compile kernels that the cache lacks, each by one process, and log them during the block."""
+    # FFCx computes a kernel's name and looks it up with `get_cached_module`. Only there is it
+    # known, without doing that work twice, whether the compiler is going to run. So `watched`
+    # replaces that function. Cached kernels need no lock, no waiting, and no list of the cache's
+    # thousands of files, which FFCx makes at every look-up. Of several ranks the first compiles,
+    # and all other ranks look up when it has finished.
     look_up: Callable[..., Any] = ffcx.codegeneration.jit.get_cached_module
     with ExitStack() as until_compiled:
 
@@ -271,10 +280,11 @@ def _compiler_watched(comm: MPI.Intracomm, what: str, seconds: int) -> Iterator[
 
 @contextmanager
 def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
-    """The only process that compiles this kernel; signals wait until it is there."""
-    # also for the compiler: a terminal and batch systems send them to all processes of a job
+    """Lock a kernel that the block compiles, log the compilation, and hold back signals."""
+    # The compiler must not get signals either: terminals and batch systems send them to all
+    # processes of a job.
     with stopping_at_once(), _alone(kernel), held_back():
-        if _is_cached(kernel):  # by the run that this one has waited for
+        if _is_cached(kernel):  # compiled by the run that this one waited for
             yield
             return
         log.log(NOTICE, "compiling %s, once on this machine: about %d s", what, seconds)
@@ -291,7 +301,7 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
 
 
 def _files(kernel: str) -> list[Path]:
-    """What FFCx leaves of a kernel: the source, which is its lock, the end mark, the library."""
+    """Return FFCx's files of a kernel: source (which is its lock), end mark and library."""
     folder, library = cache_folder(), importlib.machinery.EXTENSION_SUFFIXES[0]
     return [folder / f"{kernel}{ending}" for ending in (".c", ".c.cached", library)]
 
@@ -302,10 +312,11 @@ def _is_cached(kernel: str) -> bool:
 
 @contextmanager
 def _alone(kernel: str) -> Iterator[None]:
-    """Only one process compiles a kernel, so that whatever is unfinished of it was cut off before: it is removed."""
-    # FFCx itself would wait for it: its .c file is the lock, and stays when a process is killed. The lock here is the
-    # operating system's, which ends with its process; the file holds the number of that process. Other kernels have
-    # other locks: several runs, or tests, compile at the same time.
+    """Lock a kernel against other processes, and remove a compilation of it that was cut off."""
+    # FFCx itself would wait for a compilation that was cut off: its .c file is the lock, and stays
+    # if a process is killed. The lock here is the operating system's, which ends with its process.
+    # The file holds the process number. Each kernel has its own lock, so that several runs, or
+    # tests, compile at the same time.
     folder = cache_folder() / "locks"
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / kernel).open("a+") as lock:

@@ -1,8 +1,7 @@
-"""Kinematics: which unknowns describe the deformation, and the deformation gradient that follows from them.
+"""Kinematics: the unknowns of the deformation, and the deformation gradient."""
 
-Everything else asks the object: F is always 3x3, a displacement always has three components. dolfinx is imported when
-it is needed: scenes, which name kinematics, are read without it.
-"""
+# For all other modules F is always 3x3, and a displacement always has three components. dolfinx is
+# imported when it is needed: scenes, which name kinematics, are read without it.
 
 from __future__ import annotations
 
@@ -25,32 +24,36 @@ Array = NDArray[np.float64]
 
 
 class Kinematics(ABC):
-    """What forms, supports and records need to know of the unknowns.
+    """Meaning of the unknowns for forms, supports and results.
 
     Attributes
     ----------
     name
-        Under which scenes know it.
+        Name in scenes.
     meaning
-        What it does, for docs/scene.md.
+        Description for docs/scene.md.
     reduced
-        Whether it needs a mesh of its own, which a shape's `reductions` make, and is exact for some scenes only.
+        Whether it needs another mesh, which a shape's `reductions` make, and is exact for some
+        scenes only.
     three_dimensional
         Whether the unknown is the displacement field of a mesh in three dimensions: F = I + grad u.
     moves_rigidly
-        Whether the body can move as a whole across z, or turn about it: then supports at single nodes hold it.
+        Whether the whole body can move across z or rotate about z. Supports at single nodes then
+        constrain it.
     symmetry_planes
-        Faces of the mesh that are planes of symmetry, and the component of the displacement that is zero there.
+        Faces of the mesh that are planes of symmetry, and the component of the displacement that is
+        zero there.
     homogeneous
-        Whether the strain is the same everywhere: then no mesh changes what is found.
+        Whether the strain is the same everywhere, so that results do not depend on the mesh.
     suits_multigrid
-        Whether algebraic multigrid solves for these unknowns.
+        Whether algebraic multigrid converges for these unknowns.
     closing
-        Of which sector a tube is made (`model.residual_stress.Closing`), where it has residual stress.
+        Closed ring of a tube with residual stress (`model.residual_stress.Closing`); otherwise
+        None.
     grows
         Whether the tissue's volume changes in time (`volume_ratio`).
     cost
-        Of a step for each quadrature point, in that of one of a hexahedron, as measured on the artery.
+        Cost of a step per quadrature point, relative to a hexahedron, measured on the artery.
 
     Examples
     --------
@@ -72,51 +75,51 @@ class Kinematics(ABC):
     grows: ClassVar[bool] = False
 
     def element(self, kind: str) -> str:
-        """Kind of the mesh's elements where the scene asks for elements of the body of this kind."""
+        """Return the kind of the mesh's elements for the kind that the scene sets."""
         return kind
 
     def on(self, mesh: Mesh, body: Any) -> Kinematics:
-        """The kinematics for the mesh of a body (`body.shape.Shape`)."""
+        """Return the kinematics for the mesh of a body (`body.shape.Shape`)."""
         return self
 
     @abstractmethod
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """A dolfinx function of the unknowns, zero, with elements of this degree.
+        """Return a dolfinx function of the unknowns, zero, with elements of this degree.
 
         Parameters
         ----------
         mesh
             dolfinx mesh.
         degree
-            Of the elements, 1 or 2.
+            Degree of the elements, 1 or 2.
         """
 
     @abstractmethod
     def displacement(self, unknown: Function) -> Expr:
-        """UFL 3-vector, linear in the unknown: so it is also the virtual displacement of a test function."""
+        """Return the displacement, a UFL 3-vector, linear in the unknown or test function."""
 
     @abstractmethod
     def deformation_gradient(self, unknown: Function) -> Expr:
-        """F, UFL, always of shape (3, 3)."""
+        """Return F, UFL, always of shape (3, 3)."""
 
     def elastic(self, deformation_gradient: Expr) -> Expr:
-        """F_e, UFL, of an F: F itself where the mesh is free of stress."""
+        """Return F_e, UFL, of an F: F itself if the mesh is stress-free."""
         return deformation_gradient
 
     def elastic_gradient(self, unknown: Function) -> Expr:
-        """F_e, UFL: what the tissue feels."""
+        """Return F_e, UFL: the deformation gradient of the tissue."""
         return self.elastic(self.deformation_gradient(unknown))
 
     def stress_free_weight(self, mesh: Mesh) -> Expr | float:
-        """Volume of the tissue, free of stress, per unit of mesh."""
+        """Return the stress-free volume of the tissue per unit of mesh."""
         return self.weight(mesh)
 
     def weight(self, mesh: Mesh) -> Expr | float:
-        """Volume of the body per unit of mesh, a number or UFL; one where the mesh is the body."""
+        """Return the body's volume per unit of mesh, a number or UFL; 1 if the mesh is the body."""
         return 1
 
     def subspace(self, space: FunctionSpace, component: int) -> Any:
-        """The part of the unknown's space that a support of the displacement in x, y or z (0, 1, 2) holds, or None.
+        """Return the subspace of the unknown that a support in x, y or z constrains, or None.
 
         Parameters
         ----------
@@ -128,28 +131,28 @@ class Kinematics(ABC):
         return space.sub(component)
 
     def uniform_strain(self, component: int) -> Constant | None:
-        """The Constant that is the engineering strain along x, y or z where it is prescribed as a whole, or None."""
+        """Return the Constant of a prescribed uniform strain along x, y or z, or None."""
         return None
 
     def uniform_unknown(self, space: FunctionSpace, component: int) -> Any:
-        """Where the strain along x, y or z is an unknown: its part of the space, and its value at strain 1. Or None."""
+        """Return subspace, and value at strain 1, of an unknown uniform strain, or None."""
         return None
 
     def shear(self) -> Constant | None:
-        """The Constant that is F_xy where it is prescribed as a whole, from now on a part of F; or None."""
+        """Return the Constant of a prescribed uniform F_xy, from now on a part of F, or None."""
         return None
 
     def nodal_space(self, unknown: Function) -> FunctionSpace:
-        """A space, scalar or blocked, with the mesh's nodes in the order of `nodal_displacement`."""
+        """Return a scalar or blocked space with the nodes in the order of `nodal_displacement`."""
         return unknown.function_space
 
     @abstractmethod
     def nodal_displacement(self, unknown: Function) -> Array:
-        """Displacement of the local nodes, (nodes, 3)."""
+        """Return the displacement of the local nodes, (nodes, 3)."""
 
 
 class FullKinematics(Kinematics):
-    """The displacement field in three dimensions: F = I + grad u.
+    """Displacement field in three dimensions: F = I + grad u.
 
     Examples
     --------
@@ -170,30 +173,31 @@ class FullKinematics(Kinematics):
     moves_rigidly = True
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """A vector function, zero."""
+        """Return a vector function, zero."""
         return lagrange(mesh, degree, (3,))
 
     def displacement(self, unknown: Function) -> Expr:
-        """The unknown itself."""
+        """Return the unknown itself."""
         return unknown
 
     def deformation_gradient(self, unknown: Function) -> Expr:
-        """F = I + grad u."""
+        """Return F = I + grad u."""
         return ufl.Identity(3) + ufl.grad(unknown)
 
     def nodal_displacement(self, unknown: Function) -> Array:
-        """The unknown's own memory, (nodes, 3)."""
+        """Return the unknown's own memory, (nodes, 3)."""
         return unknown.x.array.reshape(-1, 3)
 
 
-# ---------------------------------------------------------------- a part of the body that stands for all of it
-# Such a mesh lies in three dimensions where the part lies: a ray on the x axis, a half-plane in y = 0, a quarter, a bar
-# along z beside the axis. There the radial, circumferential and axial directions are x, y and z: axes of cells, normals
-# and places need no other coordinates, and no tensor another basis.
+# ---------------------------------------------------------------- reductions
+# The mesh of a reduction is a part of the body at its position in space: a ray on the x axis, a
+# half-plane in y = 0, a quarter, a bar along z next to the axis. There the radial, circumferential
+# and axial directions are x, y and z. So axes of cells, normals and positions need no other
+# coordinates, and tensors need no other basis.
 
 
 class SectorKinematics(FullKinematics):
-    """The full displacement of a quarter of a tube between its planes of symmetry x = 0 and y = 0."""
+    """Displacement of a quarter of a tube between its planes of symmetry x = 0 and y = 0."""
 
     name = "sector"
     meaning = "the displacement in three dimensions on a quarter of a tube, between planes of symmetry"
@@ -202,38 +206,40 @@ class SectorKinematics(FullKinematics):
     symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
 
     def weight(self, mesh: Mesh) -> Expr | float:
-        """Four of them are the body."""
+        """Return 4, because four quarters are the body."""
         return 4
 
 
 class _Reduced(Kinematics):
-    """What the kinematics with fewer dimensions have in common."""
+    """Kinematics with fewer dimensions."""
 
     element_kind: ClassVar[str]
-    components: ClassVar[tuple[int | None, int | None, int | None]]  # of the unknown, by that of the displacement
+    # Of the unknown, by component of the displacement.
+    components: ClassVar[tuple[int | None, int | None, int | None]]
 
     def __init__(self, mesh: Any = None, body: Any = None):
         self.mesh, self.body = mesh, body
-        if mesh is not None and body is not None:  # Constants, so that another body compiles nothing
+        # Constants, so that another body compiles nothing.
+        if mesh is not None and body is not None:
             self.axial_length = _constant(mesh, body.axial_length)
             self.section_area = _constant(mesh, body.section_area)
 
     def element(self, kind: str) -> str:
-        """Of fewer dimensions."""
+        """Return the kind of elements with fewer dimensions."""
         return self.element_kind
 
     def on(self, mesh: Mesh, body: Any) -> Kinematics:
-        """One of its own: its numbers belong to the mesh."""
+        """Return new kinematics, because their Constants belong to the mesh."""
         return type(self)(mesh, body)
 
     def subspace(self, space: FunctionSpace, component: int) -> Any:
-        """The component's own subspace, if it is a field."""
+        """Return the component's own subspace, or None if the component is no field."""
         own = self.components[component]
         return None if own is None else space.sub(own)
 
 
 class AxisymmetricKinematics(_Reduced):
-    """A body of revolution about z that does not twist: u_r and u_z on the half-plane y = 0, x > 0."""
+    """Body of revolution about z without twist: u_r and u_z on the half-plane y = 0, x > 0."""
 
     name = "axisymmetric"
     meaning = "u_r and u_z over radius and length of a tube that stays a body of revolution"
@@ -242,30 +248,30 @@ class AxisymmetricKinematics(_Reduced):
     cost = 0.3
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """(u_r, u_z), zero."""
+        """Return (u_r, u_z), zero."""
         return lagrange(mesh, degree, (2,))
 
     def displacement(self, unknown: Function) -> Expr:
-        """u_r e_x + u_z e_z."""
+        """Return u_r e_x + u_z e_z."""
         return ufl.as_vector([unknown[0], 0.0, unknown[1]])
 
     def deformation_gradient(self, unknown: Function) -> Expr:
-        """With the circumferential stretch 1 + u_r/r."""
+        """Return F with the circumferential stretch 1 + u_r/r."""
         r, _, _ = ufl.SpatialCoordinate(self.mesh)
         return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + _along(1, unknown[0] / r)
 
     def weight(self, mesh: Mesh) -> Expr | float:
-        """2 pi r."""
+        """Return 2 pi r."""
         return _circumference(mesh)
 
     def nodal_displacement(self, unknown: Function) -> Array:
-        """Of the nodes in the half-plane, (nodes, 3)."""
+        """Return the displacement of the nodes in the half-plane, (nodes, 3)."""
         values = unknown.x.array.reshape(-1, 2)
         return np.stack([values[:, 0], np.zeros(len(values)), values[:, 1]], axis=1)
 
 
 class RadialKinematics(_Reduced):
-    """A tube whose sections stay round, plane and alike: u_r on the x axis, and one axial stretch."""
+    """Tube with round, plane and equal sections: u_r on the x axis, and one axial stretch."""
 
     name = "radial"
     meaning = "u_r over the radius of a tube whose sections stay round, plane and alike"
@@ -279,38 +285,38 @@ class RadialKinematics(_Reduced):
             self.axial_strain = _constant(mesh, 0.0)
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """u_r, zero."""
+        """Return u_r, zero."""
         return lagrange(mesh, degree, ())
 
     def displacement(self, unknown: Function) -> Expr:
-        """u_r e_x: the ray lies in the plane z = 0."""
+        """Return u_r e_x, because the ray lies in the plane z = 0."""
         return ufl.as_vector([unknown, 0.0, 0.0])
 
     def deformation_gradient(self, unknown: Function) -> Expr:
-        """Diagonal."""
+        """Return F, a diagonal tensor."""
         r, _, _ = ufl.SpatialCoordinate(self.mesh)
         stretches = _along(1, unknown / r) + _along(2, self.axial_strain)
         return ufl.Identity(3) + ufl.grad(self.displacement(unknown)) + stretches
 
     def weight(self, mesh: Mesh) -> Expr | float:
-        """2 pi r times the length."""
+        """Return 2 pi r times the length."""
         return self.axial_length * _circumference(mesh)
 
     def uniform_strain(self, component: int) -> Constant | None:
-        """The axial strain."""
+        """Return the axial strain, or None for other components."""
         return self.axial_strain if component == 2 else None
 
     def subspace(self, space: FunctionSpace, component: int) -> Any:
-        """All of it is along x."""
+        """Return the whole space for x, otherwise None."""
         return space if component == 0 else None
 
     def nodal_displacement(self, unknown: Function) -> Array:
-        """Of the nodes on the ray, (nodes, 3)."""
+        """Return the displacement of the nodes on the ray, (nodes, 3)."""
         return unknown.x.array[:, None] * np.array([1.0, 0.0, 0.0])
 
 
 class PointKinematics(_Reduced):
-    """A body with the same strain everywhere: three numbers u, F = I + diag(u)/length; F_xy may be prescribed."""
+    """Body with uniform strain: three numbers u, F = I + diag(u)/length, and F_xy if prescribed."""
 
     name = "point"
     meaning = "three numbers, for a cube, tendon or sheet with the same strain everywhere"
@@ -321,41 +327,41 @@ class PointKinematics(_Reduced):
     _shear: Constant | None = None
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """Three numbers on the one element, zero."""
+        """Return three numbers on the only element, zero."""
         self._nodes = lagrange(mesh, degree, ()).function_space
         element = basix_ufl.element("DG", mesh.topology.cell_name(), 0, shape=(3,))
         return fem.Function(fem.functionspace(mesh, element), name="displacement")
 
     def displacement(self, unknown: Function) -> Expr:
-        """u_i x_i / length."""
+        """Return u_i x_i / length."""
         x = ufl.SpatialCoordinate(self.mesh)
         return ufl.as_vector([unknown[i] * x[i] / self.axial_length for i in range(3)])
 
     def deformation_gradient(self, unknown: Function) -> Expr:
-        """Diagonal and constant."""
+        """Return F, constant and diagonal except for F_xy."""
         stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
         F = sum(stretches, ufl.Identity(3))
         return F if self._shear is None else F + ufl.as_tensor([[0, self._shear, 0], [0, 0, 0], [0, 0, 0]])
 
     def shear(self) -> Constant | None:
-        """F_xy."""
+        """Return the Constant F_xy, from now on a part of F."""
         self._shear = _constant(self.mesh, 0.0) if self._shear is None else self._shear
         return self._shear
 
     def uniform_unknown(self, space: FunctionSpace, component: int) -> Any:
-        """The number along that axis."""
+        """Return the subspace of the number along the axis, and the length."""
         return space.sub(component), self.body.axial_length
 
     def weight(self, mesh: Mesh) -> Expr | float:
-        """Area of the section."""
+        """Return the area of the section."""
         return self.section_area
 
     def nodal_space(self, unknown: Function) -> FunctionSpace:
-        """Continuous on the bar."""
+        """Return the continuous space on the bar."""
         return self._nodes
 
     def nodal_displacement(self, unknown: Function) -> Array:
-        """Of the nodes of the bar, (nodes, 3)."""
+        """Return the displacement of the nodes of the bar, (nodes, 3)."""
         places: Array = self._nodes.tabulate_dof_coordinates()
         # a rank without the element has neither nodes nor numbers
         return places * unknown.x.array.reshape(-1, 3)[:1] / self.body.axial_length if len(places) else places
@@ -365,31 +371,32 @@ KINEMATICS: dict[str, Kinematics] = {
     kind.name: kind()
     for kind in (FullKinematics, SectorKinematics, AxisymmetricKinematics, RadialKinematics, PointKinematics)
 }
-"""Kinematics by the name that a scene gives them."""
+"""Kinematics by their name in scenes."""
 
 
-# ---------------------------------------------------------------- tissue that is free of stress elsewhere
+# ---------------------------------------------------------------- natural configuration
 
 
 class _Around:
-    """Kinematics as those of another field, `field`, but for what the class says."""
+    """Wrapper of other kinematics, `field`, for all that the subclass does not define."""
 
     field: Kinematics
 
     def __getattr__(self, name: str) -> Any:
-        if name == "field":  # while it is copied it has none
+        if name == "field":  # it is missing during a copy
             raise AttributeError(name)
         return getattr(self.field, name)
 
     def elastic_gradient(self, unknown: Function) -> Expr:
-        """F_e, UFL: what the tissue feels."""
+        """Return F_e, UFL: the deformation gradient of the tissue."""
         return self.elastic(self.deformation_gradient(unknown))
 
 
 class NaturalConfiguration(_Around):
-    """A body whose tissue is free of stress in another configuration, from which G leads to the mesh: F_e = F G."""
+    """Body with a stress-free (natural) configuration; G leads from it to the mesh, F_e = F G."""
 
-    # tissue that grows has another G in time; `initial` is that of the start, to whose volume all amounts belong
+    # G of growing tissue changes in time. `initial` is G at the start, to whose volume all amounts
+    # refer.
 
     def __init__(
         self,
@@ -402,15 +409,15 @@ class NaturalConfiguration(_Around):
         self.initial, self.grows = (gradient, False) if initial is None else (initial, True)
 
     def elastic(self, deformation_gradient: Expr) -> Expr:
-        """F G."""
+        """Return F_e = F G."""
         return ufl.dot(deformation_gradient, self.gradient)
 
     def stress_free_weight(self, mesh: Mesh) -> Expr | float:
-        """The mesh's weight over det G of the start."""
+        """Return the mesh's weight over det G at the start."""
         return self.field.weight(mesh) / ufl.det(self.initial)
 
     def volume_ratio(self) -> Expr:
-        """J_g, by what the tissue has grown; UFL."""
+        """Return J_g, the volume ratio of growth since the start, UFL."""
         return ufl.det(self.initial) / ufl.det(self.gradient)
 
 
@@ -418,15 +425,15 @@ class NaturalConfiguration(_Around):
 
 
 class FreeLength(_Around):
-    """A body whose length is one more unknown: the axial force is given, or a pressure acts on caps at its ends."""
+    """Body whose length is an unknown too, for a prescribed axial force or pressure on end caps."""
 
-    suits_multigrid = False  # GMRES with GAMG does not converge where a row is full
+    suits_multigrid = False  # GMRES with GAMG does not converge if a row is full
 
     def __init__(self, kinematics: Kinematics, body: Any):
         self.field, self.body = kinematics, body
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """(u, e), zero."""
+        """Return (u, e), zero. Collective."""
         element = self.field.unknown(mesh, degree).function_space.ufl_element()
         number = basix_ufl.element("DG", mesh.topology.cell_name(), 0)
         space = fem.functionspace(mesh, basix_ufl.mixed_element([element, number]))
@@ -437,30 +444,30 @@ class FreeLength(_Around):
         return unknown
 
     def change_of_length(self, unknown: Function) -> Expr:
-        """e, UFL; linear in the unknown."""
+        """Return the change of length e, UFL, linear in the unknown."""
         return ufl.split(unknown)[1]
 
     def displacement(self, unknown: Function) -> Expr:
-        """u + e z/length e_z."""
+        """Return u + e z/length e_z."""
         u, change = ufl.split(unknown)
         z = ufl.SpatialCoordinate(unknown.ufl_function_space().mesh)[2]
         return self.field.displacement(u) + ufl.as_vector([0.0, 0.0, change * z / self._length])
 
     def deformation_gradient(self, unknown: Function) -> Expr:
-        """The field's, and e/length along z."""
+        """Return the field's F plus e/length along z."""
         u, change = ufl.split(unknown)
         return self.field.deformation_gradient(u) + _along(2, change / self._length)
 
     def subspace(self, space: FunctionSpace, component: int) -> Any:
-        """The field's."""
+        """Return the field's subspace, or None."""
         return self.field.subspace(space.sub(0), component)
 
     def nodal_space(self, unknown: Function) -> FunctionSpace:
-        """The field's."""
+        """Return the field's nodal space."""
         return self.field.nodal_space(self._nodal)
 
     def nodal_displacement(self, unknown: Function) -> Array:
-        """Displacement of the local nodes, (nodes, 3)."""
+        """Return the displacement of the local nodes, (nodes, 3). Collective."""
         self._nodal.x.array[:] = unknown.x.array[self._dofs]
         places: Array = self.nodal_space(unknown).tabulate_dof_coordinates()
         displacement = self.field.nodal_displacement(self._nodal).copy()
@@ -468,7 +475,7 @@ class FreeLength(_Around):
         return displacement
 
     def strain_of_length(self, unknown: Function) -> float:
-        """e/length; the same on every rank."""
+        """Return e/length, the same on every rank. Collective."""
         from mpi4py import MPI
 
         dofs = unknown.function_space.sub(1).dofmap.list.flatten()
@@ -477,8 +484,8 @@ class FreeLength(_Around):
 
 
 def with_one_value(space: FunctionSpace, component: int) -> FunctionSpace:
-    """A mixed space in which a component, constant in each element, has one value for the whole mesh. Collective."""
-    # The first rank with elements owns it, for all others it is a ghost.
+    """Return a mixed space whose DG0 component has one value for the whole mesh. Collective."""
+    # The first rank with elements owns the value; it is a ghost on all other ranks with elements.
     import dolfinx.la
     from mpi4py import MPI
 
@@ -494,7 +501,7 @@ def with_one_value(space: FunctionSpace, component: int) -> FunctionSpace:
     is_owner = comm.rank == owner
     size = int(owned.sum()) + is_owner
     offset = comm.exscan(size) or 0
-    numbers = dolfinx.la.vector(old, 1, dtype=np.float64)  # exact for whole numbers
+    numbers = dolfinx.la.vector(old, 1, dtype=np.float64)  # exact for integers
     numbers.array[: old.size_local][owned] = offset + np.arange(owned.sum())
     numbers.scatter_forward()
     one = comm.bcast(offset + int(owned.sum()), root=owner)
@@ -511,16 +518,16 @@ def with_one_value(space: FunctionSpace, component: int) -> FunctionSpace:
 
 
 def field_degree(space: FunctionSpace) -> int:
-    """Polynomial degree of a kinematics' unknown, of the field where there is a number beside it."""
+    """Return the polynomial degree of the unknown's field, without an additional number."""
     element = space.ufl_element()
     return int((element.sub_elements or [element])[0].degree)
 
 
-# ---------------------------------------------------------------- what they are made of
+# ---------------------------------------------------------------- building blocks
 
 
 def lagrange(mesh: Mesh, degree: int, shape: tuple[int, ...]) -> Function:
-    """A continuous function "displacement", zero, with values of this shape."""
+    """Return a continuous function "displacement", zero, with values of this shape."""
     element = basix_ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=shape)
     return fem.Function(fem.functionspace(mesh, element), name="displacement")
 
@@ -532,10 +539,10 @@ def _constant(mesh: Mesh, value: float) -> Constant:
 
 
 def _along(axis: int, value: Expr) -> Expr:
-    """value e (x) e along an axis, UFL."""
+    """Return value e (x) e along an axis, UFL."""
     return ufl.as_tensor([[value if i == j == axis else 0.0 for j in range(3)] for i in range(3)])
 
 
 def _circumference(mesh: Mesh) -> Expr:
-    """2 pi r on the half-plane y = 0."""
+    """Return 2 pi r on the half-plane y = 0."""
     return 2 * np.pi * ufl.SpatialCoordinate(mesh)[0]

@@ -1,4 +1,4 @@
-"""Quadrature points as a place where state lives: one rule for the unit cells, the forms and the stress."""
+"""Quadrature points: one rule for unit cells, forms and stress."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from dolfinx.mesh import Mesh
     from ufl.core.expr import Expr
 
-# the rule that the element wants; UFL's estimate for this energy is huge
+# Degrees of the elements' rules, because UFL's estimate for this energy is far too high.
 DEGREES = {
     **{(kind, degree): 2 * degree for kind in ("interval", "quadrilateral", "hexahedron") for degree in (1, 2)},
     ("tetrahedron", 1): 1,
@@ -32,17 +32,18 @@ DEGREES = {
 
 
 def shape_functions(kind: str, degree: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of a Lagrange element: values, then slopes along its coordinates, (1 + dimension, points, nodes)."""
+    """Return values, then slopes of a Lagrange element, (1 + dimension, points, nodes)."""
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
     element = basix.create_element(family, basix.CellType[kind], degree, variant, discontinuous=degree == 0)
     return np.asarray(element.tabulate(1, points))[..., 0]
 
 
 class Quadrature:
-    """The quadrature points of a mesh, and functions and reductions over them.
+    """Quadrature points of a mesh, with functions and reductions over them.
 
-    Arrays over the points have shape (elements, points, ...): all elements this rank knows, owned first, then ghosts.
-    Nothing at a point depends on another point, so updates need no communication.
+    Arrays over the points have shape (elements, points, ...): all elements this rank knows, owned
+    first, then ghosts. Nothing at a point depends on another point, so updates need no
+    communication.
 
     Parameters
     ----------
@@ -64,10 +65,11 @@ class Quadrature:
     extent
         Mean length of an element in every direction of the mesh.
     smallest_lengths
-        Least extent of the elements at the points, per unit of the reference element, (elements, points).
+        Smallest extent of the elements at the points, per unit of the reference element,
+        (elements, points).
     largest_areas, smallest_areas
-        Volume over the least and over the largest extent, (elements,): a stress times these is about the largest and
-        the smallest force that it means for a node of the element.
+        Volume over the smallest and over the largest extent, (elements,). A stress times these
+        areas is about the largest and the smallest force that it causes at a node of the element.
 
     Examples
     --------
@@ -109,7 +111,7 @@ class Quadrature:
         self.smallest_areas: NDArray[np.float64] = (self.volumes / lengths[..., 0]).sum(axis=1)
 
     def _geometry(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Places of the points, and singular values of the Jacobian there, descending: (elements, points, ...)."""
+        """Return points and the Jacobian's singular values, descending, (elements, points, ...)."""
         element = self.mesh.ufl_domain().ufl_coordinate_element().basix_element
         functions = element.tabulate(1, self.points)[..., 0]
         nodes = self.mesh.geometry.x[geometry_dofmap(self.mesh)[self.elements]]
@@ -123,22 +125,23 @@ class Quadrature:
         return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": self.degree})
 
     def function(self, name: str, value_shape: tuple[int, ...]) -> Function:
-        """A dolfinx function with values of `value_shape` at the points.
+        """Return a dolfinx function with values of `value_shape` at the points.
 
         Parameters
         ----------
         name
-            Of the dolfinx function.
+            Name of the dolfinx function.
         value_shape
-            Of its value at a point: (), (3,) or (3, 3).
+            Shape of its value at a point, such as (), (3,) or (3, 3).
         """
-        if value_shape not in self._spaces:  # one for each shape: its dofmap takes time and memory
+        # One space for each shape: its dofmap takes time and memory.
+        if value_shape not in self._spaces:
             element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
             self._spaces[value_shape] = dolfinx.fem.functionspace(self.mesh, element)
         return dolfinx.fem.Function(self._spaces[value_shape], name=name)
 
     def values(self, function: Function, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """The function's own memory as an array ``(elements, points, *value_shape)``."""
+        """Return the function's own memory as an array ``(elements, points, *value_shape)``."""
         return function.x.array.reshape(*self.shape, *value_shape)
 
     def evaluate(
@@ -146,31 +149,34 @@ class Quadrature:
         expression: jit.PointValues,
         value_shape: tuple[int, ...],
     ) -> NDArray[np.float64]:
-        """Values ``(elements, points, *value_shape)`` of a compiled expression at the points."""
+        """Evaluate a compiled expression at the points, ``(elements, points, *value_shape)``."""
         return expression.eval(self.mesh, self.elements).reshape(*self.shape, *value_shape)
 
     def owned(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The rows of the elements that this rank owns, (owned elements, ...)."""
+        """Return the rows of the elements that this rank owns, (owned elements, ...)."""
         return values[: self.number_of_owned_elements]
 
     def integral(self, values: NDArray[np.float64]) -> float:
-        """Integral over the body of values (elements or owned elements, points), over all ranks."""
+        """Integrate values (elements or owned elements, points) over the body. Collective."""
         local = float((self.owned(values) * self.owned(self.volumes)).sum())
         return float(over_ranks(self.mesh.comm, local, MPI.SUM))
 
     def mean(self, values: NDArray[np.float64]) -> float:
-        """Volume mean of values (elements, points)."""
+        """Return the volume mean of values (elements, points). Collective."""
         return self.integral(values) / self.volume
 
     def mean_of_known(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
-        """Volume mean over the points whose value is known, not NaN; NaN where there is none.
+        """Return the volume mean over the points whose value is not NaN. Collective.
+
+        The mean is NaN if all values are NaN.
 
         Parameters
         ----------
         values
-            (elements, points).
+            Values, (elements, points).
         weights
-            Of the points beside their volume, of the same shape or one for each element; default: one.
+            Weights of the points in addition to their volume, (elements, points) or (elements,).
+            Default: 1.
         """
         known = ~np.isnan(values)
         counted = known if weights is None else known * (weights if weights.ndim == 2 else weights[:, None])
@@ -179,40 +185,41 @@ class Quadrature:
 
     @cached_property
     def gradients(self) -> NDArray[np.float64]:
-        """G with ``|grad u| <= G max |u_node|`` in each element, (elements,): the slopes of its functions."""
+        """G with ``|grad u| <= G max |u_node|`` in each element, (elements,)."""
         slopes = shape_functions(self.element_kind, self.element_degree, self.points)[1:]
         sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
         return np.max(sums / self.smallest_lengths, axis=1, initial=0.0)
 
     @cached_property
     def largest_gradient(self) -> float:
-        """The largest G over all ranks. Collective, the first time."""
+        """Largest of `gradients` over all ranks. Collective on first access."""
         return self.maximum(self.gradients)
 
     @cached_property
     def volume(self) -> float:
-        """Of the body, over all ranks. Collective, the first time."""
+        """Volume of the body, over all ranks. Collective on first access."""
         return self.integral(np.ones(self.shape))
 
     def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Volume mean over each element: (elements, points, ...) to (elements, ...)."""
+        """Return the volume mean over each element, (elements, points, ...) to (elements, ...)."""
         return np.einsum("ep,ep...->e...", self._shares, values)
 
     def element_mean_of_known(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Volume mean over the points of each element whose value is not NaN, (elements, points) to (elements,)."""
+        """Return each element's volume mean without NaN, (elements, points) to (elements,)."""
         known = ~np.isnan(values)
         sums, shares = self.element_mean(np.where(known, values, 0.0)), self.element_mean(known.astype(np.float64))
         return np.divide(sums, shares, out=np.full_like(sums, np.nan), where=shares > 0)
 
     @cached_property
     def _shares(self) -> NDArray[np.float64]:
-        """Of the points in the volume of their element, (elements, points)."""
+        """Volume fraction of each quadrature point in its element, (elements, points)."""
         return self.volumes / self.volumes.sum(axis=1, keepdims=True)
 
     def beyond(self, degree: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What of values (owned elements, points, n) no polynomial of a degree has in an element, by least squares.
+        """Return values (owned elements, points, n) minus a least-squares polynomial.
 
-        Elements of a single point have nothing inside: theirs is the distance from the mean over their neighbours.
+        Each element has its own polynomial of this degree. In elements of a single point it is
+        the mean over adjacent elements, which is collective.
         """
         if self.shape[1] == 1:
             return values - self._means_at_nodes(values).mean(axis=1, keepdims=True)
@@ -221,20 +228,22 @@ class Quadrature:
         return self._complements[degree] @ values
 
     def _fitted(self, degree: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """From values at an element's points to those of their least-squares polynomial elsewhere in the element."""
+        """Return the matrix from values to their least-squares polynomial at other points."""
         polynomials, elsewhere = (shape_functions(self.element_kind, degree, x)[0] for x in (self.points, points))
         roots = np.sqrt(self.weights)[:, None]
         return np.asarray(elsewhere @ (np.linalg.pinv(roots * polynomials) * roots.T))
 
     def superconvergent(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values (elements, points, n) where gradients have an order more (Barlow 1976), (elements, fewer points, n).
+        """Return values (elements, points, n) at superconvergent points.
 
-        In a hexahedron these are the points of Gauss's rule of one order less: its middle, or 2 x 2 x 2.
+        The result has shape (elements, fewer points, n). At these points gradients converge one
+        order faster (Barlow 1976). In a hexahedron these are the points of Gauss's rule of one
+        order less: the centre, or 2 x 2 x 2.
         """
         return self._fitted(self.element_degree - 1, self._superconvergent_points) @ values
 
     def superconvergent_from_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """At the same points, of values (elements, nodes) at the geometry's nodes: (elements, fewer points)."""
+        """Interpolate nodal values (elements, nodes) to the superconvergent points."""
         functions = shape_functions(self.element_kind, self.mesh.geometry.cmap.degree, self._superconvergent_points)
         return np.asarray(values @ functions[0].T)
 
@@ -244,21 +253,22 @@ class Quadrature:
         return np.asarray(basix.make_quadrature(kind, max(1, 2 * self.element_degree - 2))[0])
 
     def jumps(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far values (owned elements, points, n) lie from their neighbours': a mean square, (owned elements,).
+        """Return mean-square jumps of values (owned elements, points, n) to adjacent elements.
 
-        They are continued to the element's nodes, and compared with the mean over all elements there.
+        Values are extrapolated to the element's nodes, and compared with the mean over all elements
+        there. The result has shape (owned elements,). Collective.
         """
         continued = self._continuation @ values
         return np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
 
     @cached_property
     def _continuation(self) -> NDArray[np.float64]:
-        """From values at an element's points to those at its nodes, (nodes, points)."""
+        """Matrix from values at an element's points to those at its nodes, (nodes, points)."""
         functions = shape_functions(self.element_kind, self.mesh.geometry.cmap.degree, self.points)
         return np.asarray(np.linalg.pinv(functions[0]))
 
     def _means_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of values at an element's nodes, or the same at all, (owned elements, nodes or 1, n): means by volume."""
+        """Return nodal means by volume of values (owned elements, nodes or 1, n). Collective."""
         nodes, number = geometry_dofmap(self.mesh)[: self.number_of_owned_elements], values.shape[-1] + 1
         sums = dolfinx.la.vector(self.mesh.geometry.index_map(), number, dtype=np.float64)
         volumes = np.ones((*nodes.shape, 1)) * self.owned(self.volumes).sum(axis=1)[:, None, None]
@@ -269,12 +279,12 @@ class Quadrature:
         return np.asarray(at_nodes[nodes, :-1] / at_nodes[nodes, -1:])
 
     def maximum(self, values: NDArray[np.float64]) -> float:
-        """Largest of values (elements, ...) over all ranks."""
+        """Return the largest of values (elements, ...) over all ranks. Collective."""
         local = float(np.max(self.owned(values), initial=-np.inf))
         return float(over_ranks(self.mesh.comm, local, MPI.MAX))
 
     def place_of_largest(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
-        """Reference place of the largest of values (elements, points), over all ranks."""
+        """Return the reference position of the largest of values (elements, points). Collective."""
         owned = self.owned(values)
         local: tuple[float, tuple[float, float, float]] = (-np.inf, (np.nan, np.nan, np.nan))
         if owned.size:
@@ -283,13 +293,13 @@ class Quadrature:
         return max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
 
     def shown_place_of_largest(self, values: NDArray[np.float64]) -> str:
-        """Return this place in words."""
+        """Return the reference position of the largest value as text. Collective."""
         return f"({', '.join(f'{c:.4g}' for c in self.place_of_largest(values))})"
 
     def minimum(self, values: NDArray[np.float64]) -> float:
-        """Smallest of values (elements, ...) over all ranks."""
+        """Return the smallest of values (elements, ...) over all ranks. Collective."""
         return -self.maximum(-values)
 
     def norm(self, values: NDArray[np.float64]) -> float:
-        """Root of the sum of the squares of values (elements, ...), over all ranks."""
+        """Return the root of the sum of squares of values (elements, ...). Collective."""
         return float(np.sqrt(self.mesh.comm.allreduce(float(np.sum(self.owned(values) ** 2)), MPI.SUM)))

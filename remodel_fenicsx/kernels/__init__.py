@@ -1,13 +1,14 @@
-"""What is computed at every quadrature point, in C: compiled like the forms, held against Python by tests.
+"""Kernels in C for computations at every quadrature point.
 
-`Library` compiles the C files and calls them; there is a method for each function. Most stand for
-a function of the package: it is the reference, decides where C leaves a point open, and runs in its place with
-``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger. Those of `factor`, which calls CHOLMOD, stand for
-none: without them factors are PETSc's, in double precision.
+`Library` compiles the C files like the forms, and calls their functions. Most functions in C
+replace a function in Python. That function is the reference of the tests, and computes the points
+that C leaves open. For a debugger it runs in place of C, with ``REMODEL_FENICSX_KERNELS=numpy`` in
+the environment. The functions of `factor`, which call CHOLMOD, replace none: without them
+factorisations are PETSc's, in double precision.
 
-=================== =====================================================================================
-in C                stands for
-=================== =====================================================================================
+=================== ============================================================
+in C                replaces
+=================== ============================================================
 principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
 without_noise       model.spectral.without_noise
@@ -20,7 +21,7 @@ factor_new          kernels.SingleFactor
 factor_renew        kernels.SingleFactor.renew
 factor_solve        kernels.SingleFactor.solve
 factor_free         kernels.SingleFactor.close
-=================== =====================================================================================
+=================== ============================================================
 """
 
 from __future__ import annotations
@@ -54,17 +55,19 @@ Flags = NDArray[np.bool_]
 
 FOLDER = Path(__file__).parent
 NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
-NOT_FINITE = 2  # mark of a point with NaN or infinity
+NOT_FINITE = 2  # flag of a point with NaN or infinity
 HEADER = "suitesparse/cholmod.h"
-C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}  # of numpy's characters; all others are double
+# By numpy's type character; double for all others.
+C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}
 NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
-"""What tensor.c takes from Python: the numbers that tune."""
-FIRST = 5  # CHOLMOD's version that has single precision
+"""Constants that tensor.c takes from Python."""
+FIRST = 5  # first version of CHOLMOD with single precision
 
 
 def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
-    """A C file with the files that it includes in it, after a #define for each number."""
-    # One text with everything that decides the machine code: by it the library is found in the cache.
+    """Return the text of a C file with its includes, after a #define for each number."""
+    # The text holds everything that decides the machine code, because it names the library in the
+    # cache.
 
     def included(found: re.Match[str]) -> str:
         following = found.string.count("\n", 0, found.end()) + 1
@@ -75,12 +78,12 @@ def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
 
 
 def declarations(text: str) -> list[str]:
-    """Of the functions in C that are not static, and of what it numbers."""
+    """Return the declarations of a C text's non-static functions and enumerations."""
     return re.findall(r"^((?!static)\w+ \w+\([^)]*\)(?=\n\{)|enum \{[^}]*\}(?=;))", text, flags=re.MULTILINE)
 
 
 def in_numpy() -> bool:
-    """Whether Python's functions run in place of C's; says so, once."""
+    """Return whether numpy's functions replace those in C, and log that once."""
     if environment.kernels() == "numpy":
         _say_so()
         return True
@@ -90,11 +93,11 @@ def in_numpy() -> bool:
 @functools.cache
 def _say_so() -> None:
     if MPI.COMM_WORLD.rank == 0:
-        log.log(NOTICE, "%s=numpy: numpy computes what C does otherwise, for a debugger; slower", environment.KERNELS)
+        log.log(NOTICE, "%s=numpy: using the numpy kernels (slower; for debugging)", environment.KERNELS)
 
 
 class Library:
-    """The functions of a C file, which can be called with arrays."""
+    """Functions of a C file that can be called with arrays."""
 
     def __init__(
         self,
@@ -112,7 +115,7 @@ class Library:
         self._functions, self._ffi = module.lib, module.ffi
 
     def __call__(self, name: str, *arguments: Any) -> Any:
-        """What a function returns. Arrays that it writes to are contiguous; None is a null pointer."""
+        """Call a function. Arrays that it writes to must be contiguous; None is a null pointer."""
         passed = [self._ffi.NULL if value is None else value for value in arguments]
         for number, value in enumerate(arguments):
             if isinstance(value, np.ndarray):
@@ -123,7 +126,7 @@ class Library:
 
 
 def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
-    """The tissue with its repulsion in C, where it is `log`."""
+    """Return the tissue with its repulsion in C if that is `log`. Collective."""
     if tissue.chain is None or tissue.repulsion.sum is not energy.log_sum or in_numpy():
         return tissue
     kernels = TensorKernels(comm)
@@ -132,11 +135,11 @@ def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
     )
 
 
-# ---------------------------------------------------------------- what a pass and its limits compute at every point
+# ---------------------------------------------------------------- pointwise functions
 
 
 class PointKernels:
-    """Functions on arrays of n points, in numpy: what they are in C stands for these."""
+    """Functions on arrays of n points in numpy, the reference for those in C."""
 
     principal: spectral.Pairing = staticmethod(spectral.principal)
     positive_direction: Callable[..., tuple[Array, Flags]] = staticmethod(spectral.positive_direction)
@@ -144,12 +147,12 @@ class PointKernels:
     structure_tensor: Callable[..., Array] = staticmethod(cells.structure_tensor)
 
     def squared_length(self, F: Array, cell: UnitCell) -> Array:
-        """`energy.squared_end_to_end_length` of one whole cell."""
+        """Return `energy.squared_end_to_end_length` of one whole cell, (n,)."""
         return np.asarray(energy.squared_end_to_end_length(F, [cell]))
 
 
 class CompiledPointKernels(PointKernels):
-    """The same in C. `PointKernels` says what goes in and comes out, and does what C leaves open."""
+    """Functions of `PointKernels` in C; numpy computes the points that C leaves open."""
 
     def __init__(self, comm: MPI.Intracomm):
         self._call = Library(comm, "spectral.c", "the pass")
@@ -157,13 +160,14 @@ class CompiledPointKernels(PointKernels):
     def principal(
         self, tensors: ArrayLike, previous: ArrayLike, tolerance: float = spectral.AGREEMENT, threshold: ArrayLike = 0.0
     ) -> tuple[Array, Array]:
-        """By Jacobi's method where the tensor decides."""
+        """Compute by Jacobi's method; numpy computes the points that this leaves open."""
         tensors, previous = np.asarray(tensors), np.asarray(previous)
         n, limit = len(tensors), np.broadcast_to(threshold, len(tensors))
         values, axes, left_open = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n, np.uint8)
         given = tensors, previous, tolerance, limit, spectral.DECISIVE
         if self._call("principal", n, *given, values, axes, left_open):
-            if np.any(left_open == NOT_FINITE):  # for the words that name the first one
+            # Numpy raises an error that names the first such point.
+            if np.any(left_open == NOT_FINITE):
                 return super().principal(tensors, previous, tolerance, threshold)
             at = np.flatnonzero(left_open)
             values[at], axes[at] = super().principal(tensors[at], previous[at], tolerance, limit[at])
@@ -174,7 +178,7 @@ class CompiledPointKernels(PointKernels):
         n, limit = len(values), np.broadcast_to(threshold, len(values))
         direction, active = np.empty((n, 3)), np.empty(n, np.bool_)
         if self._call("positive_direction", n, values, limit, spectral.ROUNDING, direction, active):
-            return super().positive_direction(values, threshold)  # for the words that name the first one
+            return super().positive_direction(values, threshold)  # numpy raises the error
         return direction, active
 
     def without_noise(self, tensors: Array, axes: Array, noise: ArrayLike) -> Array:
@@ -194,7 +198,7 @@ class CompiledPointKernels(PointKernels):
 
 
 def point_kernels(comm: MPI.Intracomm) -> PointKernels:
-    """In C, or in numpy where that is asked for. Collective."""
+    """Return the point functions in C, or in numpy on request. Collective."""
     return PointKernels() if in_numpy() else CompiledPointKernels(comm)
 
 
@@ -202,13 +206,13 @@ def point_kernels(comm: MPI.Intracomm) -> PointKernels:
 
 
 class TensorKernels:
-    """The law `tensor` and the repulsion `log` in C (tensor.c), on arrays of n points."""
+    """Law `tensor` and repulsion `log` in C (tensor.c), on arrays of n points."""
 
     def __init__(self, comm: MPI.Intracomm):
         self.call = Library(comm, "tensor.c", "the law for the structure tensor", numbers=NUMBERS)
 
     def target(self, drive: Drive) -> tensor_law.Target:
-        """`laws.tensor_target`."""
+        """Compute the target of `laws.tensor_target`."""
         F, given = drive.deformation_gradient, drive.tensor
         n, turned_back = len(F), not drive.driver.material
         if turned_back and drive.frame.tensor is not rotated_back:
@@ -218,7 +222,7 @@ class TensorKernels:
         return tensor_law.Target(direction, switch)
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
-        """`energy.log_sum`."""
+        """Compute the sum of `energy.log_sum`."""
         if np.iscomplexobj(F):
             return energy.log_sum(F, cells, end_to_end_length)
         result = np.empty(F.shape[:-2])
@@ -226,54 +230,61 @@ class TensorKernels:
         return result
 
     def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
-        """`energy.log_derivatives`."""
+        """Compute the derivatives of `energy.log_derivatives`."""
         first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
         self.call("log_derivatives", len(C), C, A, first, matrices)
         return first, matrices
 
 
-# ---------------------------------------------------------------- factors in single precision, where CHOLMOD 5 is
+# ---------------------------------------------------------------- factorisations with CHOLMOD 5
 
 
 @functools.cache
 def include_folder() -> Path | None:
-    """Where CHOLMOD's header is; None, and a line in the log, where no version with single precision is."""
+    """Return the folder of CHOLMOD's header; log and return None if no version is new enough."""
     for folder in (Path(sys.prefix) / "include", Path("/usr/include"), Path("/usr/local/include")):
         path = folder / HEADER
         if path.is_file():
             version = re.search(r"define CHOLMOD_MAIN_VERSION\s+(\d+)", path.read_text(encoding="utf-8"))
             if version and int(version[1]) >= FIRST:
                 return folder
-    log.info("kept factors have double precision, for twice the time: no header of CHOLMOD %d or later is here", FIRST)
+    log.info(
+        "CHOLMOD %d headers not found; lagged factorisations use double precision " "and take about twice the time",
+        FIRST,
+    )
     return None
 
 
 def is_available() -> bool:
-    """Whether such factors can be made here."""
+    """Return whether factorisations in single precision are available."""
     return include_folder() is not None and not in_numpy()
 
 
 class SingleFactor:
-    """A factor L L^T of sparse symmetric matrices of one pattern, with seven digits."""
+    """Cholesky factorisation L L^T of sparse matrices of one pattern, with seven digits."""
 
     def __init__(self, starts: NDArray[np.int32], columns: NDArray[np.int32]):
         self._call = Library(
-            MPI.COMM_SELF, "factor.c", "factors in single precision", include=include_folder(), libraries=("cholmod",)
+            MPI.COMM_SELF,
+            "factor.c",
+            "factorisations in single precision",
+            include=include_folder(),
+            libraries=("cholmod",),
         )
         self._handle: Any = self._call("factor_new", len(starts) - 1, starts, columns)
         if not self._handle:
-            raise MemoryError("no memory for a factor in single precision")
+            raise MemoryError("no memory for a factorisation in single precision")
 
     def renew(self, values: Array) -> bool:
-        """Factorise the matrix with these values (entries,); whether it is positive definite to single precision."""
+        """Factorise a matrix of values (entries,). Return whether it is positive definite."""
         return bool(self._call("factor_renew", self._handle, values))
 
     def solve(self, right: Array, answer: Array) -> bool:
-        """Write the answer (n,) to a right-hand side (n,); whether both are finite."""
+        """Write the solution (n,) of a right-hand side (n,). Return whether both are finite."""
         return bool(self._call("factor_solve", self._handle, right, answer))
 
     def close(self) -> None:
-        """Free its memory."""
+        """Free the memory of the factorisation."""
         if self._handle:
             self._call("factor_free", self._handle)
         self._handle = None

@@ -1,1 +1,1 @@
-"""One equilibrium at given loads: residual and tangent, Newton's method, its linear systems, its load increments."""
+"""Equilibrium at fixed loads: residual, tangent, Newton's method, linear systems, increments."""

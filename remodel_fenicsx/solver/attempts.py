@@ -1,4 +1,4 @@
-"""What is tried where a solve fails: in which order, and what the log says of it."""
+"""Attempts to solve a step, in their order, with log messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ F = TypeVar("F", bound=Exception)
 
 
 class Attempt(NamedTuple):
-    """One way to the solution of a step: what it is, who makes it, and what is logged where it fails."""
+    """Attempt to solve a step: description, class or function, and log message of its failure."""
 
     what: str
     where: str
@@ -20,27 +20,27 @@ class Attempt(NamedTuple):
 
 
 FROM_EXPECTED = Attempt(
-    "from the displacement that the last steps let expect",
+    "from the displacement predicted by the last steps",
     "Staggered",
-    "not solved from the predicted displacement",
+    "Newton failed from the predicted displacement",
 )
-FROM_LAST = Attempt("from the last displacement", "Staggered", "solving in parts")
+FROM_LAST = Attempt("from the last displacement", "Staggered", "solving in substeps")
 MADE_ANEW = Attempt(
-    "in each solve: once more, with new factors or levels in each iteration",
+    "in each solve: again, with a new factorisation or new multigrid levels in every iteration",
     "EveryTangent.second_try",
-    "the step is solved once more",
+    "Newton failed; retrying",
 )
-IN_PARTS = Attempt("in parts: first what has remodeled, then the loads, a failed part halved", "Change")
-STEP_REFUSED = Attempt("the step is refused, with its kind and advice", "diagnosed")
+IN_PARTS = Attempt("in substeps: first the remodeled cells, then the loads; a failed substep is halved", "Change")
+STEP_REFUSED = Attempt("the step fails, with its cause and advice", "diagnosed")
 SHORTER_STEP = Attempt(
-    "with a tolerance: a step of a quarter, up to three times", "StepControl", "a shorter step is tried"
+    "with time.tolerance: a quarter of the step size, up to three times", "StepControl", "retrying with a smaller step"
 )
 ATTEMPTS = (FROM_EXPECTED, FROM_LAST, MADE_ANEW, IN_PARTS, STEP_REFUSED, SHORTER_STEP)
-"""In their order; docs/architecture.md has the table."""
+"""Attempts in their order; docs/architecture.md has the table."""
 
 
 def attempted(solve: Callable[[], T], *failures: type[F]) -> T | F:
-    """Return what a solve gives, or its failure."""
+    """Return the result of a solve, or its failure."""
     try:
         return solve()
     except failures as failed:
@@ -48,5 +48,5 @@ def attempted(solve: Callable[[], T], *failures: type[F]) -> T | F:
 
 
 def say(attempt: Attempt, reason: object, how: str = "") -> None:
-    """Log that an attempt has failed, and how the next one goes."""
-    log.info("%s%s: %s", attempt.fails, f", {how}" if how else "", reason)
+    """Log that an attempt has failed, and how the next one proceeds."""
+    log.info("%s%s: %s", attempt.fails, f" {how}" if how else "", reason)

@@ -1,4 +1,4 @@
-"""A change in as many parts as Newton's method needs: half the part after a failure, twice after a success."""
+"""Continuation: a change in substeps, halved after a failure and doubled after a success."""
 
 from __future__ import annotations
 
@@ -29,56 +29,65 @@ from remodel_fenicsx.state import Numbers, State
 log = logging.getLogger(__name__)
 
 FAR = 2.0
-"""`Solution.reach` from which on a way is looked at again in parts. The paper's bodies have at most 1.25, a tube
-without chains that comes near its largest pressure in one step 2.9, a jump over a limit point 3.9 and more."""
-# Iterations, or tangents of a whole step: chains near their contour length make ends nearer too, but within 11
+"""`Solution.reach` above which a step is repeated in substeps. The paper's bodies have at most
+1.25. A tube without chains that approaches its largest pressure in one step has 2.9, a jump over a
+limit point 3.9 and more."""
+# A reach below CLOSE after more than MANY iterations (or tangents of a whole step) may be a jump.
+# Chains near their contour length have a small reach too, but need at most 11 iterations.
 CLOSE, MANY = 0.5, 12
-SAME_SOLUTION = (
-    1e-4  # of the way to them: by what two solutions may differ that are one; of other branches it is a good part
-)
-FASTER = 4.0  # than the part before: a way that comes to a limit point is up to 3 times as fast in its last equal part
-WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # refusals for which no smaller step helps
-PROOF = 8  # halvings without which a jump is not told from a step that is only too large
-MOST_JUMPS = 3  # that are looked into in a run, each by some 25 solves: a body that falls apart jumps in every step
-KEPT_RESERVE = 0.2  # share of 1 - r/L that a part of a remodeling increment leaves at every point
+# Difference of equal solutions, relative to their distance from the start. Other branches differ by
+# much of it.
+SAME_SOLUTION = 1e-4
+# Ratio of the displacement to that of the substep before that may be a jump. Towards a limit point
+# the last of equal substeps moves up to 3 times as far.
+FASTER = 4.0
+WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # causes of failure for which no smaller step helps
+PROOF = 8  # number of halvings needed to distinguish a jump from a step that is too large
+# Number of jumps in a run that are checked, each by about 25 solves. A body that collapses jumps in
+# every step.
+MOST_JUMPS = 3
+KEPT_RESERVE = 0.2  # fraction of 1 - r/L that a remodeling substep leaves at every point
 
 
 @dataclass
 class Work(Counted):
-    """Solver work of one step, failed attempts included."""
+    """Solver work of one step, including failed attempts."""
 
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
-    extension: Extension | None = None  # of the last solution, where it was looked at with the cells of the row
+    # Of the last solution, if evaluated with the cells of the row.
+    extension: Extension | None = None
     last: Solution | None = None
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
-        """Count a solve, or the work of a step that was taken back."""
+        """Add the work of a solve, or of a rejected step."""
         self.count(done)
         if isinstance(done, Solution):
             self.residual, self.extension, self.last = done.residual, done.extension, done
 
 
 class StepFailure(RemodelError, RuntimeError):
-    """A step cannot be solved, or is not wanted; the state is that of the last accepted step.
+    """Failure of a step, or an unstable equilibrium that stops the run.
+
+    The state is that of the last accepted step.
 
     Parameters
     ----------
     time
-        Of the step.
+        Time of the step.
     text
-        One line: where it stops, and why.
+        One line: position in the step, and reason.
     refusal
-        What kind of refusal it is, and what helps.
+        Cause of the failure, and advice.
 
     Attributes
     ----------
     time
-        Of the step.
+        Time of the step.
     refusal
-        Why, and what helps.
+        Cause of the failure, and advice.
     kept
-        What of the run is on the disk.
+        One clause on the saved part of the run.
 
     Examples
     --------
@@ -104,7 +113,7 @@ class StepFailure(RemodelError, RuntimeError):
         self.time, self.refusal, self.kept = time, refusal, "every finished step is kept"
 
     def in_words(self) -> str:
-        """Where it stops and why, what helps, and what is kept.
+        """Return position, reason, advice, and the saved part of the run.
 
         Returns
         -------
@@ -115,46 +124,48 @@ class StepFailure(RemodelError, RuntimeError):
 
 
 def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) -> str:
-    """Where a change of the problem has stopped, and why."""
+    """Return the message of a change that stops at a fraction of the step, with its cause."""
     point = ", ".join(f"{c:.3f}" for c in cause.extension.worst_point)
     return (
-        f"no equilibrium at time {time:g}: {stage} stops at {100 * fraction:.3g} % of the step ({cause.reason}; "
-        f"largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
+        f"no equilibrium at time {time:g}: {stage} failed at {100 * fraction:.3g} % of the step "
+        f"({cause.reason}; largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
         f"smallest J = {cause.extension.min_jacobian:.4g})"
     )
 
 
 @dataclass
 class Change:
-    """A change of the problem that can be applied in parts."""
+    """Change of cells or loads that can be applied in substeps."""
 
     time: float
     stage: str
     set_fraction: Callable[[float], None]
     state: State
-    solves: Callable[[], GuardedNewton]  # asked for when parts are solved: few steps have any
+    solves: Callable[[], GuardedNewton]  # called for substeps only, which few steps need
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
     roughly: bool = False
-    refusal: Refusal | None = field(default=None, init=False)  # what there was no way past but by a jump
-    _direction: NDArray[np.float64] | None = field(default=None, init=False)  # of the unknowns over the last part
+    refusal: Refusal | None = field(default=None, init=False)  # cause of a jump in the change
+    # Rate of the unknowns in the last substep.
+    _direction: NDArray[np.float64] | None = field(default=None, init=False)
 
     @functools.cached_property
     def newton(self) -> GuardedNewton:
-        """Who solves the parts."""
+        """Newton's method of the substeps."""
         return self.solves()
 
     def advance(self, work: Work, failure: SolveFailure | None = None, part: float = 1.0) -> None:
-        """Go from 0 to 1."""
-        # A part that ends far from where its tangent points to is halved like one that fails. If it is the smallest,
-        # the way ends here: this is said, and the change goes on beyond the jump.
+        """Apply the change in substeps, from 0 to 1."""
+        # A substep that ends far from the prediction of its tangent is halved like one that fails.
+        # The branch ends there if it is the smallest one. Then a warning is logged, and the change
+        # continues beyond the jump.
         done, attempts = 0.0, 0
         if failure is not None:
             part = self._halved(part, done, failure, work)
         while done < 1.0:
             attempts += 1
             self.state.tell(
-                f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, attempt {attempts}: {100 * part:.2g} %"
+                f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, " f"attempt {attempts}: {100 * part:.2g} %"
             )
             before = self.state.unknown.x.array.copy()
             part = min(part, 1.0 - done, self.largest_part(done))
@@ -172,7 +183,7 @@ class Change:
                     solved, self.state.unknown.x.array[:] = self.state.unknown.x.array.copy(), before
                     if part / 2 >= self._smallest:
                         log.debug(
-                            "%s: far from the last part, %.3g of the first Newton step", self.stage, solution.reach
+                            "%s: far from the last substep, %.3g of the first Newton step", self.stage, solution.reach
                         )
                         part /= 2
                         continue
@@ -187,8 +198,8 @@ class Change:
                 work.substeps += 1
 
     def look_back(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
-        """After a step: look into one that has ended far from its tangent or from the step before."""
-        # `again`: it was solved once more, with other cells; that is no step of its own
+        """Repeat a step in substeps if it may have jumped. Return whether it was. Collective."""
+        # `again`: the same step was solved before, with other cells.
         unknown, jumps = self.state.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
@@ -200,9 +211,9 @@ class Change:
         return looked
 
     def confirm(self, before: NDArray[np.float64], work: Work) -> None:
-        """Go the way again in parts, from the unknowns before it, where the whole was solved far from its tangent."""
-        # Where there is no such way, the solution stays, and a warning says so. Where it leads to another solution,
-        # this one is taken: the body comes to it.
+        """Repeat a step in substeps from the unknowns before it. Collective."""
+        # The solution stays if the substeps fail, with a warning if the branch ends there. If they
+        # lead to another solution, that one is used, because the body reaches it.
         unknown = self.state.unknown.x.array
         found, parts = unknown.copy(), Work()
         unknown[:] = before
@@ -212,13 +223,13 @@ class Change:
             if self.refusal is None and failure.refusal.kind in WAYS_END:
                 self._jumped(found, failure.refusal)
             log.info(
-                "time %g: the solution is far from what the tangent predicts, and parts of the step fail: %s",
+                "time %g: solution far from the tangent's prediction, and its substeps failed: %s",
                 self.time,
                 failure,
             )
         work.count(parts)
         if leads_on and self._size(unknown - found) > SAME_SOLUTION * self._size(found - before):
-            log.info("time %g: there are several solutions; parts of the step lead to the one that is taken", self.time)
+            log.info("time %g: several solutions exist; using the one reached by substeps", self.time)
             work.residual, work.extension, work.substeps = parts.residual, parts.extension, parts.substeps
             return
         unknown[:] = found
@@ -229,8 +240,9 @@ class Change:
         return 2.0**-self.maximum_halvings
 
     def is_another_branch(self, solution: Solution | None, moved: float, expected: float, tangents: int = 0) -> bool:
-        """Whether a solve may have ended there: far from its tangent, late, or much further than was expected."""
-        # `expected`: what the way before lets expect, 0 where there is none; `tangents`: of a whole step
+        """Return whether a solve may have jumped: far from its tangent, slow, or too far."""
+        # `expected`: distance predicted by the last substep, 0 if unknown; `tangents`: number of a
+        # whole step.
         least = POSSIBLE_JUMP * self.state.loading.domain.size
         if tangents > MANY or 0.0 < expected < moved / FASTER and moved > least:
             return True
@@ -239,11 +251,11 @@ class Change:
         return solution.reach > FAR or (0.0 < solution.reach < CLOSE and solution.newton_iterations > MANY)
 
     def _size(self, change: NDArray[np.float64]) -> float:
-        """Largest change of an unknown, over all ranks."""
+        """Return the largest change of an unknown over all ranks. Collective."""
         return float(over_ranks(self.state.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
 
     def _looks(self) -> bool:
-        """Whether a part that has ended far away is looked into."""
+        """Return whether a possible jump is checked."""
         enough = self.maximum_halvings >= PROOF
         return enough and self.refusal is None and self._jumps["found"] < MOST_JUMPS
 
@@ -252,34 +264,35 @@ class Change:
         return Numbers(self.state, "jumps", {"found": 0, "moved": 0})
 
     def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
-        """Say that there is no way to what was solved; unknowns and loads are those where the way ends."""
+        """Warn of a jump from the end of a branch, the present state, to `solved`. Collective."""
         self.refusal = refusal
         self._jumps["found"] += 1
         state, far = self.state, self._size(solved - self.state.unknown.x.array)
         if state.comm.rank == 0:
             loads = ", ".join(f"{name} {value:.4g}" for name, value in state.loading.values.items() if value)
             log.warning(
-                "time %g: the body jumps by %.3g to another solution: the path of the last one ends at %s. %s; a "
-                "smaller time.step shows that path", self.time, far, loads or "the start", refusal,
+                "time %g: jump to another solution branch (largest displacement change %.3g). "
+                "The previous branch ends at %s (%s). Set a smaller time.step to resolve it",
+                self.time, far, loads or "the start", refusal,
             )  # fmt: skip
 
     def _halved(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
         if part / 2 < self._smallest:
             text = self.state.label + failure_text(self.time, self.stage, done, failure)
-            self.set_fraction(done)  # the last state that was solved
+            self.set_fraction(done)  # the last solved state
             found = diagnosed(self.newton, failure, self._direction)
             refusal = found if found.kind or self.refusal is None else self.refusal
             raise StepFailure(self.time, text, refusal) from failure
-        log.debug("%s: %s; next part %g", self.stage, failure.reason, part / 2)
+        log.debug("%s: %s; next substep %g", self.stage, failure.reason, part / 2)
         return part / 2
 
 
 class Blend:
-    """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep: the old and the new model at the ends.
+    """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep."""
 
-    Few runs have a step that needs it, and its kernels take as long to compile as those of the run itself: it is made
-    when it is asked for.
-    """
+    # At theta = 0 and 1 it is the model with the old and with the new cells. Few runs need it, and
+    # its kernels take as long to compile as those of the run itself. So it is compiled on first
+    # access.
 
     def __init__(self, state: State, tissue: Tissue, settings: Solver):
         self.state, self.tissue, self.settings = state, tissue, settings
@@ -287,7 +300,7 @@ class Blend:
 
     @functools.cached_property
     def equilibrium(self) -> Equilibrium:
-        """Compiled."""
+        """Equilibrium of the mixed cells, compiled on first access."""
         old, new = self.state.equilibrium_cells, self.state.cells
 
         def at_points() -> list[UnitCell]:
@@ -297,7 +310,7 @@ class Blend:
 
     @functools.cached_property
     def newton(self) -> GuardedNewton:
-        """The solver."""
+        """Newton's method for the mixed cells."""
         return GuardedNewton(self.equilibrium, self.settings, robust=True)
 
     def close(self) -> None:
@@ -306,11 +319,11 @@ class Blend:
             vars(self).pop("newton").close()
 
     def set(self, fraction: float) -> None:
-        """theta."""
+        """Set theta to this fraction."""
         self.theta.value = fraction
 
     def largest_part(self, done: float) -> float:
-        """Largest further part of theta that keeps KEPT_RESERVE of 1 - r/L at every point of the present unknowns."""
+        """Return the largest increment of theta that keeps KEPT_RESERVE of 1 - r/L everywhere."""
         # r^2 is linear in theta at a frozen deformation, so the bound is in closed form.
         equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
         length = quadrature.owned(equilibrium.locking_length())
@@ -318,12 +331,13 @@ class Blend:
         now = quadrature.owned(equilibrium.squared_lengths())
         self.theta.value = 1.0
         end = quadrature.owned(equilibrium.squared_lengths())
-        allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2  # infinite where nothing locks
+        # Infinite without locking.
+        allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2
         increase = end - now
         room = np.where(increase > 0, (allowed - now) / np.where(increase > 0, increase, 1.0), np.inf)
         return (1.0 - done) * quadrature.minimum(room)
 
 
 def shares(old: UnitCell, new: UnitCell, theta: UflOrArray) -> list[UnitCell]:
-    """(1 - theta) of an old cell and theta of a new one, UFL or arrays."""
+    """Return an old cell with weight 1 - theta and a new one with theta, UFL or arrays."""
     return [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]

@@ -1,4 +1,4 @@
-"""What a solve comes to: how many eigenvalues of the tangent are negative, and why a step is refused."""
+"""Diagnosis of a solve: inertia of the tangent, and causes of failed steps."""
 
 from __future__ import annotations
 
@@ -20,17 +20,20 @@ Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- inertia of the tangent
-# How many of its eigenvalues are negative, and the lowest of them with its mode.
+# The number of negative eigenvalues, and the lowest eigenvalue with its mode.
 
-FIRST_SHIFT = 1e-3  # of the smallest diagonal entry: where the search for a bound of the spectrum starts
-SHIFT_FACTOR = 8.0  # from one trial of it to the next
+# First trial of a lower bound of the spectrum, relative to the smallest diagonal entry.
+FIRST_SHIFT = 1e-3
+SHIFT_FACTOR = 8.0  # ratio of two successive trials
 MOST_SHIFTS = 40
-SYMMETRIC_TO = 1e-9  # of the tangent's norm: rounding leaves 1e-16, a pressure on an open face far more
+# Largest unsymmetric part, relative to the tangent's norm. Rounding causes 1e-16, a pressure on an
+# open face far more.
+SYMMETRIC_TO = 1e-9
 
 
 @dataclass(frozen=True)
 class Mode:
-    """The lowest eigenvalue, and its mode."""
+    """Lowest eigenvalue and its mode, with the position of its largest displacement."""
 
     eigenvalue: float
     place: tuple[float, float, float]
@@ -38,16 +41,16 @@ class Mode:
 
 
 class FactorisationFailed(ArithmeticError):
-    """MUMPS could not factorise the symmetric part, for want of memory say."""
+    """Failure of MUMPS to factorise the symmetric part, for example for lack of memory."""
 
 
 class Inertia:
-    """Signs of the eigenvalues of an equilibrium's tangent on the free unknowns, at the present unknowns.
+    """Signs of the eigenvalues of an equilibrium's tangent on the free unknowns. Collective."""
 
-    A tangent whose symmetric part is positive definite has eigenvalues of positive real part. The converse holds for
-    symmetric tangents only: a pressure that follows an open face may leave the symmetric part indefinite while all
-    eigenvalues are positive, as of a strip that it pulls.
-    """
+    # A tangent whose symmetric part is positive definite has eigenvalues of positive real part. The
+    # converse holds for symmetric tangents only. With a follower pressure on an open face, such as
+    # that of a strip under tension, the symmetric part may be indefinite although all eigenvalues
+    # are positive.
 
     def __init__(self, equilibrium: Equilibrium):
         self.equilibrium = equilibrium
@@ -59,18 +62,19 @@ class Inertia:
         self._definite = KeptFactor()
 
     def close(self) -> None:
-        """Free PETSc's objects; the next question makes new ones."""
+        """Free PETSc's objects; the next call makes new ones."""
         for thing in (self._factorisation, self._factorised, self._symmetric, self._tangent):
             if thing is not None:
                 thing.destroy()
         self._tangent = self._symmetric = self._factorised = self._factorisation = None
         self._definite.close()
 
-    # ------------------------------------------------------------ questions
+    # ------------------------------------------------------------ eigenvalues
     def negative_eigenvalues(self) -> int:
         """Count the eigenvalues of negative real part."""
         self._assemble()
-        if self.equilibrium.comm.size == 1 and self._definite.is_definite(self._symmetric):  # in half of MUMPS's time
+        # CHOLMOD takes half of MUMPS's time.
+        if self.equilibrium.comm.size == 1 and self._definite.is_definite(self._symmetric):
             return 0
         number = self._negative_of(self._symmetric)
         if number == 0 or not self._is_unsymmetric:
@@ -89,11 +93,12 @@ class Inertia:
         return mode
 
     def _lowest(self, number: int) -> tuple[list[float], PETSc.Vec]:
-        """Return at least `number` smallest real parts of eigenvalues, and the vector of the first."""
+        """Return at least `number` smallest real parts of eigenvalues, and the first vector."""
         from slepc4py import SLEPc
 
         matrix = self._without_prescribed(self._symmetric)
-        shift = self._lower_bound(matrix)  # real parts lie above the lowest eigenvalue of the symmetric part
+        # Real parts exceed the symmetric part's lowest eigenvalue.
+        shift = self._lower_bound(matrix)
         unsymmetric = self._is_unsymmetric and shift < 0
         if unsymmetric:
             matrix.destroy()
@@ -111,7 +116,8 @@ class Inertia:
         linear.setType("preonly")
         linear.getPC().setType("lu" if unsymmetric else "cholesky")
         linear.getPC().setFactorSolverType("mumps")
-        solver.setInitialSpace(uneven(matrix.createVecRight()))  # as everywhere: the same on any number of ranks
+        # The same start on any number of ranks.
+        solver.setInitialSpace(uneven(matrix.createVecRight()))
         solver.solve()
         if solver.getConverged() < number:
             raise FactorisationFailed("the lowest eigenvalues of the tangent did not converge")
@@ -123,7 +129,7 @@ class Inertia:
         return values, vector
 
     def cosine(self, mode: Mode, direction: Array) -> float:
-        """Of the angle between a mode and another change of the unknowns, without its sign."""
+        """Return the absolute cosine of a mode and another change of the unknowns. Collective."""
         owned = self.equilibrium.state.number_of_owned_unknowns
         both = np.array([mode.displacement, direction])[:, :owned]
         products = self.equilibrium.comm.allreduce(both @ both.T)
@@ -146,24 +152,26 @@ class Inertia:
         self._symmetric.scale(0.5)
 
     def _negative_of(self, matrix: PETSc.Mat, shift: float = 0.0) -> int:
-        """Eigenvalues below `shift` of a matrix that has the pattern of the tangent."""
+        """Count the eigenvalues below `shift` of a matrix with the pattern of the tangent."""
         if self._factorised is None:
             self._factorised = matrix.copy()
         matrix.copy(self._factorised, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        if shift:  # PETSc's own shift would be a change of the pattern on several ranks, and a new factorisation
+        if shift:  # PETSc's own shift would change the pattern on several ranks
             diagonal = matrix.getDiagonal()
             diagonal.shift(-shift)
             self._factorised.setDiagonal(diagonal)
             diagonal.destroy()
-        if self._factorisation is None:  # kept: the order of elimination is found once
+        if self._factorisation is None:  # reused: the elimination order is computed once
             self._factorisation = PETSc.PC().create(self.equilibrium.comm)
-            self._factorisation.setType("cholesky")  # SYM = 2 as long as nobody calls the matrix positive definite
+            # SYM = 2, because the matrix is not marked as positive definite.
+            self._factorisation.setType("cholesky")
             self._factorisation.setFactorSolverType("mumps")
             self._factorisation.setOperators(self._factorised)
             self._factorisation.setFactorSetUpSolverType()
             factor = self._factorisation.getFactorMatrix()
-            factor.setMumpsIcntl(13, 1)  # the last front on one rank: otherwise its pivots are not counted
-            factor.setMumpsIcntl(24, 1)  # zero pivots are counted apart
+            # The last front on one rank; otherwise its pivots are not counted.
+            factor.setMumpsIcntl(13, 1)
+            factor.setMumpsIcntl(24, 1)  # zero pivots are counted separately
         self._factorisation.setUp()
         factor = self._factorisation.getFactorMatrix()
         if self._factorisation.getFailedReason() or factor.getMumpsInfog(1) < 0:
@@ -171,7 +179,7 @@ class Inertia:
         return int(factor.getInertia()[0])
 
     def _without_prescribed(self, matrix: PETSc.Mat) -> PETSc.Mat:
-        """A copy in which the prescribed unknowns have an eigenvalue of the size of the largest ones, not one."""
+        """Return a copy whose prescribed unknowns have a large eigenvalue instead of one."""
         matrix, diagonal = matrix.copy(), matrix.getDiagonal()
         held = ~np.isnan(self.equilibrium.prescribed_values()[: diagonal.getLocalSize()])
         largest = matrix.norm(PETSc.NormType.NORM_INFINITY)
@@ -181,7 +189,7 @@ class Inertia:
         return matrix
 
     def _lower_bound(self, matrix: PETSc.Mat) -> float:
-        """Below all eigenvalues, but not by far; zero where none is negative."""
+        """Return a close lower bound of all eigenvalues, or zero if none is negative."""
         if self._negative_of(matrix) == 0:
             return 0.0
         diagonal = matrix.getDiagonal()
@@ -191,7 +199,7 @@ class Inertia:
             if self._negative_of(matrix, shift) == 0:
                 return shift
             shift *= SHIFT_FACTOR
-        raise FactorisationFailed("no lower bound of the eigenvalues was found")
+        raise FactorisationFailed("no lower bound of the eigenvalues")
 
     def _mode(self, eigenvalue: float, vector: PETSc.Vec) -> Mode:
         state = self.equilibrium.state
@@ -202,14 +210,14 @@ class Inertia:
         amplitude = np.linalg.norm(state.kinematics.nodal_displacement(function), axis=1)
         nodes = state.kinematics.nodal_space(state.unknown).tabulate_dof_coordinates()
         largest = self.equilibrium.comm.allreduce(float(np.max(amplitude, initial=0.0)), MPI.MAX)
-        # of nodes that symmetry makes equal the first one in space, whatever the number of ranks
+        # Of nodes that are equal by symmetry the first one in space, for any number of ranks.
         candidates = (np.round(nodes[amplitude >= (1 - 1e-6) * largest], 12) + 0.0).tolist()
         place = min(tuple(node) for rank in self.equilibrium.comm.allgather(candidates) for node in rank)
         return Mode(eigenvalue, place, function.x.array.copy())
 
 
 def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
-    """Negative eigenvalues, and the lowest one, without loads, displacement and remodeling; the state stays."""
+    """Return negative eigenvalues (number, lowest) of the unloaded body with initial cells."""
     state = inertia.equilibrium.state
     cells = state.cells
     with state.tentative():
@@ -220,21 +228,21 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
         return inertia.negative_eigenvalues(), inertia.lowest().eigenvalue
 
 
-# ---------------------------------------------------------------- why there is no further step
-# Kinds of refusals, each with its own advice, told apart at the last solved state.
+# ---------------------------------------------------------------- causes of failed steps
+# Causes are distinguished at the last solved state. Each has its own advice.
 
-NEARLY_LOCKED = 0.98  # r/L, where a prescribed motion makes chains longer
-LOCKED = 0.999  # r/L under any load
-CRUSHED = 0.02  # J
+NEARLY_LOCKED = 0.98  # r/L of locking chains under a prescribed motion
+LOCKED = 0.999  # r/L of locking chains under any load
+CRUSHED = 0.02  # J of collapsed elements
 NEARLY_CRITICAL = 0.1  # lowest eigenvalue over its unloaded value
 ALONG_THE_MODE = 0.5  # cosine between the last change of the displacement and the mode
-NEARLY_SOLVED = 1e3  # residual over tolerance
-LOOSEST = 1e-4  # residual over the forces at the nodes that is worth going on with
+NEARLY_SOLVED = 1e3  # largest residual over tolerance that is attributed to the tolerance
+LOOSEST = 1e-4  # largest relative_tolerance that a message recommends
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why there is no further step."""
+    """Cause of a failed step, with advice and evidence."""
 
     kind: str
     advice: str
@@ -249,36 +257,36 @@ class Refusal:
 TOO_LARGE = Refusal("", "try a smaller time.step, a slower ramp or lower loads")
 LIMIT_POINT = Refusal(
     "limit point",
-    "the load approaches the largest that the body can carry, and the displacement grows without bound; lower the "
-    "load, or prescribe a displacement in its place",
+    "the load approaches the largest that the body can carry; " "lower it, or prescribe a displacement instead",
 )
 BIFURCATION = Refusal(
     "bifurcation",
-    "the body buckles or loses its symmetry; lower the load, hold the body by supports, "
+    "the body buckles or loses its symmetry; lower the load, add supports, "
     'or stop before it with solver.unstable = "stop"',
 )
 CHAIN_LOCKING = Refusal(
     "chain locking",
-    "chains cannot become longer than material.contour_length; prescribe less elongation, or load more slowly",
+    "chains cannot exceed material.contour_length; prescribe less elongation, or load more slowly",
 )
 KINEMATIC_LOCKING = Refusal(
     "kinematic locking",
-    "supports and loads leave elements without volume; prescribe a smaller motion, or refine the mesh",
+    "supports and loads reduce the volume of elements to almost zero; "
+    "prescribe a smaller motion, or refine the mesh",
 )
 SOLVER_TOLERANCE = Refusal(
     "solver tolerance",
-    "the residual does not fall below the tolerance; try a larger solver.maximum_iterations, or a smaller time.step",
+    "the residual does not fall below the tolerance; " "try a larger solver.maximum_iterations, or a smaller time.step",
 )
 SEVERAL_SOLUTIONS = Refusal(
-    "several solutions", "this solution does not continue the last one; try a slower ramp, or lower loads"
+    "several solutions", "this solution does not continue the previous branch; try a slower ramp, or lower loads"
 )
-UNSTABLE = Refusal("lost stability", 'lower the load, or go on beyond it with solver.unstable = "warn"')
+UNSTABLE = Refusal("lost stability", 'lower the load, or continue beyond it with solver.unstable = "warn"')
 
 
 def diagnosed(
     newton: GuardedNewton, failure: SolveFailure | None, direction: NDArray[np.float64] | None = None
 ) -> Refusal:
-    """The kind of refusal, from the present state: the last one that was solved."""
+    """Return the cause of a failure, from the last solved state. Collective."""
     extension = newton.equilibrium.extension()
     if not extension.admissible:
         return TOO_LARGE
@@ -286,34 +294,37 @@ def diagnosed(
     moved = newton.equilibrium.comm.allreduce(bool(np.any(np.nan_to_num(prescribed))), MPI.LOR)
     if longest > (NEARLY_LOCKED if moved else LOCKED):
         place = ", ".join(f"{c:.4g}" for c in extension.worst_point)
-        return replace(CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last state that was solved")
+        return replace(CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last solved state")
     if extension.min_jacobian < CRUSHED:
-        return replace(KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last state that was solved")
+        return replace(KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last solved state")
     inertia = Inertia(newton.equilibrium)
     try:
         found = _of_the_tangent(inertia, direction)
-        # beyond a limit point a residual may come near the tolerance too, at a state far away
+        # The residual may be near the tolerance beyond a limit point too, at a remote state.
         if failure is None or found.kind == LIMIT_POINT.kind:
             return found
         return _of_the_tolerance(failure) or found
     except FactorisationFailed as reason:
-        log.info("why the step was not solved could not be found out: %s", reason)
+        log.info("the cause of the failed step could not be determined: %s", reason)
         return TOO_LARGE
     finally:
         inertia.close()
 
 
 def _of_the_tolerance(failure: SolveFailure) -> Refusal | None:
-    """Where not much is left of the residual."""
+    """Return advice on the tolerance if the residual is close to it, otherwise None."""
     if not 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
         return None
-    found = replace(SOLVER_TOLERANCE, finding=f"{failure.residual_over_tolerance:.3g} times the tolerance is left")
+    found = replace(
+        SOLVER_TOLERANCE, finding=f"the residual is {failure.residual_over_tolerance:.3g} times the tolerance"
+    )
     if failure.relative_residual > LOOSEST:
         return found
-    enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))  # twice: it is not the same in every iteration
+    # Twice, because it varies between iterations.
+    enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))
     key = f"solver.relative_tolerance = {enough:g}"
     if failure.stagnates:
-        return replace(found, advice=f"the residual stagnates, as rounding does: {key} accepts this state")
+        return replace(found, advice=f"the residual stagnates at rounding errors; {key} accepts this state")
     return replace(found, advice=f"{found.advice}; {key} would accept this state")
 
 
@@ -321,10 +332,8 @@ def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> 
     negative, mode = inertia.negative_eigenvalues(), inertia.lowest()
     at_start, unloaded = of_the_unloaded_body(inertia)
     place = ", ".join(f"{c:.4g}" for c in mode.place)
-    finding = (
-        f"the lowest eigenvalue of the tangent is {mode.eigenvalue:.3g}, and {unloaded:.3g} in the unloaded body; its "
-    )
-    finding += f"mode is largest at ({place})"
+    finding = f"the lowest eigenvalue of the tangent is {mode.eigenvalue:.3g} "
+    finding += f"(unloaded body: {unloaded:.3g}); its mode is largest at ({place})"
     if negative > at_start:
         return replace(BIFURCATION, finding=finding)
     if mode.eigenvalue > NEARLY_CRITICAL * unloaded:

@@ -1,4 +1,4 @@
-"""Equilibrium at given loads and cells: residual, tangent, stored energy, and how far a state is from its limits."""
+"""Equilibrium at fixed loads and cells: residual, tangent, stored energy, and limits of a state."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ Array = NDArray[np.float64]
 Shares = Callable[[], Sequence[UnitCell]]
 
 
-# ---------------------------------------------------------------- the repulsion where UFL has no closed expression
-# Stress and stiffness as values at the quadrature points.
+# ---------------------------------------------------------------- repulsion without UFL
+# Stress and stiffness are values at the quadrature points.
 
 
 class PointwiseRepulsion:
-    """Second Piola-Kirchhoff stress of the repulsion and its derivative, as quadrature functions that forms take."""
+    """Second Piola-Kirchhoff stress of the repulsion, and stiffness, as quadrature functions."""
 
     def __init__(self, state: State, tissue: Tissue, cells: Sequence[UnitCell], shares: Shares):
         self.state, self.shares, self.quadrature = state, shares, state.cells.quadrature
@@ -56,7 +56,7 @@ class PointwiseRepulsion:
         self._stresses, self._stiffnesses = (Remembered[None](None, *of_stress) for _ in range(2))
 
     def update(self, stiffness: bool = False) -> None:
-        """Stress, and stiffness on request, of the present unknowns and cells: what is there already stays."""
+        """Update the stress, and the stiffness on request, if unknowns or cells have changed."""
         self._stresses(lambda: self._evaluate(stiffness=False))
         if stiffness:
             self._stiffnesses(lambda: self._evaluate(stiffness=True))
@@ -75,19 +75,19 @@ class PointwiseRepulsion:
             values[:] = (-2 * modulus[:, None, None] * second).reshape(*shape, 6, 6)
 
     def energy(self) -> float:
-        """Its part of the stored energy, over all ranks."""
+        """Return the repulsion's part of the stored energy, over all ranks. Collective."""
         F = self.state.elastic_gradient()
         r0 = self._parameters.at_points().end_to_end_length
         values = -self._modulus() / 2 * self.tissue.repulsion.sum(F, self.shares(), r0)
         return self.quadrature.integral(self.state.per_mesh_volume(values))
 
     def residual(self, u: Function, F: Expr, test: Expr) -> Expr:
-        """Its virtual work per reference volume, UFL."""
+        """Return the repulsion's virtual work per stress-free volume, UFL."""
         variation = ufl.derivative(F, u, test)
         return ufl.inner(ufl.dot(F, self.stress), variation)
 
     def tangent(self, u: Function, F: Expr, test: Expr, trial: Expr) -> Expr:
-        """Derivative of `residual`, UFL."""
+        """Return the derivative of `residual`, UFL."""
         variation, increment = ufl.derivative(F, u, test), ufl.derivative(F, u, trial)
         geometric = ufl.inner(ufl.dot(increment, self.stress), variation)
         strains = [ufl.sym(ufl.dot(ufl.transpose(F), direction)) for direction in (increment, variation)]
@@ -99,7 +99,7 @@ class PointwiseRepulsion:
 
 
 class PointStresses:
-    """Stresses at the quadrature points as the residual has them: with what the formulation and the repulsion add."""
+    """UFL stresses of the residual at the quadrature points, with formulation and repulsion."""
 
     def __init__(self, state: State, tissue: Tissue):
         self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(state, tissue, [state.cells.ufl_cell])
@@ -108,27 +108,26 @@ class PointStresses:
         if self._repulsion is not None:
             self.ufl = self.ufl.plus(F, self._repulsion.stress)
         kinematics = state.kinematics
-        if (
-            isinstance(kinematics, NaturalConfiguration) and kinematics.grows
-        ):  # amounts belong to the volume of the start, stresses to the present one
+        # Amounts refer to the volume at the start, stresses to the present volume.
+        if isinstance(kinematics, NaturalConfiguration) and kinematics.grows:
             self.ufl = Stresses(*(stress / kinematics.volume_ratio() for stress in self.ufl))
 
     def refresh(self) -> None:
-        """Take what the expressions need beside F from the present unknowns and cells."""
+        """Update what the expressions need in addition to F from the present unknowns and cells."""
         self._dilatation.refresh()
         if self._repulsion is not None:
             self._repulsion.update()
 
 
 def mandel_vector(tensor: Expr) -> Expr:
-    """Six Mandel components of a symmetric UFL tensor."""
+    """Return the six Mandel components of a symmetric UFL tensor."""
     return ufl.as_vector([tensor[i, j] if i == j else np.sqrt(2.0) * tensor[i, j] for i, j in MANDEL])
 
 
 def pointwise_repulsion(
     state: State, tissue: Tissue, cells: Sequence[UnitCell], shares: Shares | None = None
 ) -> PointwiseRepulsion | None:
-    """The part of a tissue's energy that UFL leaves out, with the state's cells or shares of them; None without one."""
+    """Return the repulsion that UFL cannot express, of the state's or weighted cells, or None."""
     if tissue.chain is None or tissue.repulsion.derivatives is None:
         return None
     return PointwiseRepulsion(state, tissue, cells, shares or (lambda: [state.cells.point_cells]))
@@ -136,7 +135,7 @@ def pointwise_repulsion(
 
 @dataclass(frozen=True)
 class Extension:
-    """How far a state is from its limits: the largest r/L and the smallest J, and where r/L is largest (reference)."""
+    """Limits of a state: largest r/L with its reference position, and smallest J."""
 
     max_chain_extension: float
     min_jacobian: float
@@ -145,12 +144,12 @@ class Extension:
 
     @property
     def admissible(self) -> bool:
-        """True when every chain is shorter than its contour length and no volume has collapsed; False for NaN."""
+        """Whether r < L and J > 0 everywhere; False for NaN."""
         return self.max_chain_extension < 1.0 and self.min_jacobian > 0.0
 
 
 class Look(NamedTuple):
-    """A state at this rank's own points: how far it is from its limits; r/L and J (elements, points), F (n, 3, 3)."""
+    """State at this rank's own points: limits; r/L and J, (elements, points); F, (n, 3, 3)."""
 
     extension: Extension
     stretches: Array
@@ -159,7 +158,7 @@ class Look(NamedTuple):
 
 
 class Equilibrium:
-    """The balance of internal forces and loads, compiled."""
+    """Balance of internal forces and loads, compiled."""
 
     def __init__(
         self,
@@ -187,7 +186,7 @@ class Equilibrium:
             tangents[0] += self.pointwise.tangent(u, F, test, trial) * weight * dx
         self.internal_forms = [jit.form(form) for form in internal]
         self.external_forms = [] if external is None else [jit.form(external)]
-        # apart, so that bodies with other loads share the costly one
+        # A separate form, so that bodies with other loads reuse the costly one.
         self.tangent_forms = [jit.form(form) for form in tangents]
         if external is not None and _depends_on(external, u):
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
@@ -196,16 +195,16 @@ class Equilibrium:
         self._known: Remembered[Look] = Remembered(self.comm, F, *map(ufl.as_ufl, [*chains, length]))
         self._energy_forms: list[dolfinx.fem.Form] = []
 
-    # ------------------------------------------------------------ what users ask
+    # ------------------------------------------------------------ state and limits
     def extension(self) -> Extension:
-        """Largest r/L and smallest J of the present unknowns over all points of all ranks."""
+        """Return largest r/L and smallest J of the present unknowns over all ranks. Collective."""
         return self.look().extension
 
     def look(self) -> Look:
-        """Extension, and what it was made of, of the present unknowns; one state is looked at once."""
+        """Return limits, r/L, J and F of the present unknowns, cached for a state. Collective."""
         look = self._known(self._look)
         if look.extension.stop_signal:
-            self._known.forget()  # who asked for the end may take it back
+            self._known.forget()  # the stop request may be withdrawn
         return look
 
     def _look(self) -> Look:
@@ -233,13 +232,14 @@ class Equilibrium:
         share: float,
         nearer_than: float = 0.0,
     ) -> bool:
-        """Whether every point of all ranks keeps a share of its 1 - r/L."""
+        """Return whether every point keeps a fraction of its 1 - r/L. Collective."""
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
         return not over_ranks(self.comm, lost, MPI.LOR)
 
     def turns_inside_out(self, before: Look, after: Look) -> bool:
-        """Whether J vanishes on the straight way between two states at a point of any rank."""
-        # |F^-1| <= F:F / (2 det F), and nearer than its inverse nothing is singular: few points are to be asked
+        """Return whether J vanishes on the straight path between two states. Collective."""
+        # |F^-1| <= F:F / (2 det F), and no matrix within 1 / |F^-1| of F is singular. So few points
+        # need the exact check.
         F, G, J = before.gradients, after.gradients, before.jacobians.ravel()
         change, own = (np.einsum("nij,nij->n", each, each) for each in (G - F, F))
         at = np.flatnonzero((J <= 0.0) | (np.sqrt(change) * own >= 2.0 * J))
@@ -247,7 +247,7 @@ class Equilibrium:
         return bool(over_ranks(self.comm, turns, MPI.LOR))
 
     def room(self, far: float) -> float:
-        """Largest |dF| at which J > 0 and r/L < `far` at every point of all ranks."""
+        """Return the largest |dF| with J > 0 and r/L < `far` at all points. Collective."""
         look, lengths = self.look(), self.state.cells.dimension_values
         chains = np.sqrt((lengths**2).sum(axis=-1)) / self.locking_length()
         volume = 2.0 * look.jacobians.ravel() / np.einsum("nij,nij->n", look.gradients, look.gradients)
@@ -255,7 +255,7 @@ class Equilibrium:
         return float(over_ranks(self.comm, np.minimum(volume, length.ravel()).min(initial=np.inf), MPI.MIN))
 
     def squared_lengths(self) -> Array:
-        """r^2 in squared link lengths, (elements, points); 0 without chains."""
+        """Return r^2 in squared link lengths, (elements, points); 0 without chains."""
         shape = self.quadrature.shape
         if self.tissue.chain is None:
             return np.zeros(shape)
@@ -265,11 +265,11 @@ class Equilibrium:
         return np.asarray(squared_end_to_end_length(F, self._point_shares())).reshape(shape)
 
     def locking_length(self) -> NDArray[np.float64]:
-        """Length at which a chain locks at all points, (elements, points); infinite where nothing locks."""
+        """Return the locking length of chains, (elements, points); infinite if no chain locks."""
         return self.parameters.locking_length()
 
     def stored_energy(self) -> float:
-        """Integral of W over the body."""
+        """Return the integral of W over the body. Collective."""
         if not self._energy_forms:
             self.compile_energy()
         local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
@@ -277,18 +277,18 @@ class Equilibrium:
         return float(over_ranks(self.comm, local, MPI.SUM)) + pointwise
 
     def compile_energy(self) -> None:
-        """Make `stored_energy` ready; apart, because a blend needs none."""
+        """Compile `stored_energy`, which `continuation.Blend` does not need. Collective."""
         self._energy_forms = [jit.form(energy) for energy in self.energies]
 
-    # ------------------------------------------------------------ what a solver asks
+    # ------------------------------------------------------------ vectors and matrices
     def assemble_internal(self, vector: PETSc.Vec) -> None:
-        """Internal nodal forces of the present unknowns."""
+        """Assemble the internal nodal forces of the present unknowns. Collective."""
         if self.pointwise is not None:
             self.pointwise.update()
         self._assemble(vector, self.internal_forms)
 
     def assemble_external(self, vector: PETSc.Vec) -> None:
-        """Minus the nodal forces of the loads."""
+        """Assemble minus the nodal forces of the loads. Collective."""
         self._assemble(vector, self.external_forms)
 
     def _assemble(self, vector: PETSc.Vec, forms: Sequence[dolfinx.fem.Form]) -> None:
@@ -300,7 +300,7 @@ class Equilibrium:
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
     def assemble_lifting(self, vector: PETSc.Vec, x: PETSc.Vec) -> None:
-        """What the tangent makes of the distance between prescribed values and x: K (u_prescribed - x)."""
+        """Assemble K (u_prescribed - x), the forces of prescribed values not met. Collective."""
         with vector.localForm() as local:
             local.set(0.0)
         conditions = self.state.loading.boundary_conditions
@@ -310,11 +310,11 @@ class Equilibrium:
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
     def create_matrix(self) -> PETSc.Mat:
-        """An empty matrix with the pattern of the tangent."""
+        """Return an empty matrix with the pattern of the tangent. Collective."""
         return create_matrix(self.tangent_forms[0])
 
     def assemble_tangent(self, matrix: PETSc.Mat) -> None:
-        """Derivative of the residual at the present unknowns, one on the diagonal where they are prescribed."""
+        """Assemble the tangent, with unit diagonal for prescribed unknowns. Collective."""
         self._update_tangent()
         assemble_matrix(matrix, self.tangent_forms, self.state.loading.boundary_conditions)
 
@@ -323,23 +323,23 @@ class Equilibrium:
             self.pointwise.update(stiffness=True)
 
     def prescribed_values(self) -> NDArray[np.float64]:
-        """What supports and loads prescribe of this rank's unknowns, ghosts included; NaN where they are free."""
+        """Return prescribed values of this rank's unknowns with ghosts; NaN for free unknowns."""
         values = np.full_like(self.state.unknown.x.array, np.nan)
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def prescribed_gap(self) -> float:
-        """Largest distance of a prescribed value from its target, over all ranks."""
+        """Return the largest difference of an unknown from its prescribed value. Collective."""
         gap = np.abs(self.prescribed_values() - self.state.unknown.x.array)
         return float(over_ranks(self.comm, float(np.nanmax(gap, initial=0.0)), MPI.MAX))
 
 
 def _smallest(values: Array) -> float:
-    """Smallest value; -inf if one is not finite."""
+    """Return the smallest value, or -inf if one is not finite."""
     return float(values.min(initial=np.inf)) if np.isfinite(values).all() else -np.inf
 
 
 def _depends_on(form: ufl.Form, unknown: Function) -> bool:
-    """Whether a form's derivative with respect to the unknown is not zero."""
+    """Return whether a form depends on the unknown."""
     return unknown in form.coefficients()

@@ -1,4 +1,4 @@
-"""How the linear systems of Newton's method are solved: with every tangent, an earlier factor, or multigrid."""
+"""Linear solvers of Newton's method: full Newton, lagged factorisation, or multigrid."""
 
 from __future__ import annotations
 
@@ -25,33 +25,34 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-# ---------------------------------------------------------------- quasi-Newton steps on a kept factor
-# L-BFGS, on any number of ranks.
+# ---------------------------------------------------------------- quasi-Newton steps
+# L-BFGS with a lagged factorisation, on any number of ranks.
 
-REMEMBERED_PAIRS = 20  # pairs that are remembered
-CURVED = 1e-8  # cosine between a step and the change of the residual, below which they say nothing of use
+REMEMBERED_PAIRS = 20  # number of stored pairs
+CURVED = 1e-8  # smallest cosine between a step and the change of the residual for a pair
 
 
 class Secants:
-    """Betters the steps of a kept factor by what earlier steps have shown of the present tangent."""
+    """L-BFGS update of a lagged factorisation, from the residuals of earlier steps."""
 
     def __init__(self, comm: MPI.Intracomm) -> None:
         self._comm = comm
-        # a step s, the change z of the residual over it, and H z with the kept inverse H; with s . z
+        # Each pair is a step s, the change z of the residual over it, and H z with the lagged
+        # inverse H; with s . z.
         self._pairs: deque[tuple[Array, float]] = deque(maxlen=REMEMBERED_PAIRS)
         self._last: Array | None = None
 
     def forget(self) -> None:
-        """The factor is another one."""
+        """Delete all pairs, because the factorisation is another one."""
         self.interrupt()
         self._pairs.clear()
 
     def interrupt(self) -> None:
-        """The next step does not follow the last one: another problem, or another place."""
+        """Form no pair from the next step, because it does not follow the last one."""
         self._last = None
 
     def improve(self, x: Vec, residual: Vec, step: Vec) -> bool:
-        """Better the step H r (trial: x - step) in place; whether it was changed."""
+        """Improve the step H r (trial: x - step) in place. Return whether it was. Collective."""
         now = np.array([x.array_r, residual.array_r, step.array_r])
         if self._last is not None:
             pair = now - self._last
@@ -77,24 +78,32 @@ class Secants:
 
 log = logging.getLogger(__name__)
 
-UNSYMMETRIC = 1e-10  # relative to the largest row: what a symmetric tangent may be unsymmetric by
-OVER = 3  # iterations over which the rate of convergence is taken, but for the first one
-SLOW_STEP = 2 / 3  # of `worth`: iterations of a step after which the next one starts with a new factor
-SINGLE_ERROR = 0.5  # relative, of the answer to the softest motion: 0.36 (40,800 unknowns) cost no iteration, for
-# L-BFGS learns such motions; above 1 a factor may even have another sign there
-MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; Newton's method goes on, as often again
+UNSYMMETRIC = 1e-10  # largest unsymmetric part of a symmetric tangent, relative to the largest row
+OVER = 3  # number of iterations for the rate of convergence, except for the first iteration
+# Iterations of a step, relative to `worth`, after which the next step factorises first.
+SLOW_STEP = 2 / 3
+# Relative error for the softest mode that is accepted in single precision. An error of 0.36
+# (40,800 unknowns) cost no iteration, because L-BFGS learns such modes. Above 1 a factorisation may
+# even have another sign there.
+SINGLE_ERROR = 0.5
+# Number of factorisations in a solve. If it needs more, lagging is not the cause: the solve
+# continues as Newton's method for as many more.
+MOST_RENEWALS = 6
 
-LAST, SURELY = 1e-5, 0.3  # relative, of a linear solve that ends it all: tried down to LAST; share of what is needed
+# Relative tolerance of a linear solve that may be the last one: SURELY times the required
+# reduction, if above LAST.
+LAST, SURELY = 1e-5, 0.3
 
 
 def worth(unknowns: int) -> float:
-    """Iterations that a new factor must save, for it costs about as much."""
-    # Smaller bodies gain nothing from fewer: the time of 150 steps of 1,881 unknowns is flat between 9 and 16.
+    """Return the number of iterations that cost about as much as a factorisation."""
+    # Smaller bodies gain nothing from a lower number: 150 steps of 1,881 unknowns take the same
+    # time from 9 to 16.
     return 12.0 * max(1.0, unknowns / 5616) ** 0.4
 
 
 class KeptFactor:
-    """Factors of an earlier tangent, which PETSc takes as a preconditioner of Python's."""
+    """Lagged factorisation of an earlier tangent, a Python preconditioner of PETSc."""
 
     comm: Comm = PETSc.COMM_SELF
 
@@ -104,10 +113,10 @@ class KeptFactor:
         self._kind = ""
         self._takes_single = kernels.is_available()
         self._single: kernels.SingleFactor | None = None
-        self._soft: PETSc.Vec = None  # the softest motion that is known: a vector of length one
+        self._soft: PETSc.Vec = None  # the softest known mode, of norm one
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
-        """PETSc asks for y, the inverse of the kept tangent times x; NaN where there is none: the solve then fails."""
+        """Apply the lagged factorisation: y = K^-1 x; NaN without one, and the solve fails."""
         if self._kind == SINGLE and self._single is not None:
             if not self._single.solve(x.array_r, y.array_w):
                 y.set(np.nan)
@@ -117,11 +126,11 @@ class KeptFactor:
             self.preconditioner.apply(x, y)
 
     def renew(self, matrix: Mat) -> None:
-        """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
+        """Factorise a tangent. If that fails, log it and keep no factorisation."""
         symmetric = matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
         kinds, refused = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL], False
         if symmetric and self._was_indefinite():
-            kinds.remove(DEFINITE)  # most likely refused again
+            kinds.remove(DEFINITE)  # most likely fails again
         elif symmetric and self._takes_single:
             answers = self._answers_in_single(matrix)
             if answers:
@@ -132,16 +141,16 @@ class KeptFactor:
             if self._factorised(kind, matrix):
                 break
         if refused and self._kind == SYMMETRIC and not self._was_indefinite():
-            self._takes_single = False  # it refuses what is definite
+            self._takes_single = False  # it failed although the matrix is positive definite
 
     def is_definite(self, matrix: Mat) -> bool:
-        """Whether a symmetric matrix is positive definite: CHOLMOD takes it."""
+        """Return whether CHOLMOD factorises a symmetric matrix, which is then positive definite."""
         taken = self._factorised(DEFINITE, matrix)
-        matrix.setOption(PETSc.Mat.Option.SPD, False)  # of others' factors nothing is known
+        matrix.setOption(PETSc.Mat.Option.SPD, False)  # unknown for other matrices
         return taken
 
     def close(self) -> None:
-        """Free PETSc's objects and CHOLMOD's."""
+        """Free the objects of PETSc and CHOLMOD."""
         self._let_go()
         if self._single is not None:
             self._single.close()
@@ -149,7 +158,7 @@ class KeptFactor:
         self._single = self._soft = None
 
     def _let_go(self) -> None:
-        """Free the factor of PETSc."""
+        """Free PETSc's factorisation."""
         if self.preconditioner is not None:
             self.preconditioner.destroy()
         if self._options is not None:
@@ -157,19 +166,20 @@ class KeptFactor:
         self.preconditioner, self._options, self._kind = None, None, ""
 
     def _answers_in_single(self, matrix: Mat) -> bool | None:
-        """Whether a factor in single precision answers soft motions well enough; None where there is no such factor."""
+        """Factorise in single precision. Return whether it is accurate, or None on failure."""
         starts, columns, values = matrix.getValuesCSR()
         looks = 1
         if self._single is None:
             self._single, self._soft = kernels.SingleFactor(starts, columns), uneven(matrix.createVecRight())
             looks = 2
         if not self._single.renew(values):
-            log.info("the tangent cannot be factorised as %s", SINGLE)
+            log.info("%s failed, the tangent is probably indefinite; " "using LDL^T in double precision", SINGLE)
             return None
         self._let_go()
         self._kind = SINGLE
         answer, back = self._soft.duplicate(), self._soft.duplicate()
-        for _ in range(looks):  # motions become softer from one to the next: there what rounding has done is largest
+        # Inverse iterations lead to softer modes, for which rounding errors are largest.
+        for _ in range(looks):
             self.apply(None, self._soft, answer)
             matrix.mult(answer, back)
             back.axpy(-1.0, self._soft)
@@ -180,13 +190,16 @@ class KeptFactor:
         back.destroy()
         if error < SINGLE_ERROR:
             return True
-        log.info("a factor in single precision is %.2g off", error)
+        log.info(
+            "single-precision factorisation rejected: relative error %.2g for the softest mode "
+            "(limit %g); using double precision", error, SINGLE_ERROR,
+        )  # fmt: skip
         self._kind = ""
         uneven(self._soft)
         return False
 
     def _was_indefinite(self) -> bool:
-        """Whether the kept factor has negative pivots, which MUMPS counts of a symmetric tangent."""
+        """Return whether MUMPS has counted negative pivots in its LDL^T factorisation."""
         return self._kind == SYMMETRIC and self.preconditioner.getFactorMatrix().getMumpsInfog(12) > 0
 
     def _factorised(self, kind: str, matrix: Mat) -> bool:
@@ -201,34 +214,35 @@ class KeptFactor:
             self.preconditioner.setReusePreconditioner(False)
             self.preconditioner.setUp()
             failed = bool(self.preconditioner.getFailedReason())
-            self.preconditioner.setReusePreconditioner(True)  # whatever the matrix becomes
+            self.preconditioner.setReusePreconditioner(True)  # for all later matrices
         except PETSc.Error:
             failed = True
         if failed:
-            log.info("the tangent cannot be factorised as %s", kind)
+            log.info("%s of the tangent failed", kind)
             self._let_go()
         return not failed
 
 
 class GatheredFactor:
-    """The same on several ranks: the first one has the whole tangent and its factors."""
+    """Lagged factorisation on several ranks: the first one has the whole tangent. Collective."""
 
     def __init__(self, comm: Comm):
         self.comm, self.first = comm, KeptFactor()
-        self._whole: PETSc.Mat = None  # a matrix of all ranks, whose rows and columns are the first one's
+        # A matrix of all ranks; the first rank owns all rows and columns.
+        self._whole: PETSc.Mat = None
         self._scatter: PETSc.Scatter = None
-        self._right: PETSc.Vec = None  # of the first rank; empty on others
+        self._right: PETSc.Vec = None  # on the first rank; empty on others
         self._answer: PETSc.Vec = None
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
-        """As of `KeptFactor`. Collective."""
+        """Apply the factorisation, see `KeptFactor.apply`. Collective."""
         self._scatter.scatter(x, self._right, mode=PETSc.ScatterMode.FORWARD)
         if self.comm.rank == 0:
             self.first.apply(_, self._right, self._answer)
         self._scatter.scatter(self._answer, y, mode=PETSc.ScatterMode.REVERSE)
 
     def renew(self, matrix: Mat) -> None:
-        """As of `KeptFactor`. Collective."""
+        """Factorise a tangent, see `KeptFactor.renew`. Collective."""
         if self._scatter is None:
             template = matrix.createVecRight()
             self._scatter, self._right = PETSc.Scatter.toZero(template)
@@ -241,7 +255,7 @@ class GatheredFactor:
             self.first.renew(self._whole.getDiagonalBlock())
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free all objects. Collective."""
         self.first.close()
         for thing in (self._whole, self._scatter, self._right, self._answer):
             if thing is not None:
@@ -250,21 +264,21 @@ class GatheredFactor:
 
 
 def kept_factor(comm: Comm) -> KeptFactor | GatheredFactor:
-    """Factors of a matrix of these ranks."""
+    """Return a lagged factorisation for matrices of these ranks."""
     return KeptFactor() if comm.size == 1 else GatheredFactor(comm)
 
 
 class EveryTangent:
-    """As PETSc's options say, with the tangent of every iteration.
+    """Full Newton: linear solves with the tangent of every iteration, by PETSc's options.
 
     Parameters
     ----------
     equilibrium
-        Whose tangents they are.
+        Equilibrium that assembles the tangents.
     snes, matrix
         PETSc's solver with its options, and the tangent.
     options
-        Those of the problem.
+        Options of the problem.
 
     Examples
     --------
@@ -278,67 +292,69 @@ class EveryTangent:
     ...     def renew(self):
     ...         super().renew()
     ...         Counted.tangents += 1
-    >>> SOLVER_METHODS["counted"] = SolverMethod(SOLVER_METHODS["direct"].options, "direct, counted", Counted)
-    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"solver.method": "counted", "time.end": 2.0})
+    >>> direct = SOLVER_METHODS["direct"].options
+    >>> SOLVER_METHODS["counted"] = SolverMethod(direct, "direct, counted", Counted)
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube")
+    >>> scene = scene.with_values({"solver.method": "counted", "time.end": 2.0})
     >>> iterations = [step.row["newton_iterations"] for step in Simulation(scene).steps()]
     >>> Counted.tangents == sum(iterations)
     True
     >>> del SOLVER_METHODS["counted"]
     """
 
-    given_up = False  # whether this way leads to nothing
-    keeps = False  # whether factors outlast a solve
+    given_up = False  # whether the solve shall stop
+    keeps = False  # whether a factorisation is reused in later solves
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         self.equilibrium, self.snes, self.matrix, self.options = equilibrium, snes, matrix, options
         self.tangents = 0
-        self._always = False  # whether what may be kept is made anew in every iteration
+        self._always = False  # whether nothing is reused between iterations
 
     def begin(self) -> None:
-        """A solve begins."""
+        """Prepare for a new solve."""
 
     def tangent(self, norm: float, tolerance: float) -> None:
-        """A linear system is about to be solved, at a residual of this norm.
+        """Prepare the tangent for a linear solve.
 
         Parameters
         ----------
         norm
-            Of the residual, in the unit of forces.
+            Norm of the residual, in the unit of force.
         tolerance
-            Below which the solve ends.
+            Norm below which the nonlinear solve ends.
         """
         self.renew()
 
     def renew(self) -> None:
-        """The tangent of the present unknowns."""
+        """Assemble the tangent of the present unknowns. Collective."""
         self.equilibrium.assemble_tangent(self.matrix)
         self.tangents += 1
 
     def improve(self, x: Vec, residual: Vec, step: Vec, is_exact: bool) -> bool:
-        """Improve the Newton step in place (the trial state is x - step); returns whether it was changed.
+        """Improve the Newton step in place (trial state: x - step). Return whether it changed.
 
-        `is_exact`: the residual at x is that of the prescribed values too.
+        If `is_exact`, the residual at x includes the prescribed values.
         """
         return False
 
     def ended(self, iterations: int) -> None:
-        """A solve has ended well."""
+        """Record a successful solve and its number of iterations."""
 
     def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        """A slower and safer way for a solve that has failed, and in words; None where this was it."""
+        """Return a slower and safer fallback for a failed solve, with its description, or None."""
         return None
 
     def keep_nothing(self) -> None:
-        """From now on no factor is kept from solve to solve; here none is kept at all."""
+        """Reuse no factorisation between solves from now on."""
 
     @property
     def more_iterations(self) -> int:
-        """Times solver.maximum_iterations before a solve has failed."""
+        """Factor on solver.maximum_iterations."""
         return 1
 
     @contextmanager
     def _anew(self) -> Iterator[None]:
-        """Meanwhile nothing is kept from one iteration to the next."""
+        """Reuse nothing between iterations while the block runs."""
         before, self._always = self._always, True
         try:
             yield
@@ -346,29 +362,29 @@ class EveryTangent:
             self._always = before
 
     def _set_up(self) -> None:
-        """A new preconditioner, of the present tangent, where PETSc keeps the one it has."""
+        """Set up the preconditioner for the present tangent, which PETSc would otherwise reuse."""
         preconditioner = self.snes.getKSP().getPC()
         preconditioner.setReusePreconditioner(False)
         preconditioner.setOperators(self.matrix)
         preconditioner.setUp()
 
     def factorisation(self) -> PC | None:
-        """PETSc's preconditioner with the factors of the last tangent; None where there are none."""
+        """Return PETSc's preconditioner with the last factorisation, or None without one."""
         preconditioner = self.snes.getKSP().getPC()
         has_factors = self.tangents and preconditioner.getType() in ("lu", "cholesky", "telescope")
         return preconditioner if has_factors else None
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free all objects of PETSc."""
 
 
 class Multigrid(EveryTangent):
-    """GMRES with levels: of degree 1 below degree 2, made anew with each tangent, or kept as PETSc's options say."""
+    """GMRES with multigrid: new levels per tangent below degree 2, otherwise by PETSc's options."""
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
         self._solver, self._space = snes.getKSP(), equilibrium.state.unknown.function_space
-        self._far = self._solver.getTolerances()[0]  # of the method: as Newton's method needs it far away
+        self._far = self._solver.getTolerances()[0]  # tolerance far from the solution
         self._below: DegreeOne | None = None
         if equilibrium.state.kinematics.reduced:
             return
@@ -377,7 +393,8 @@ class Multigrid(EveryTangent):
         if self._space.ufl_element().degree > 1 and not given & {"pc", "mg"}:
             self._below = DegreeOne(self._solver.getPC(), degree_one(self._space), matrix, elastic=True)
             if self._chooses:
-                self._solver.setPCSide(PETSc.PC.Side.RIGHT)  # its tolerance is then that of the residual itself
+                # The tolerance is then that of the residual itself.
+                self._solver.setPCSide(PETSc.PC.Side.RIGHT)
         else:
             matrix.setNearNullSpace(rigid_motions(self._space, matrix))
 
@@ -396,17 +413,19 @@ class Multigrid(EveryTangent):
 
     def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
         if self._below is None:
-            return "with new levels in every iteration", self._anew()
+            return "with new multigrid levels in every iteration", self._anew()
         if self.snes.getConvergedReason() != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
             return None
-        self.close()  # a stiff bulk needs more than degree 1 knows of it, and an error measured by the levels
+        # Nearly incompressible tissue needs levels of the matrix itself, and an error norm measured
+        # by them.
+        self.close()
         self._solver.getPC().setFromOptions()
         self.matrix.setNearNullSpace(rigid_motions(self._space, self.matrix))
         if self._chooses:
             self._solver.setPCSide(PETSc.PC.Side.LEFT)
             self._solver.setNormType(PETSc.KSP.NormType.PRECONDITIONED)
             self._solver.setTolerances(rtol=self._far)
-        return "with levels of the matrix, from now on", nullcontext()
+        return "with multigrid levels of the matrix from now on", nullcontext()
 
     def close(self) -> None:
         if self._below is not None:
@@ -415,10 +434,11 @@ class Multigrid(EveryTangent):
 
 
 class Lagged(EveryTangent):
-    """Modified Newton with quasi-Newton steps: the tangent is renewed where that costs less than going on without."""
+    """Modified Newton with L-BFGS: the tangent is renewed if more iterations would cost more."""
 
     keeps = True
-    _begins_anew = False  # whether each solve has factors of its own, renewed as soon as one iteration says so
+    # Whether each solve factorises first, and one slow iteration suffices to do so again.
+    _begins_anew = False
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
@@ -429,11 +449,13 @@ class Lagged(EveryTangent):
             preconditioner.setType(PETSc.PC.Type.PYTHON)
             preconditioner.setPythonContext(self.factor)
         self.secants = Secants(equilibrium.comm)
-        self._before = 0  # tangents before the solve
-        self._norms: list[float] = []  # of the residual since the tangent was renewed, of this solve
+        self._before = 0  # number of tangents before the solve
+        # Norms of the residual in this solve since the tangent was renewed.
+        self._norms: list[float] = []
         self._due = True
         self.worth = worth(matrix.getSize()[0])
-        self._spent, self._solves = 0.0, 0  # iterations since the factor was made, its cost included, and solves
+        # Iterations, including the cost of the factorisation, and solves since then.
+        self._spent, self._solves = 0.0, 0
 
     @property
     def more_iterations(self) -> int:
@@ -452,7 +474,7 @@ class Lagged(EveryTangent):
         return self._renewed_over(2 * MOST_RENEWALS)
 
     def _renewed_over(self, most: int) -> bool:
-        """Whether this solve, where factors may be kept, has made more than so many."""
+        """Return whether this solve has renewed the tangent more than `most` times, if it lags."""
         return not self._always and not self._begins_anew and self.tangents - self._before > most
 
     def tangent(self, norm: float, tolerance: float) -> None:
@@ -475,18 +497,20 @@ class Lagged(EveryTangent):
         return self.secants.improve(x, residual, step)
 
     def ended(self, iterations: int) -> None:
-        """The next step starts with a new factor after a slow one."""
-        # The mean cost of a step, its share of the factor included, is least where the next step would cost more.
+        """Decide whether the next step starts with a new factorisation."""
+        # The mean cost of a step, including that of the factorisation, is smallest if the next step
+        # would cost more.
         self._spent, self._solves = self._spent + iterations, self._solves + 1
         self._due = self._always or iterations > SLOW_STEP * self.worth or iterations * self._solves > self._spent
 
     def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return None if self._always else ("with new factors in every iteration", self._anew())
+        return None if self._always else ("with a new factorisation in every iteration", self._anew())
 
     def _costs_more(self, tolerance: float) -> bool:
-        """Whether the iterations that are left cost more than new factors; also where the residual rises."""
-        # The first iteration with a factor tells whether the problem is near linear. The second one often is worse, and
-        # L-BFGS makes up for it: only three of them tell more.
+        """Return whether the remaining iterations cost more than factorising, or diverge."""
+        # The first iteration with a factorisation shows whether the problem is nearly linear. The
+        # second is often worse, and L-BFGS makes up for it. So the next estimate needs three
+        # iterations.
         since = len(self._norms) - 1
         if since == 0 or (1 < since < OVER and not self._begins_anew):
             return False
@@ -505,7 +529,7 @@ class Lagged(EveryTangent):
 
 
 def uneven(vector: Vec) -> Vec:
-    """The vector, filled with what no symmetry leaves unchanged."""
+    """Fill a vector with values that no symmetry leaves unchanged, and return it."""
     first, last = vector.getOwnershipRange()
     vector.array[:] = np.sin(1.0 + np.arange(first, last) * np.sqrt(2.0))
     return vector

@@ -1,4 +1,4 @@
-"""Newton's method for one equilibrium: PETSc SNES, with the tangent or an older one, and the guards r < L, J > 0."""
+"""Newton's method for one equilibrium, with PETSc SNES and the guards r < L and J > 0."""
 
 from __future__ import annotations
 
@@ -32,27 +32,29 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 
-# ---------------------------------------------------------------- when Newton's method has converged
-# A residual below a tolerance that no rounding error can pass.
+# ---------------------------------------------------------------- convergence
+# The residual must be below a tolerance that is not below rounding errors.
 
-FORCE_ROUNDINGS = 8.0  # how many times the rounding of assembled forces a residual may be
-# the same of the rounding of displacements; 0.07 to 4 were measured on thin and on stiff walls. What only this rounding
-# allows is accepted where it goes no further down
+FORCE_ROUNDINGS = 8.0  # accepted residual over the rounding error of assembled forces
+# Accepted residual over the rounding error of displacements; 0.07 to 4 were measured on thin and on
+# stiff walls. A residual that only this rounding error allows is accepted if it stagnates.
 ROUNDED_STRAINS = 8.0
-PRESCRIBED_TOLERANCE = (
-    1e-10  # of the body's size: how far a prescribed displacement may be missed; no force measures it
-)
-PRESCRIBED_ROUNDING = 1e-13  # of the body's size: prescribed values that are met to rounding
-# Of the nodal forces: residual of a part that others follow. A part may be 1/256 of a step, and the next one is held
-# against its direction: of 1e-3, which quasi-Newton steps stop just below, some were taken for jumps
+# Largest error of a prescribed displacement, relative to the body's size. No force measures it.
+PRESCRIBED_TOLERANCE = 1e-10
+# Error of prescribed values up to rounding, relative to the body's size.
+PRESCRIBED_ROUNDING = 1e-13
+# Residual of all substeps but the last, relative to the nodal forces. A substep may be 1/256 of a
+# step, and the next one is compared with its direction. With 1e-3, just below which quasi-Newton
+# steps stop, some were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
-# Above this r/L the rounding of one point may be more than this share of the nodal forces. A residual below it is then
-# accepted only when an iteration leaves more than this share of it
+# If r/L exceeds the first number, the rounding error of one point may exceed the second one times
+# the nodal forces. A residual below it is then accepted only if it exceeds the third one times the
+# residual before.
 NEARLY_STRAIGHT, COARSE, STAGNATION = 0.99, 1e-8, 0.25
 
 
 class Convergence:
-    """|R| <= absolute_tolerance + relative_tolerance |nodal forces|, not below the rounding of assembled forces."""
+    """Test of |R| <= absolute_tolerance + relative_tolerance |nodal forces|, or rounding errors."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver):
         self.equilibrium, self.settings = equilibrium, settings
@@ -65,19 +67,20 @@ class Convergence:
         self.begin()
 
     def begin(self) -> None:
-        """A solve begins: parameters may be others from solve to solve, not within one."""
+        """Prepare for a solve: parameters may change between solves, but not within one."""
         self._largest = self.equilibrium.parameters.largest()
         self.extended(self.max_chain_extension)
 
     def extended(self, max_chain_extension: float) -> None:
-        """An admissible state has this largest r/L."""
+        """Set the largest r/L of an admissible state."""
         self.max_chain_extension = max_chain_extension
         self._stress_rounding = stress_rounding(self._largest, max_chain_extension)
 
     def reached(self, norm: float, previous: float) -> bool:
-        """Whether a residual of this norm is accepted; `previous`: that of the iteration before, infinite at first."""
-        # Near L the rounding of the worst point may be far above that of all others, and the largest displacement is
-        # not that of all elements. What is below such a rounding is accepted only when it goes no further down.
+        """Return whether a residual norm is accepted; `previous`: the norm before, or infinity."""
+        # Near L the rounding error of the worst point may be far above that of all other points,
+        # and the largest displacement is not that of all elements. A residual below such an error
+        # is accepted only if it stagnates.
         if self.prescribed_gap > PRESCRIBED_TOLERANCE:
             return False
         if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
@@ -91,13 +94,14 @@ class Convergence:
         return norm <= certain or norm > STAGNATION * previous
 
     def goal(self) -> float:
-        """Norm of the residual at which the solve ends, about."""
+        """Return the approximate norm of the residual at which the solve ends."""
         coarse = INTERMEDIATE_TOLERANCE * self.force_scale if self.intermediate else 0.0
         return max(coarse, self.tolerance())
 
     def tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
-        """In the unit of force: relative to the nodal forces, not below the rounding of forces that cancel there."""
-        # Stresses are rounded, and so are displacements: over a thin element that is a strain of eps |u|/h.
+        """Return the tolerance in the unit of force, at least the rounding error of forces."""
+        # Stresses have rounding errors, and so have displacements: in a thin element that is a
+        # strain of eps |u|/h.
         relative = self.settings.relative_tolerance * self.force_scale
         area = FORCE_ROUNDINGS * self._area + rounded_strains * self.displacement * self._area_of_gradients
         return self.settings.absolute_tolerance + max(relative, self._stress_rounding * area)
@@ -106,19 +110,22 @@ class Convergence:
 # ---------------------------------------------------------------- admissible states
 # The limits r < L and J > 0 in the line search of Newton's method.
 
-NEAR_LIMIT, RESERVE = 0.95, 0.3  # a Newton step that ends above this r/L keeps this share of 1 - r/L
+# A Newton step that ends above this r/L keeps this fraction of 1 - r/L.
+NEAR_LIMIT, RESERVE = 0.95, 0.3
 NOWHERE = Extension(0.0, 1.0, (np.nan,) * 3)
-LINE_SEARCH_HALVINGS = 20  # of one Newton step, before the solve is given up
-POSSIBLE_JUMP = 1e-3  # of the body's size: displacements that may be a jump; 1 % of the radius of a tube of this length
+LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
+# Smallest displacement of a jump, relative to the body's size: 1 % of the radius of a tube of this
+# length.
+POSSIBLE_JUMP = 1e-3
 
 
 @dataclass(eq=False)
 class Counted:
-    """Work of the solver."""
+    """Work of the solver: iterations and tangents."""
 
     newton_iterations: int = 0
     linear_iterations: int = 0
-    tangents: int = 0  # that were assembled
+    tangents: int = 0  # number of assembled tangents
 
     def count(self, other: Counted) -> None:
         """Add the work of another solve."""
@@ -129,15 +136,16 @@ class Counted:
 
 @dataclass
 class Solution(Counted):
-    """How a solve has ended."""
+    """Result of a successful solve."""
 
     residual: float = 0.0
     extension: Extension = NOWHERE
-    reach: float = 0.0  # how far it is from its origin, over how far the first iterate was; 0 where that says nothing
+    # Distance from the origin over that of the first iterate; 0 for small distances.
+    reach: float = 0.0
 
 
 class SolveFailure(RuntimeError, Counted):
-    """SNES did not find an admissible equilibrium; the unknowns before the call are restored."""
+    """Failure of SNES to find an admissible equilibrium; the unknowns before it are restored."""
 
     def __init__(
         self,
@@ -155,29 +163,30 @@ class SolveFailure(RuntimeError, Counted):
 
 @dataclass
 class _Solve:
-    """What is known within one solve."""
+    """Data of one solve."""
 
     origin: Array
     first_iterate: float | None = None
     norm: float = np.inf
     previous: float = np.inf
     inadmissible: bool = False
-    room: float = 0.0  # |dF| around the last state that was looked at within which all are admissible
-    is_certain: bool = False  # whether the state is within it
+    # Radius |dF| around the last evaluated state in which all states are admissible.
+    room: float = 0.0
+    is_certain: bool = False  # whether the state is within this radius
 
 
-# by PETSc's SNESConvergedReason; numbers, for the names differ between its versions
+# By PETSc's SNESConvergedReason, as numbers, because the names differ between its versions.
 SNES_REASONS = {
     -3: "the linear solver failed",
-    -4: "forces or parameters are too large or too small for floating-point numbers",
-    -6: "the line search found no better state",
-    -9: "the residual grew beyond all bounds",
+    -4: "overflow or NaN in the residual; check units and magnitudes of loads and parameters",
+    -6: "the line search did not reduce the residual",
+    -9: "the residual diverged",
 }
 MOST_ITERATIONS = -5
 
 
 def failure_text(reason: int, iterations: int, extension: Extension) -> str:
-    """Why SNES has ended; where it did not fail itself, the state is not admissible."""
+    """Return why SNES has failed; if it has converged, the state is not admissible."""
     if reason >= 0:
         return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
     if reason == MOST_ITERATIONS:
@@ -186,7 +195,7 @@ def failure_text(reason: int, iterations: int, extension: Extension) -> str:
 
 
 class GuardedNewton:
-    """Solves an equilibrium from the present unknowns; use `close` when it is needed no more."""
+    """Newton's method with guards, from the present unknowns; see `close`. Collective."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
         self.equilibrium, self.settings, self._robust = equilibrium, settings, robust
@@ -201,11 +210,12 @@ class GuardedNewton:
         self._make_solver()
 
     def _make_solver(self) -> None:
-        """PETSc's objects of the method, which a body has for all of its steps."""
+        """Create PETSc's objects of the method, which serve all steps."""
         equilibrium, settings, kinematics = self.equilibrium, self.settings, self.equilibrium.state.kinematics
         unknowns, ranks, narrow = self._x.getSize(), equilibrium.comm.size, not kinematics.three_dimensional
         self.method = method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
-        # where a method is named, three dimensions stay with it: its numbers shall not depend on their size
+        # In three dimensions a named method is not replaced, so that results do not depend on the
+        # size.
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
         bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
@@ -216,7 +226,8 @@ class GuardedNewton:
         snes.setLineSearchPreCheck(self._keep_admissible)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=settings.maximum_iterations)
         self._options.apply(snes)
-        self._most_iterations = snes.getTolerances()[3]  # the user's PETSc option may have changed it
+        # A PETSc option of the user may have changed it.
+        self._most_iterations = snes.getTolerances()[3]
         snes.setConvergenceTest(self._converged)
         self._snes: PETSc.SNES = snes
         self._linear: EveryTangent = SOLVER_METHODS[method].make_linear(equilibrium, snes, self._matrix, self._options)
@@ -224,7 +235,7 @@ class GuardedNewton:
             self._linear.keep_nothing()
 
     def close(self) -> None:
-        """Free PETSc's objects and take the options out of its database; calling it again does nothing."""
+        """Free PETSc's objects and options. Further calls have no effect."""
         if self._snes is None:
             return
         self._linear.close()
@@ -235,7 +246,7 @@ class GuardedNewton:
         self._snes = None
 
     def solve(self, origin: Array | None = None, roughly: bool = False) -> Solution:
-        """Solve from the present unknowns; on success they are the solution. `roughly`: others follow."""
+        """Solve from the present unknowns, and set them; `roughly`: more substeps follow."""
         self.convergence.intermediate = roughly
         first = attempted(lambda: self._attempt(origin, self._linear.more_iterations), SolveFailure)
         if isinstance(first, Solution):
@@ -253,7 +264,7 @@ class GuardedNewton:
         return again
 
     def may_start(self, last_extension: float) -> bool:
-        """Whether the present unknowns, from which `solve` is to start, are admissible and not too near to locking."""
+        """Return whether a solve may start here: admissible, and not too near to locking."""
         extension, least = self.equilibrium.extension(), RESERVE * (1 - last_extension)
         near = extension.max_chain_extension > NEAR_LIMIT and 1 - extension.max_chain_extension < least
         return extension.admissible and not near
@@ -285,7 +296,7 @@ class GuardedNewton:
         raise SolveFailure(text, found, left, relative, norm > STAGNATION * self._present.previous)
 
     def _reach(self) -> float:
-        """`Solution.reach` of the present unknowns."""
+        """Return `Solution.reach` of the present unknowns. Collective."""
         comm, state, present = self.equilibrium.comm, self.equilibrium.state, self._present
         change = self._values - present.origin
         largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
@@ -294,12 +305,12 @@ class GuardedNewton:
         return self._length(change[: state.number_of_owned_unknowns]) / present.first_iterate
 
     def _length(self, change: Array) -> float:
-        """Norm of a change of the unknowns; of this rank only those that it owns."""
+        """Return the norm of a change of the unknowns that this rank owns. Collective."""
         return float(np.sqrt(over_ranks(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
     def answer(self, equilibrium: Equilibrium, tangents: int) -> Array:
-        """Change of a solved state's unknowns with which the residual of `equilibrium` vanishes; one linear system."""
-        # `tangents` were assembled for that state: the last one counts, or where there is none a new one.
+        """Solve one linear system for the change that balances `equilibrium`. Collective."""
+        # `tangents` is the number assembled for that state. Without any a new one is assembled.
         self._pull(self._x)
         equilibrium.assemble_internal(self._residual)
         equilibrium.assemble_external(self._external)
@@ -317,11 +328,11 @@ class GuardedNewton:
         return values
 
     def factorisation(self) -> PETSc.PC | None:
-        """PETSc's preconditioner with the factors of the last tangent; None where the method does not factorise."""
+        """Return PETSc's preconditioner with the last factorisation, or None without one."""
         return self._linear.factorisation()
 
     def _warn_of_unused_options(self) -> None:
-        """Once, after the first solve; on all ranks, for each has a database of options."""
+        """Warn of unused PETSc options, once, after the first solve. Collective."""
         if self._options_checked:
             return
         self._options_checked = True
@@ -345,19 +356,20 @@ class GuardedNewton:
             self._values[:] = local.array_r
 
     def _assemble_residual(self, snes: PETSc.SNES, x: PETSc.Vec, residual: PETSc.Vec) -> None:
-        """R = internal forces - loads, zero where displacements are prescribed and met."""
-        # Fills R with NaN where the state is not admissible: line searches that know NaN shorten their step, others
-        # stop.
+        """Assemble R = internal forces - loads, zero for prescribed displacements that are met."""
+        # R is NaN if the state is not admissible. Line searches that handle NaN shorten their step,
+        # others stop.
         self._push(x)
         equilibrium, loading = self.equilibrium, self.equilibrium.state.loading
         equilibrium.assemble_internal(residual)
         equilibrium.assemble_external(self._external)
-        # forces at the nodes, reactions included: what the residual must be small against
+        # The residual must be small compared with the forces at the nodes, including reactions.
         self.convergence.force_scale = max(residual.norm(), self._external.norm())
         residual.axpy(1.0, self._external)
         self.convergence.prescribed_gap = equilibrium.prescribed_gap() / loading.domain.size
         if self.convergence.prescribed_gap > PRESCRIBED_ROUNDING:
-            # lifting assembles tangents of the constrained elements; it adds exactly zero once x meets the conditions
+            # Lifting assembles tangents of the constrained elements. It adds exactly zero once x
+            # meets the conditions.
             equilibrium.assemble_lifting(self._external, x)
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
@@ -376,16 +388,17 @@ class GuardedNewton:
         self.convergence.displacement = x.norm(PETSc.NormType.NORM_INFINITY)
 
     def _keep_admissible(self, x: PETSc.Vec, step: PETSc.Vec) -> bool:
-        """Halve the Newton step until r < L and J > 0 everywhere (trial: x - step). True when it changed the step."""
-        # J > 0 all the way there: a step that turns two axes of an element has J > 0 at its end again. Near L each
-        # point also keeps a share of its 1 - r/L: from a point much too near, where forces are huge, Newton's method
-        # comes back only by a factor of 1.5 an iteration.
+        """Halve the step until r < L and J > 0 (trial: x - step). Return whether it changed."""
+        # J must be positive on the whole path, because a step that inverts two axes of an element
+        # has J > 0 at its end again. Near L each point also keeps a fraction of its 1 - r/L. Much
+        # too near to L forces are huge, and Newton's method moves away only by a factor of 1.5 an
+        # iteration.
         met, present = self.convergence.prescribed_gap <= PRESCRIBED_ROUNDING, self._present
         improved = self._linear.improve(x, self._snes.getFunction()[0], step, met)
         if present.first_iterate is None:
             first = x.array_r - step.array_r
             present.first_iterate = self._length(first - present.origin[: first.size])
-        # so far |dF| goes at most; where that is admissible for certain, nobody looks
+        # This bounds |dF|. No evaluation is needed if the bound is within the admissible radius.
         largest = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
         present.room -= self.equilibrium.quadrature.largest_gradient * largest
         present.is_certain = present.room > 0.0
@@ -401,13 +414,13 @@ class GuardedNewton:
                 break
             step.scale(0.5)
         else:
-            log.debug("no admissible step after %d halvings", LINE_SEARCH_HALVINGS)
+            log.debug("line search failed: no step with r < L and J > 0 after %d halvings", LINE_SEARCH_HALVINGS)
         if halving:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
 
     def _allows(self, before: Look, after: Look) -> bool:
-        """Whether a step may end there: at an admissible state, with a reserve near L, and no J <= 0 on the way."""
+        """Return whether a step is admissible: its end, a margin near L, and J > 0 on its path."""
         near, equilibrium = after.extension.max_chain_extension > NEAR_LIMIT, self.equilibrium
         if not after.extension.admissible:
             return False
@@ -416,7 +429,7 @@ class GuardedNewton:
         return not equilibrium.turns_inside_out(before, after)
 
     def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
-        """SNES asks after every iteration: `Convergence`, or no more iterations."""
+        """Return the SNES reason after an iteration, from `Convergence` and the iteration limit."""
         norm = norms[2]
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN

@@ -1,7 +1,6 @@
-"""What looks on and warns, off the path of a step: each is a `Watcher`. Without it a run is the same.
+"""Watchers that warn of the state of a run, without an influence on its results."""
 
-One is no warning: `EquilibriumStability` ends a run where `solver.unstable` is "stop".
-"""
+# Except for `EquilibriumStability`, which ends a run if `solver.unstable` is "stop".
 
 from __future__ import annotations
 
@@ -18,15 +17,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WatcherKind:
-    """A watcher as runs know it.
+    """Kind of watcher, registered by name.
 
     Attributes
     ----------
     maker
-        Function of a scene and a stepper that gives a `Watcher`, or None where there is nothing to watch; or its dotted
-        name.
+        Function of a scene and a stepper that returns a `Watcher`, or None if there is nothing to
+        watch; or its dotted name.
     each_case
-        Whether it looks at solved states, whatever the cells do: each load case then has one of its own.
+        Whether it watches solved states only, so that each load case has its own watcher.
 
     Examples
     --------
@@ -52,7 +51,7 @@ class WatcherKind:
     each_case: bool = False
 
     def make(self, scene: Scene, stepper: LoadCaseSolver) -> Watcher | None:
-        """The watcher of a scene's stepper, or of another load case; None where there is nothing to watch.
+        """Return the watcher of a stepper or load case, or None if there is nothing to watch.
 
         Parameters
         ----------
@@ -76,4 +75,4 @@ WATCHERS = {
     "radial-chains": WatcherKind(_WARNINGS + "RadialChains.of"),
     "fronts": WatcherKind(_WARNINGS + "FrontsInLayers.of"),
 }
-"""By name, in the order in which they see a step."""
+"""Watchers by name, in the order in which they see a step."""

@@ -1,4 +1,4 @@
-"""Whether passes over-correct, told from the run itself: cells that swing, or that make up for a rest at once."""
+"""Overshooting passes, detected in the run: oscillating cells, and cells that make up a delay."""
 
 from __future__ import annotations
 
@@ -17,25 +17,32 @@ from remodel_fenicsx.state import Earlier
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
-ORDER = 3  # of the difference over passes that takes a smooth course away and keeps what changes its sign each time
-GAIN = 2.0**ORDER  # by which it magnifies that
-# factor of a pass, and passes in a row, from which on a swing is told that will be over `TOLD_SIZE` after one more:
-# the beginning of an instability, of the cells over r0^2. All bodies that left their solution had it, no other one
+# Order of the difference over passes. It removes a smooth course, and keeps a part that changes its
+# sign in each pass.
+ORDER = 3
+GAIN = 2.0**ORDER  # factor of the difference on the oscillating part
+# Factor of a pass, and number of successive passes, of an oscillation that is reported if it
+# exceeds `TOLD_SIZE` after one more pass. GROWING is the start of an instability, of the cells over
+# r0^2: all bodies that left their solution had it, and no other body.
 GROWING = -1.2, 2
-# its end, of the displacement over itself: random cells swing for ever at single points, each its own way, which the
-# body hardly feels
+# SUSTAINED is its end, of the displacement relative to itself. Random cells oscillate for ever at
+# single points, without a common phase, which has hardly any effect on the body.
 SUSTAINED = -0.9, 3
 TOLD_SIZE = 0.02
-RESTED_SHARE = 0.5  # of the body: after a pass that has left so much of it as it was, a jump is no swing
-UNEVEN = 1.5  # ratio of two steps up to which they are about alike; of uneven ones a jump looks like a swing
-LOAD_JUMP = 1e-3  # share of a load by which it may swing itself
-# root mean square over the body of what cells after a rest change in A in one pass, over r0^2
+# Largest fraction of the body that a pass may leave unchanged. After more a jump is no oscillation.
+RESTED_SHARE = 0.5
+# Largest ratio of two steps of similar size. A jump looks like an oscillation if the steps differ
+# more.
+UNEVEN = 1.5
+LOAD_JUMP = 1e-3  # largest oscillation of a load, relative to the load
+# RMS over the body of the change of A in one pass after a delay, over r0^2, above which a run
+# warns.
 RESUMED_CHANGE = 0.03
 
 
 def _difference(times: Array, values: Array) -> Array:
-    """Difference of order ORDER over the newest passes: of equal steps 1, -3, 3, -1 times the values."""
-    # Of passes that are not equally far from each other it is the divided difference, made as large.
+    """Return the difference of order ORDER over the newest passes, 1, -3, 3, -1 for equal steps."""
+    # For unequal steps it is the divided difference, scaled to the same size.
     apart = np.subtract.outer(times[: ORDER + 1], times[: ORDER + 1])
     np.fill_diagonal(apart, 1.0)
     weights = 1.0 / apart.prod(axis=1)
@@ -43,14 +50,14 @@ def _difference(times: Array, values: Array) -> Array:
 
 
 class Swing(NamedTuple):
-    """The part of a step's change that the pass before had made the other way round."""
+    """Oscillation from pass to pass: its size, and the factor of the last pass."""
 
     size: float
     factor: float
 
 
 class OverCorrection(WarnsOnce):
-    """Warns, once, when the cells swing to and fro from pass to pass so that results suffer."""
+    """Warning that the cells oscillate from pass to pass, with an effect on results."""
 
     name = "over_correction"
     initial = dict.fromkeys(("growing", "sustained", *(f"time_{age}" for age in range(ORDER + 1))), 0.0)
@@ -58,7 +65,7 @@ class OverCorrection(WarnsOnce):
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
         self.swings: dict[str, Swing] = {}
-        # of the passes before, with the newest one
+        # Histories of previous passes, including the newest one.
         cells = partial(self.quadrature.function, "", (6,))
         self._cells = Earlier(self.state, "over_correction_cells", cells, ORDER + 1)
         self._body = Earlier(self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1)
@@ -69,7 +76,7 @@ class OverCorrection(WarnsOnce):
         return cls(stepper) if stepper.remodeling.law.remodels and not scene.time.is_equilibrium else None
 
     def started(self, step: Step) -> None:
-        """Remember the cells before the first pass, and nothing else."""
+        """Reset the histories to the cells before the first pass. Collective."""
         for memory in (self._cells, self._body, self._numbers):
             memory.forget()
         if self.rested is not None:
@@ -77,7 +84,7 @@ class OverCorrection(WarnsOnce):
         self.completed(step)
 
     def completed(self, step: Step) -> None:
-        """Judge one pass more, and remember it."""
+        """Check the new pass, and record it. Collective."""
         structure = to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
         cells, known, numbers = [structure, *self._cells.values], self._cells.known, self._numbers
         structures = np.reshape(cells, (len(cells), *self.quadrature.shape, 6))
@@ -92,7 +99,7 @@ class OverCorrection(WarnsOnce):
             numbers[f"time_{age}"] = time
 
     def _judge(self, step: Step, cells: Array, times: Array) -> None:
-        """Say what swings, of the last passes (passes, ...), the newest first."""
+        """Warn of oscillations of the last passes (passes, ...), the newest first. Collective."""
         quadrature, r0 = self.quadrature, self.stepper.remodeling.parameters.largest().end_to_end_length
         scale = np.sqrt(quadrature.owned(quadrature.volumes) / quadrature.volume)[..., None] / r0**2
         of_cells = (cells[:, : len(scale)] * scale).reshape(len(cells), -1)
@@ -109,22 +116,23 @@ class OverCorrection(WarnsOnce):
             most = quadrature.shown_place_of_largest(np.linalg.norm(_difference(times, cells), axis=-1))
             self.find(
                 step,
-                "the remodeling pass over-corrects: from pass to pass the cells swing to and fro. The structure tensor "
-                f"A changes by {cells_swing.size:.2g} r0^2 (root mean square; most at {most}), the displacement "
-                f"by {body_swing.size:.2g} of its size; each pass multiplies this by about "
-                f"{cells_swing.factor:.2g}. Results may be wrong from here on; set "
-                f"{self._advice(cells_swing.factor)} (docs/theory.md, Stability of the pass)",
+                "the remodeling pass overshoots: the cells oscillate from pass to pass. "
+                f"The structure tensor A changes by {cells_swing.size:.2g} r0^2 (RMS; maximum at "
+                f"{most}), the displacement by {body_swing.size:.2g} of its size; "
+                f"each pass multiplies this by about {cells_swing.factor:.2g}. "
+                f"Results may be wrong from here on; set {self._advice(cells_swing.factor)} "
+                "(docs/theory.md, Stability of the pass)",
             )
 
     def _swing(self, times: Array, values: Array) -> Swing:
-        """Return that of values of this rank (passes, n), as root of their sum of squares."""
+        """Return the oscillation of this rank's values (passes, n), in their norm. Collective."""
         changes = np.array([_difference(times, values), _difference(times[1:], values[1:])])
         products = over_ranks(self.state.comm, changes @ changes.T, MPI.SUM)
         return Swing(np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf))
 
     def _tells(self, step: Step, cells: Array, times: Array) -> bool:
-        """Whether a swing is one of passes: not of loads, of uneven steps, nor of cells that had rested."""
-        # it starts unloaded
+        """Return whether passes oscillate, not loads, unequal steps or delays. Collective."""
+        # At time 0 there are no loads.
         loads = np.array([[*self.stepper.load_values(time).values()] for time in times]) * (times[:, None] > 0)
         lengths, rested = -np.diff(times), (cells[:-1] == cells[1:]).all(axis=-1).astype(np.float64)
         return bool(
@@ -134,7 +142,7 @@ class OverCorrection(WarnsOnce):
         )
 
     def _advice(self, factor: float) -> str:
-        """A share of the pass with which the swing dies out: 1 - theta (1 - f) > -1."""
+        """Return the setting of theta that damps the oscillation: 1 - theta (1 - f) > -1."""
         share = self.stepper.remodeling.relaxation
         stable = 2 * share / (1 - factor)
         if share == 1.0 and stable > 0.5:
@@ -143,29 +151,29 @@ class OverCorrection(WarnsOnce):
 
 
 class RestedCells(WarnsOnce):
-    """Warns, once, when cells that had rested change in one pass as much as if they had remodeled all the time."""
+    """Warning that cells make up in one pass for a phase without tension."""
 
     name = "rested_cells"
 
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
-        # passes since a cell has moved, by points; 0 before it ever did
+        # Number of passes at each point since its cell has changed; 0 before its first change.
         self._rest = Earlier(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
 
     def forget(self) -> None:
-        """Forget all passes."""
+        """Reset the record of all passes."""
         self._rest.forget()
         self._numbers.forget()
 
     def compare(self, step: Step, changes: Array, time_before: float) -> None:
-        """Judge one pass more: its changes of A (elements, points, 6), and the time of the one before."""
+        """Check the changes of A (elements, points, 6) in a pass since a time. Collective."""
         now = changes.any(axis=-1)
         rest = np.reshape(self._rest.values, (self._rest.known, *now.shape)).sum(axis=0)
         self._rest.push(np.where(now, 1.0, rest + (rest > 0)).ravel())
-        # a rest without loads is the loads', and no matter of steps
+        # A phase without loads is due to the loads, not to the steps.
         if self.said or not any(self.stepper.load_values(time_before).values()):
             return
-        # |change of A|^2 where it was made up for
+        # |change of A|^2 at the points that make up a delay.
         squares = np.where(now & (rest > 1), np.square(changes).sum(axis=-1), 0.0)
         r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
         if (change := np.sqrt(self.quadrature.mean(squares)) / r0**2) < RESUMED_CHANGE:
@@ -173,9 +181,10 @@ class RestedCells(WarnsOnce):
         share = self.quadrature.mean((squares > 0).astype(float))
         self.find(
             step,
-            "cells that had rested without tension remodel again, and the law catches up in one pass. In "
-            f"{100 * share:.2g} % of the body the structure tensor A changes by {change:.2g} r0^2 (root mean square "
-            f"over the body; most at {self.quadrature.shown_place_of_largest(squares)}). "
-            'When cells rest depends on time.step, and so does the result; set remodeling.coupling = "relaxed", or a '
-            "remodeling.law that is a rate (docs/theory.md, Stability of the pass)",
+            "cells resume remodeling after a phase without tension; an absolute-time law makes up "
+            f"the delay in one pass. In {100 * share:.2g} % of the body the structure tensor A "
+            f"changes by {change:.2g} r0^2 (RMS over the body; maximum at "
+            f"{self.quadrature.shown_place_of_largest(squares)}). This depends on time.step; set "
+            'remodeling.coupling = "relaxed", or a remodeling.law that is a rate '
+            "(docs/theory.md, Stability of the pass)",
         )

@@ -1,4 +1,4 @@
-"""Whether equilibria are stable, by the tangent's curvature; whether whole bodies of a reduction would buckle."""
+"""Stability of equilibria by the tangent's inertia, and buckling that a reduction cannot show."""
 
 from __future__ import annotations
 
@@ -25,14 +25,18 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-ITERATIONS_BETWEEN_LOOKS = 100  # Newton iterations with a tangent, each of about the cost of a look
-OLD_FACTOR = 1 / 8  # of these, what an iteration without a new tangent counts
-MOST_UNKNOWNS = 200_000  # of a look that nobody has asked for: factors of more take minutes and gigabytes
-FIRST_INVERSE_ITERATIONS = 3  # later steps go on from the vector of the step before: one each
+# Number of Newton iterations with a tangent between two counts. A count costs about as much as an
+# iteration.
+ITERATIONS_BETWEEN_LOOKS = 100
+OLD_FACTOR = 1 / 8  # weight of an iteration without a new tangent in this number
+# Largest number of unknowns for a count without a request. Above it a factorisation takes minutes
+# and gigabytes.
+MOST_UNKNOWNS = 200_000
+FIRST_INVERSE_ITERATIONS = 3  # later steps do one iteration from the vector of the step before
 
 
 class EquilibriumStability(Watcher):
-    """Knows the number of negative eigenvalues of the tangent at solved states, and says when it changes."""
+    """Watcher that counts negative eigenvalues of the tangent and logs changes. Collective."""
 
     def __init__(self, stepper: LoadCaseSolver, unstable: str = "warn", every_step: bool = False):
         self.stepper, self.state = stepper, stepper.state
@@ -40,7 +44,7 @@ class EquilibriumStability(Watcher):
         self.inertia = Inertia(stepper.coupling.equilibrium)
         self._vector = Earlier(self.state, "stability_vector", self.state.unknown.copy, 1)
         self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
-        # eigenvalues that are known, and Newton iterations since the last look
+        # The last number of negative eigenvalues, and Newton iterations since the last count.
         self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
 
     def close(self) -> None:
@@ -49,12 +53,12 @@ class EquilibriumStability(Watcher):
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:
-        """Count at the start, where it is a row that somebody wants."""
+        """Count at the start if every row has the number."""
         if self.every_step:
             step.negative_eigenvalues = self._count()
 
     def solved(self, step: Step) -> None:
-        """Count, if it is time."""
+        """Count if a count is due or the curvature is negative."""
         known = int(self._numbers["known"])
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
@@ -67,8 +71,9 @@ class EquilibriumStability(Watcher):
             if step.is_last:
                 self._say(
                     logging.INFO,
-                    f"the stability of equilibria was not checked: with {self.unknowns} unknowns that is done only on "
-                    "request, by the column negative_eigenvalues or solver.unstable = 'stop'",
+                    f"the stability of equilibria was not checked: with {self.unknowns} unknowns "
+                    "that is done only on request, by the column negative_eigenvalues or "
+                    "solver.unstable = 'stop'",
                 )
         if not (suspicious or overdue or self.every_step):
             return
@@ -80,7 +85,7 @@ class EquilibriumStability(Watcher):
             self._numbers["known"] = count
             self._judge(step, known, int(count))
 
-    # ------------------------------------------------------------ what it means
+    # ------------------------------------------------------------ messages
     def _count(self) -> float:
         try:
             return self.inertia.negative_eigenvalues()
@@ -96,14 +101,14 @@ class EquilibriumStability(Watcher):
         if now <= unloaded:
             self._say(
                 logging.INFO,
-                f"{step.moment}: {eigenvalues(now)} of the tangent. The unloaded body has {unloaded}, from the "
-                "stress of its cells at the start: the equilibrium is not lost",
+                f"{step.moment}: {eigenvalues(now)} of the tangent. The unloaded body has "
+                f"{unloaded}, from the stress of its initial cells: the equilibrium is not lost",
             )
             return
-        text = f"{eigenvalues(now)} of the tangent ({before} before); {described(self.inertia.lowest(), scale)}"
+        text = f"{eigenvalues(now)} of the tangent (before: {before}); " f"{described(self.inertia.lowest(), scale)}"
         if self.stops:
             raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
-        unstable = f"{step.moment}: the equilibrium is unstable, and the body would leave it: {text}"
+        unstable = f"{step.moment}: unstable equilibrium: {text}. A perturbed body would leave this state"
         self._say(logging.WARNING, unstable)
 
     @cached_property
@@ -115,20 +120,20 @@ class EquilibriumStability(Watcher):
             log.log(level, "%s", text)
 
     def _curvature(self, factorisation: PETSc.PC) -> float:
-        """Of the remembered vector after one more inverse iteration."""
+        """Return the curvature of the stored vector after inverse iteration. Collective."""
         vector, image = factorisation.getOperators()[0].createVecs()
         first = not self._vector.known
         if first:
             uneven(vector)
             free = np.isnan(self.inertia.equilibrium.prescribed_values()[: vector.getLocalSize()])
-            vector.array[:] *= free  # prescribed ones have an eigenvalue of their own, one
+            vector.array[:] *= free  # prescribed unknowns have an eigenvalue of one
         else:
             vector.array[:] = self._vector.values[0][: vector.getLocalSize()]
         curvature = np.inf
         for _ in range(FIRST_INVERSE_ITERATIONS if first else 1):
             factorisation.apply(vector, image)
             size = image.norm()
-            if size == 0.0:  # supports and loads leave nothing free
+            if size == 0.0:  # supports and loads prescribe all unknowns
                 break
             curvature = image.dot(vector) / size**2
             if not np.isfinite(curvature):
@@ -142,26 +147,29 @@ class EquilibriumStability(Watcher):
 
 
 def eigenvalues(number: int) -> str:
-    """In words."""
+    """Return a number of negative eigenvalues as text."""
     return f"{number or 'no'} negative eigenvalue{'' if number == 1 else 's'}"
 
 
 def described(mode: Mode, unloaded: float) -> str:
-    """A mode in words; `unloaded`: the lowest eigenvalue of the unloaded body, which is the unit where positive."""
+    """Return a mode as text, relative to the unloaded body's lowest eigenvalue if positive."""
     place = ", ".join(f"{c:.4g}" for c in mode.place)
     size = f"{mode.eigenvalue / unloaded:.3g} times its unloaded value" if unloaded > 0 else f"{mode.eigenvalue:.3g}"
     return f"the lowest is {size}, and its mode is largest at ({place})"
 
 
-# ---------------------------------------------------------------- whole bodies that a reduction keeps in their symmetry
-STRAINS = {1: 1e-5, 2: 1e-3}  # of the differences of W that make stresses and moduli: these are right to about 1e-6
-# The estimate is 0.8 to 1.1 where whole slender tubes lose their stability (docs/theory.md, Buckling)
+# ---------------------------------------------------------------- buckling of whole bodies
+# Strains of the finite differences of W for stresses and moduli, whose relative error is about
+# 1e-6.
+STRAINS = {1: 1e-5, 2: 1e-3}
+# Thrust over Euler's load. It is 0.8 to 1.1 when whole slender tubes lose their stability
+# (docs/theory.md, Buckling).
 WARNED_LOAD = 0.9
 AROUND, ALONG = range(1, 3)
 
 
 class BucklingWarning(WarnsOnce):
-    """Says once that thrust would bend the whole body, where a reduced kinematics cannot show it."""
+    """Warning that thrust would bend the whole body, which reduced kinematics cannot show."""
 
     name = "buckling"
 
@@ -174,26 +182,27 @@ class BucklingWarning(WarnsOnce):
     @classmethod
     def of(cls, scene: Scene, stepper: Stepper) -> BucklingWarning | None:
         strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
-        return None if strut is None else cls(stepper, strut)  # a whole body buckles by itself
+        return None if strut is None else cls(stepper, strut)  # full kinematics show buckling
 
     def look(self, step: Step | None = None) -> str:
-        """Compare the present thrust with what the body can bear."""
+        """Compare the present thrust with Euler's load. Collective."""
         share = self.thrust() / self.euler_load()
         if not share > WARNED_LOAD:
             return ""
         return (
-            f"the whole body would buckle: its thrust along z is about {share:.2g} times what it can bear. Kinematics "
-            f"{self.state.kinematics.name!r} cannot show that; set model.kinematics = 'full' (docs/theory.md, Buckling)"
+            f"expected buckling: axial thrust is about {share:.2g} times the Euler load. "
+            f"Kinematics {self.state.kinematics.name!r} cannot show it; "
+            "set model.kinematics = 'full' (docs/theory.md, Buckling)"
         )
 
     def thrust(self) -> float:
-        """Thrust of the wall and of what fills the lumen, along z."""
+        """Return the thrust of wall and lumen along z. Collective."""
         thrust = -self._integral(self._derivative(ALONG)) / self._length()
         pressure = self.state.loading.values.get("pressure", 0.0)
         return thrust if self.strut.inner_radius is None else thrust + pressure * self.lumen_area()
 
     def lumen_area(self) -> float:
-        """Present area of the lumen's section, from the mean radius of the nodes on its wall."""
+        """Return the lumen's present area, from the mean radius of its nodes. Collective."""
         kinematics, unknown, radius = self.state.kinematics, self.state.unknown, self.strut.inner_radius
         assert radius is not None
         nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
@@ -203,7 +212,7 @@ class BucklingWarning(WarnsOnce):
         return float(np.pi * (total / number) ** 2)
 
     def euler_load(self) -> float:
-        """Euler's load of the present body, pi^2 EI / (k l)^2."""
+        """Return Euler's load of the present body, pi^2 EI / (k l)^2. Collective."""
         H = np.empty((3, 3, len(self._places)))  # second derivatives of W by logarithmic strains
         for i, j in itertools.combinations_with_replacement(range(3), 2):
             H[i, j] = H[j, i] = self._derivative(i, j)
@@ -220,12 +229,13 @@ class BucklingWarning(WarnsOnce):
         return self.strut.length * self._integral(self.state.elastic_gradient()[:, 2, 2]) / self.quadrature.volume
 
     def _integral(self, values: Array) -> float:
-        """Integral over the reference body, of values (n,)."""
+        """Integrate values (n,) over the reference configuration. Collective."""
         return self.quadrature.integral(values.reshape(self.quadrature.shape))
 
     def _derivative(self, *axes: int) -> Array:
-        """Derivative of W at the points by one or two logarithmic strains of the present body: central differences."""
-        room = 1 - max(0.0, self.stepper.coupling.equilibrium.extension().max_chain_extension)  # no chain reaches L
+        """Return central differences of W by one or two logarithmic strains, (n,). Collective."""
+        # No chain reaches L.
+        room = 1 - max(0.0, self.stepper.coupling.equilibrium.extension().max_chain_extension)
         h, total = STRAINS[len(axes)] * room, np.zeros(len(self._places))
         for signs in itertools.product((1.0, -1.0), repeat=len(axes)):
             strains = np.zeros(3)
@@ -234,7 +244,7 @@ class BucklingWarning(WarnsOnce):
         return np.asarray(total / (2 * h) ** len(axes))
 
     def _energy(self, strains: Array) -> Array:
-        """W at the points after further stretches exp(strains) along the directions."""
+        """Return W at the points after further stretches exp(strains) along the axes, (n,)."""
         Q, tissue = self._directions, self.state.parameters(self.stepper.tissue).at_points()
         stretch = (Q * np.exp(strains)) @ Q.swapaxes(1, 2)
         return tissue.strain_energy(stretch @ self.state.elastic_gradient(), [self.state.cells.point_cells])

@@ -1,4 +1,4 @@
-"""Warnings of a run, each said once: elements that lock, noise, buckling, lost volume, fronts."""
+"""Warnings of a run: locking, pressure noise, lost volume, weak tension, radial chains, fronts."""
 
 from __future__ import annotations
 
@@ -21,44 +21,52 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-# ---------------------------------------------------------------- elements that hold a body back
-# By a stiff bulk (they lock), or because the strain varies too much inside them.
+# ---------------------------------------------------------------- spurious stiffness
+# Elements are too stiff if nearly incompressible tissue makes them lock, or if the strain varies
+# too much inside them.
 
-# The part of its way that a body lacks, from which it is said. docs/what_may_go_wrong.md: estimate and error; the
-# paper's bodies come to 3.6 % (artery with random cells, t = 5)
+# Missing fraction of the displacement above which a run warns. docs/what_may_go_wrong.md has the
+# estimate and its error. The paper's bodies have at most 3.6 % (artery with random cells, t = 5).
 WARNED_SHARE = 0.05
-# Of the matrix's energy: with less work it is not the loads that deform the body, but its cells. Elastic tubes have at
-# least 0.93 (up to 0.9 of the pressure that bursts them), the paper's bodies 1.4
+# Work over the energy of the matrix. With less work the cells deform the body, not the loads.
+# Elastic tubes have at least 0.93 (up to 0.9 of the pressure that bursts them), the paper's bodies
+# 1.4.
 DRIVEN = 0.9
-# Jumps between linear elements count so many times: at a wall, where strain varies most, an element has neighbours on
-# one side, and half of the jump
+# Factor on jumps between linear elements. At a wall, where strain varies most, an element has
+# neighbours on one side only, and half of the jump.
 JUMPS = 4.0
-# Part of the motion across an elongated body that it lacks, over the share of volume changes in the
-# matrix's energy: 1.6 to 3.3 where the tangent was asked (tubes, elongation 0.1, lambda/mu 8.8 to 250)
+# Missing fraction of the motion across an elongated body, over the fraction of volume changes in
+# the matrix's energy. By the tangent it is 1.6 to 3.3 (tubes, elongation 0.1, lambda/mu 8.8 to
+# 250).
 HELD_BACK = 2.5
 TURNED_BY_NOISE = 2.0
-"""Degrees by which noise of the pressure turns tensions, from which on it is said. Of 150 random tubes with lambda/mu
-from 50 to 10,000 (benchmarks/fuzz.py) 108 had angles off by 1 degree or radii by 0.5 %: 2.4 and more. 5 of the others
-had above 2. Bodies as soft as the paper's, which has up to 3.1, are as right as their mesh."""
+"""Angle in degrees between principal tensions with and without pressure noise, above which a run
+warns. Of 150 random tubes with lambda/mu from 50 to 10,000 (benchmarks/fuzz.py) 108 had errors of 1
+degree in angles or 0.5 % in radii. All of these had 2.4 degrees or more; 5 of the remaining tubes
+had more than 2. Bodies as soft as the paper's, which have up to 3.1 degrees, are as accurate as
+their mesh."""
 REMEDY = f"set mesh.element = 'hexahedron' and mesh.formulation = {NOT_LOCKING!r}"
 
 
 def remedy(scene: Scene) -> str:
-    """What a scene may set whose elements lock, in words."""
+    """Return a remedy for locking elements as text, with the scene's keys."""
     if needs := scene.needs_all_points():
-        return f"set mesh.degree = 2 or a larger mesh.refinement, for {needs} needs mesh.formulation = 'displacement'"
+        return (
+            "set mesh.degree = 2 or a larger mesh.refinement, "
+            f"because {needs} needs mesh.formulation = 'displacement'"
+        )
     return REMEDY
 
 
 class Missing(NamedTuple):
-    """About which part of its way a body lacks: by changes of volume, and by changes of shape, inside elements."""
+    """Missing fraction of the deformation, by changes of volume and of shape inside elements."""
 
     volume: float
     shape: float
 
 
 class ElementWarning(WarnsOnce):
-    """What warnings of elements know of the tissue: lambda and mu at this rank's own points."""
+    """Warning of elements, with lambda and mu at this rank's own points."""
 
     def __init__(self, stepper: Stepper, remedy: str = REMEDY):
         super().__init__(stepper)
@@ -68,7 +76,7 @@ class ElementWarning(WarnsOnce):
 
 
 class LockingWarning(ElementWarning):
-    """Says once that elements hold the body back, as soon as a solved state shows it."""
+    """Warning that elements lock or are too large for the strain."""
 
     name = "locking"
 
@@ -78,28 +86,29 @@ class LockingWarning(ElementWarning):
 
     @classmethod
     def of(cls, scene: Scene, stepper: Stepper) -> LockingWarning | None:
-        if stepper.state.kinematics.homogeneous:  # there are no elements that could hold it back
+        if stepper.state.kinematics.homogeneous:  # uniform strain has no spurious stiffness
             return None
         return cls(stepper, FORMULATIONS[scene.mesh.formulation].locks, remedy(scene))
 
     def missing(self) -> Missing:
-        """Return what the present state lacks; zero if neither loads nor prescribed displacements deform the body."""
+        """Return the missing deformation; zero if only the cells deform the body. Collective."""
         energy, volume, shape = self.energies()
         work, free_work = self.work()
         driven = Missing(volume / work, shape / work) if work > DRIVEN * energy > 0 else Missing(0.0, 0.0)
         if not max(free_work, 0.0) + self._energy_of_elongation() > DRIVEN * energy > 0:
             return driven
-        # the work of a prescribed elongation hides that of the motion across, which elements hold back
+        # The work of a prescribed elongation hides that of the motion across, which is
+        # underestimated.
         across = min(HELD_BACK * volume / energy, volume / free_work if free_work > 0 else np.inf)
         return max(driven, Missing(across, 0.0), key=sum)
 
     def _energy_of_elongation(self) -> float:
-        """That a prescribed elongation e gives a matrix of constant volume: 3/2 mu e^2 over the body."""
+        """Return the energy 3/2 mu e^2 of a prescribed isochoric elongation. Collective."""
         elongation = self.stepper.state.loading.values.get("elongation", 0.0)
         return self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2) if elongation else 0.0
 
     def energies(self) -> tuple[float, float, float]:
-        """Of the matrix, with the mean J of each element; of changes of J inside; twice that of changes of F there."""
+        """Return energies: with mean J per element, of varying J, twice varying F. Collective."""
         quadrature, (stiffness, shear) = self.quadrature, self.stiffnesses
         look = self.stepper.coupling.equilibrium.look()
         logarithm, F = np.log(look.jacobians), look.gradients.reshape(*stiffness.shape, 9)
@@ -114,10 +123,10 @@ class LockingWarning(ElementWarning):
         return first, second, third
 
     def _followed(self, shape: Array, F: Array) -> Array:
-        """Which part of `shape` counts, by element: strain that linear elements do follow has no jumps between them."""
-        # The strain of a twisted bar varies inside its elements, which have it exactly. What elements of degree 1 lack
-        # jumps between them by as much as it varies. Elements of degree 2 err alike where they meet, and a linear
-        # strain is none that they could lack.
+        """Return the fraction of `shape` that counts as missing, (owned elements,). Collective."""
+        # The strain of a twisted bar varies inside its elements, which represent it exactly. Strain
+        # that elements of degree 1 cannot represent jumps between them by as much as it varies.
+        # Elements of degree 2 have equal errors where they meet, and represent a linear strain.
         quadrature = self.quadrature
         if quadrature.element_degree > 1 or quadrature.shape[1] == 1:
             return np.ones(len(F))
@@ -128,38 +137,40 @@ class LockingWarning(ElementWarning):
         return np.asarray(np.minimum(1.0, jumps / np.maximum(inside, np.finfo(float).tiny)))
 
     def work(self) -> tuple[float, float]:
-        """Half of the internal nodal forces times the unknowns: the work of loads and supports if all were linear."""
-        # The second number is that of the unknowns alone that nothing prescribes, the work of forces.
+        """Return the linearised work of loads and supports, and of loads alone. Collective."""
+        # The work is half of the internal nodal forces times the unknowns; for loads alone, times
+        # the free unknowns.
         state, equilibrium = self.stepper.state, self.stepper.coupling.equilibrium
         unknowns = state.unknown.x.array
         free = np.where(np.isnan(equilibrium.prescribed_values()), unknowns, 0.0)
-        # shares of the ranks in a node's force are not added up: their sum over all ranks is the same
+        # The ranks' contributions to a node's force are not summed, because the sum over all ranks
+        # is the same.
         forces = sum(dolfinx.fem.assemble_vector(form).array for form in equilibrium.internal_forms)
         local = np.array([forces @ unknowns, forces @ free])
         whole, of_forces = state.comm.allreduce(local).tolist()
         return whole / 2, of_forces / 2
 
     def look(self, step: Step) -> str:
-        """Whether the body lacks more of its way than is noticed."""
+        """Return a warning if too much of the deformation is missing. Collective."""
         missing = self.missing()
         return self.in_words(missing) if sum(missing) > WARNED_SHARE else ""
 
     def in_words(self, missing: Missing) -> str:
-        """What holds the body back, by how much, and what to set."""
-        lacks = f"displacements are off by about {100 * min(sum(missing), 1.0):.2g} %"
+        """Return cause, size and remedy of the missing deformation as text."""
+        lacks = f"displacements too small by about {100 * min(sum(missing), 1.0):.2g} %"
         if missing.volume >= missing.shape:
             return (
-                f"the elements lock, {lacks} (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
+                f"volumetric locking: {lacks} (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
                 "(docs/theory.md, Volumetric locking)"
             )
         return (
-            f"the elements are too large, {lacks}: strain varies inside them by more than they can follow; set "
+            f"elements too large: {lacks}, because strain varies too much inside elements; set "
             "mesh.degree = 2 or a larger mesh.refinement (docs/theory.md, Volumetric locking)"
         )
 
 
 class PressureNoise(ElementWarning):
-    """Says once that the pressure inside elements, not that of the body, decides where the cells turn."""
+    """Warning that pressure noise inside elements reorients the cells."""
 
     name = "pressure_noise"
 
@@ -170,7 +181,7 @@ class PressureNoise(ElementWarning):
         return cls(stepper, remedy(scene)) if locks and turns else None
 
     def degrees(self) -> float:
-        """Mean over the body of the angle by which the noise turns the tensions of the present state."""
+        """Return the mean angle between principal tensions with and without noise. Collective."""
         quadrature, stiffness = self.quadrature, self.stiffnesses[0]
         F, tensor = (values[: stiffness.size] for values in self.stepper.remodeling.driving_tensor())
         J = np.linalg.det(F)
@@ -182,44 +193,47 @@ class PressureNoise(ElementWarning):
             quiet = tensor - noise / J[:, None, None] * np.eye(3)
         with_noise, without = (np.maximum(np.linalg.eigvalsh(stress), 0.0) for stress in (tensor, quiet))
         lengths = np.linalg.norm(with_noise, axis=1) * np.linalg.norm(without, axis=1)
-        # no tension in both: nothing turns; in one alone: everything does
+        # The angle is 0 without tension in both, and 90 degrees without tension in one of them.
         cosine = np.where(lengths > 0, (with_noise * without).sum(axis=1), (with_noise + without).sum(axis=1) == 0)
         turned = np.degrees(np.arccos(np.clip(cosine / np.where(lengths > 0, lengths, 1.0), -1.0, 1.0)))
         return quadrature.integral(turned.reshape(stiffness.shape)) / quadrature.volume
 
     def look(self, step: Step) -> str:
-        """Whether it turns them by much."""
+        """Return a warning if the mean angle is large. Collective."""
         if self.ratio <= min(STIFF_BULK.values()) or (turned := self.degrees()) <= TURNED_BY_NOISE:
             return ""
         return (
-            f"the pressure inside elements is noise, which turns the tensions that drive the cells by {turned:.2g} "
-            f"degrees on the mean: fibre angles and radii are off (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
-            "(docs/what_may_go_wrong.md, Cells that turn)"
+            f"pressure oscillations change the principal tensions by {turned:.2g} degrees on "
+            "average; fibre angles and radii are inaccurate "
+            f"(lambda/mu up to {self.ratio:.4g}); {self.remedy} "
+            "(docs/what_may_go_wrong.md, Spurious reorientation by pressure noise)"
         )
 
 
-# ---------------------------------------------------------------- what a run says of its tissue
-# Volume that is lost, chains that do not lie in the wall, and fronts.
+# ---------------------------------------------------------------- tissue
+# Lost volume, weak tension, chains out of the wall, and fronts.
 
-# Of its volume a soft tissue is measured to lose a few per cent at most: what is beyond is a choice of lambda. The
-# paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
-NOTED = 0.05  # mean loss that the log mentions at the end
-MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # from where on it is hardly meant
-WEAK = 0.05  # the paper's tube by the law "tensor": angles were 0.02 degrees off at 0.014, 1.2 at 0.14, 12 at 1.4
-RADIAL_SHARE = 0.5  # of the chains: more of them out of the wall are said
-# degrees between two points of an element that are a front, not a slope: within its elements the paper's artery turns
-# by up to 14 degrees; and the share of a layer that such elements make up
+# Soft tissues were measured to lose a few per cent of their volume at most; more is due to lambda.
+# The paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
+NOTED = 0.05  # mean loss of volume that the log reports at the end
+MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # mean loss and smallest J that are probably not intended
+# Relative threshold of tensions above which a run warns. In the paper's tube with the law "tensor"
+# angles had errors of 0.02 degrees at 0.014, 1.2 at 0.14 and 12 at 1.4.
+WEAK = 0.05
+RADIAL_SHARE = 0.5  # fraction of chains out of the wall above which the log reports it
+# Degrees between two points of an element at a front, and the fraction of a layer that such
+# elements make up. In the paper's artery angles inside elements differ by up to 14 degrees.
 FRONT_ANGLE, FRONT_SHARE = 45.0, 0.5
 
 
 class VolumeLoss(WarnsOnce):
-    """Warns, once, where the tissue loses much of its volume, and says at the end how much it has lost at most."""
+    """Warning of a large loss of volume, with a report of the largest loss at the end."""
 
     name = "volume"
     initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0} | dict.fromkeys("xyz", 0.0)
 
     def solved(self, step: Step) -> None:
-        """Look at every J, also when it was said: the most that is lost is said at the end."""
+        """Update the largest loss of volume, also after the warning. Collective."""
         self._measure(step)
         numbers = self._numbers
         if not self.said and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
@@ -244,28 +258,30 @@ class VolumeLoss(WarnsOnce):
     def _in_words(self) -> str:
         found = {name: self._numbers[name] for name in self.initial}
         return (
-            "the tissue has lost up to {lost:.2g} % of its volume at {x:.4g}, {y:.4g}, {z:.4g} (least J {least:.3g}, "
-            "time {least_time:g}), {whole:.2g} % in all (mean J {mean:.3g}, time {mean_time:g})"
+            "the tissue has lost up to {lost:.2g} % of its volume at {x:.4g}, {y:.4g}, {z:.4g} "
+            "(minimum J {least:.3g}, time {least_time:g}), {whole:.2g} % overall "
+            "(mean J {mean:.3g}, time {mean_time:g})"
         ).format(lost=100 * (1 - found["least"]), whole=100 * (1 - found["mean"]), **found)
 
 
 class WeakTension(WarnsOnce):
-    """Says at the end that stresses were never far above those that count as rounding: cells turned too slowly."""
+    """Warning at the end that stresses were near rounding errors, so that cells were too slow."""
 
     name = "weak_tension"
 
     def completed(self, step: Step) -> None:
-        """Look at the end, when the pass of the last stress is made."""
+        """Check the threshold of tensions after the last pass. Collective."""
         if step.is_last and not self.said and (weakness := self.stepper.remodeling.weakness()) > WEAK:
             self.find(
                 step,
-                f"the loads are weak: a tension of {weakness:.2g} times the largest stress of the body counts by half, "
-                "for smaller ones may be rounding; cells turned too slowly. Choose a unit or loads with larger strains",
+                f"loads too small: stresses near the rounding threshold ({weakness:.2g} of the "
+                "largest stress) remodel at half speed or less, so the cells reorient too slowly. "
+                "Use loads with larger strains",
             )
 
 
 class ShapeWarning(WarnsOnce):
-    """What a shape knows of the directions of chains."""
+    """Warning that needs a shape's measures of chain directions."""
 
     def __init__(self, stepper: Stepper, shape: Shape):
         super().__init__(stepper)
@@ -277,12 +293,12 @@ class ShapeWarning(WarnsOnce):
 
 
 class RadialChains(ShapeWarning):
-    """Says once that more than half of the chains point out of the wall."""
+    """Report that more than half of the chains point out of the wall."""
 
     name, level = "radial_chains", NOTICE
 
     def look(self, step: Step) -> str:
-        """Measure their share."""
+        """Return a report if the fraction is large. Collective."""
         cells = self.state.cells
         share = self.quadrature.mean(
             self.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
@@ -290,13 +306,13 @@ class RadialChains(ShapeWarning):
         if not share > RADIAL_SHARE:
             return ""
         return (
-            f"more than half of the chains point out of the wall (radial_share {share:.2g}); the fibre angles are "
-            "means over the other chains"
+            f"more than half of the chains point out of the wall (radial_share {share:.2g}); "
+            "the fibre angles are means over the remaining chains"
         )
 
 
 class FrontsInLayers(ShapeWarning):
-    """Warns at the end where a layer's mean fibre angle is one of two families, with a front between them."""
+    """Warning at the end that a layer's mean fibre angle is over two families with a front."""
 
     name = "fronts"
 
@@ -304,7 +320,7 @@ class FrontsInLayers(ShapeWarning):
         return step.is_last
 
     def look(self, step: Step) -> str:
-        """At the last state."""
+        """Return a warning for layers with a front in most elements. Collective."""
         cells, quadrature = self.state.cells, self.quadrature
         if not self.shape.angle_layers:
             return ""
@@ -325,4 +341,6 @@ class FrontsInLayers(ShapeWarning):
                 found.append(f"{name} {jump} {low:.3g} to {high:.3g} degrees")
         if not found:
             return ""
-        return f"{'; '.join(found)}. A front lies there, so the mean depends on the mesh; set a larger mesh.refinement"
+        return (
+            f"{'; '.join(found)}. A front lies there, so the mean depends on the mesh; " "set a larger mesh.refinement"
+        )

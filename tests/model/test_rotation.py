@@ -205,4 +205,4 @@ def test_a_cube_with_fibres_across_its_load(coupling: str, caplog: pytest.LogCap
     for _ in range(5):
         expected.append((1 - share) * expected[-1] + share * angle_left(np.array(expected[-1:]), 1 / tau)[0])
     np.testing.assert_allclose(angles[-6:], np.degrees(expected), atol=1e-6)
-    assert "over-corrects" not in caplog.text
+    assert "overshoots" not in caplog.text

@@ -150,7 +150,7 @@ def test_an_impossible_load_is_a_failure_that_changes_nothing() -> None:
         stepper.advance(2.0)
     assert caught.value.time == 2.0
     text = str(caught.value)
-    assert text.startswith("no equilibrium at time 2: the change of the loads stops at ")
+    assert text.startswith("no equilibrium at time 2: the change of the loads failed at ")
     assert "largest r/L = " in text and "smallest J = " in text
     point = np.array([float(c) for c in text.split(" at (")[1].split(")")[0].split(", ")])
     assert 1.0 <= np.hypot(*point[:2]) <= 3.0 and 0.0 <= point[2] <= 1.0
