@@ -112,7 +112,7 @@ COLUMN = "from remodel_fenicsx.extend import COLUMNS, Column\nCOLUMNS['a'] = Col
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("time", "7.0", "time: there are two columns of this name"),
+        ("time", "7.0", "time: two columns have this name"),
         ("a\nb", "7.0", "bad.py, line 2: ValueError: column 'a\\nb'"),
         ("mine", "float('inf')", "the column 'mine' is inf at time 0"),
         ("mine", "1 / m.step.time", "bad.py, line 2: ZeroDivisionError"),
