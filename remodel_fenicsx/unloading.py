@@ -111,7 +111,7 @@ REFUSALS = (ArithmeticError, FaceError, StepFailure, SceneError)
 
 
 class NoUnloadedShape(RemodelError, RuntimeError):
-    """No unloaded shape is found; one line with the load factor and the reason."""
+    """Failure to find an unloaded shape; one line with the load factor and the reason."""
 
     exit_code = SOLVE_FAILED
 

@@ -358,7 +358,7 @@ def kinematics(scene: Scene) -> Faults:
 
 
 def number_of_elements(scene: Scene) -> Faults:
-    """Elements: no more than Gmsh and the memory can handle."""
+    """Elements: at most the number that Gmsh and the memory can handle."""
     if not isinstance(scene.geometry, FromFile) and (rule := too_many_elements(scene)):
         yield rule, "mesh.refinement", scene.mesh.refinement
 

@@ -167,7 +167,7 @@ class ClosedAtEnd:
         self.close()
 
     def close(self) -> None:
-        """Release files."""
+        """Close the files that the object holds."""
 
 
 # ---------------------------------------------------------------- command line values
