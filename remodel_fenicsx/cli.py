@@ -212,7 +212,7 @@ def _parsed(arguments: list[str]) -> argparse.Namespace:
 
 
 class OutputError(RemodelError):
-    """The output of a command cannot be written."""
+    """Failure to write the output of a command."""
 
     exit_code = BAD_ENVIRONMENT
 

@@ -165,7 +165,7 @@ def check_files(scene: Scene) -> str:
             read_fibres(cells, name)
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if large or number > ELEMENTS_OF_A_LOOK:
-        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; the run does"
+        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; a run checks this"
     scene = with_choices(scene)
     domain = checked_domain(mesh_of(scene, MPI.COMM_SELF), scene)
     scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
@@ -212,7 +212,7 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     for name, value in domain.dimensions.items():
         wanted = getattr(shape, name, value)
         if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
-            raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
+            raise SceneError(f"geometry.{name} = {wanted:g}: the mesh has {value:g}")
     empty = [name for name in needed if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
     if empty:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
@@ -251,7 +251,7 @@ def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict
     wanted, held = scene.natural.fibres, [name for name in UNCHANGED if name in measured]
     changed = [name for name in held if not np.allclose(measured[name], np.reshape(UNCHANGED[name], -1))]
     if changed and wanted is None:
-        rule = "set natural.fibres = true to begin with them, or false to leave them out"
+        rule = "set natural.fibres = true to start with them, or false to ignore them"
         raise SceneError(f"{key}: has {', '.join(changed)} of an earlier run; {rule}")
     of_turnover = [name for name in TURNED_OVER if name in changed]
     if wanted and of_turnover and not scene.remodeling.turnover.is_on:
@@ -289,7 +289,7 @@ def _fibres_of(cells: Cells, region: str, corners: Array, chosen: Flags) -> dict
     except UnreadableFile as error:
         raise SceneError(f"{key} = {cells.fibres!r}: {error}") from error
     count, names = len(next(iter(file.measured.values()))), ", ".join(file.measured)
-    way = "by number" if farthest is None else f"the nearest ones, {farthest:.3g} away at most"
+    way = "by number" if farthest is None else f"nearest rows, largest distance {farthest:.3g}"
     log.info("%s: %s of %d rows, %s; SHA-256 %s", key, names, count, way, file.sha256)
     return {name: values[rows] for name, values in file.measured.items()}
 

@@ -260,7 +260,7 @@ def coupling_and_mean(scene: Scene) -> Faults:
         yield f"needs a remodeling.law with a target: {laws_with_a_target()}", "remodeling.mean", remodeling.mean
     if scene.cases[1:] and not coupling.takes_cases:
         able = named(COUPLINGS, lambda kind: kind.takes_cases)
-        yield f"with [[cases]] must be one of: {able}", "remodeling.coupling", remodeling.coupling
+        yield f"must be one of {able} with [[cases]]", "remodeling.coupling", remodeling.coupling
 
 
 def growth(scene: Scene) -> Faults:
@@ -295,7 +295,7 @@ def equilibrium(scene: Scene) -> Faults:
         return
     if not LAWS[law].has_limit:
         laws = named(LAWS, lambda law: law.has_limit)
-        rule = f"remodeling.law = {law!r} has no steady state independent of the load path; must be one of {laws}"
+        rule = f"remodeling.law = {law!r} has no steady state independent of the load path; laws with one: {laws}"
         yield rule, key, end
     bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
     if bare:

@@ -137,7 +137,7 @@ NEAR_LOCKING = 0.9
 def borne(tissue: Tissue, is_loaded: bool) -> float:
     """Return p / ln(r_o/r_i) of a neo-Hookean wall with isotropic cells at r = `NEAR_LOCKING` L.
 
-    Radii are as prescribed; length and volume are constant. Without chains: the largest value.
+    Radii are as prescribed; length and volume are constant. Without chains: the limit load.
     """
     # The stretch is the square of the circumferential one.
     chain, modulus, stretch = tissue.chain, tissue.lame_mu, math.inf
@@ -220,7 +220,7 @@ FORGOTTEN_AFTER = 1000.0
 class Scene(Table):
     """A scene: its top-level keys and its tables.
 
-    The keyword arguments are the keys of a scene file (docs/scene.md), with a dictionary for each
+    Its keyword arguments are the keys of a scene file (docs/scene.md), with a dictionary for each
     table. Stresses are in `material.stress_unit`, lengths in `geometry.length_unit`, times in any
     one unit. A scene is immutable: `with_values` returns a changed copy.
 

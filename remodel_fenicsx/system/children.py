@@ -164,7 +164,7 @@ _LINES = re.compile(
 
 
 class NoRoomError(RemodelError):
-    """A full disk or a file size limit: not an error of the file."""
+    """Full disk, or file size limit of the system; not an error of the file."""
 
     exit_code = BAD_ENVIRONMENT
 

@@ -27,7 +27,7 @@ NEEDED = "basix dolfinx gmsh h5py mpi4py petsc4py pint rich ufl".split()
 
 
 class UnusableEnvironment(RemodelError):  # noqa: N818
-    """The environment lacks something that a command needs; the text names it."""
+    """Environment without something that a command needs; the text names it."""
 
     exit_code = BAD_ENVIRONMENT
 
@@ -138,7 +138,7 @@ _loaded: dict[str, tuple[Path, str]] = {}  # extensions of this process by name:
 
 
 class ExtensionError(RemodelError):
-    """An extension fails or is missing; one line."""
+    """Extension that fails or is missing; one line."""
 
 
 def load_extensions(files: Sequence[str]) -> None:

@@ -32,7 +32,7 @@ FOREIGN = {errno.ELOOP: LINK, errno.EISDIR: "is a folder, not a file", errno.EEX
 
 
 class ForeignFileError(RemodelError, OSError):
-    """A name that a run uses belongs to a link, a pipe, a device or a file that is too large."""
+    """Link, pipe, device or file of excessive size in place of a file of a run."""
 
     on_all_ranks = False
 
@@ -41,7 +41,7 @@ class ForeignFileError(RemodelError, OSError):
 
 
 class TakenError(ForeignFileError, FileExistsError, ValueError):
-    """The file or folder to create already exists."""
+    """Output file or folder that already exists."""
 
     def __init__(self, path: Path, kind: str = "file"):
         super().__init__(errno.EEXIST, f"already exists; must be a new {kind}", str(path))

@@ -40,7 +40,7 @@ def _exit_code(number: int) -> int:
 
 
 class Interrupted(RemodelError):  # noqa: N818 - no error: a user has stopped the run
-    """The run was asked to stop; the current step is discarded."""
+    """Request to stop a run; the current step is discarded."""
 
     def __init__(self, number: int, on_all_ranks: bool = True):
         super().__init__(signal.Signals(number).name)
@@ -54,7 +54,7 @@ class Interrupted(RemodelError):  # noqa: N818 - no error: a user has stopped th
 
 
 class Paused(RemodelError):  # noqa: N818 - no error: a user has stopped the run
-    """The run stopped on request between two steps, on all ranks, and can be resumed."""
+    """Stop on request between two steps, on all ranks; the run can be resumed."""
 
     exit_code = PAUSED
 

@@ -344,7 +344,7 @@ def test_a_damaged_run_goes_on_or_is_refused(data: st.DataObject, first_half: Pa
     ("changes", "said"),
     [
         ({"shape": "cube"}, "the mesh is a 'cube'"),
-        ({"dimensions": {"length": math.nan}}, "that of the mesh is nan"),
+        ({"dimensions": {"length": math.nan}}, "the mesh has nan"),
         ({"faces": {"inner": 1}}, "the mesh has no face bottom, top, outer"),
         ({"faces": dict.fromkeys(Tube.face_names, 99)}, "no facets with the tag of bottom, top, inner, outer"),
         ({}, "the mesh has elements of type 'hexahedron'"),
