@@ -438,7 +438,7 @@ def _new(options: argparse.Namespace) -> None:
     surface FILE  The surface of the lumen, open at its ends: STL, PLY, VTP or OBJ.
     --thickness VALUE  Thickness of the wall in the unit of the surface, or the name of a point
         array.
-    --layers NAME=VALUE+  Layers from the lumen outwards with their thickness; each becomes a region.
+    --layers NAME=VALUE+  Layers with their thickness, from the lumen outwards; each is a region.
     --size LENGTH!  Element size along the wall, about its thickness.
     --through K = 2  Elements through the wall, at least one per layer (default: %(default)s).
     -o --output FILE  Output file; must not exist (default: SURFACE.msh).

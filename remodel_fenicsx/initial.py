@@ -54,9 +54,7 @@ ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
 def meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Scene, Domain]:
     """Resolve and log the scene's choices; return the resolved scene and its mesh. Collective."""
     if scene.geometry.is_loaded:
-        raise SceneError(
-            f"geometry.is = 'loaded': needs the unloaded body; write its scene with {typed()} unload SCENE"
-        )
+        raise SceneError(f"geometry.is = 'loaded': needs the unloaded body, from {typed()} unload SCENE")
     if domain is None and comm.rank == 0:
         for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
             log.info("%s", line)
@@ -90,8 +88,8 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
         elements = domain.gather_mesh()[1]
         if tensors is not None and elements is not None:
             log.info(
-                "natural.fibres: files have element means, so the first row has an error from variations inside "
-                "elements; at nodes the means differ by up to %.1f %% of tr A",
+                "natural.fibres: files have element means, so the first row has an error from variations "
+                "inside elements; at nodes the means differ by up to %.1f %% of tr A",
                 100 * unevenness(elements, tensors),
             )
     return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
@@ -122,7 +120,7 @@ def unloaded_state(
 def natural_gradient(
     scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes, fibres: Fibres = NO_FIBRES
 ) -> tuple[Array, Closing | None]:
-    """Return G of the natural configuration (elements, points, 3, 3), and the closed ring."""
+    """Return G of the natural configuration (elements, points, 3, 3); the closed ring or None."""
     from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing
 
@@ -147,7 +145,7 @@ def natural_gradient(
         stretches = found.stretches(radii)
         beyond = quadrature.maximum(((inner - radii) / (next_one - inner)).reshape(quadrature.shape))
         if beyond > BEYOND or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:
-            rule = "must be smaller, or mesh.refinement larger: straight element sides leave the curved wall"
+            rule = "must be smaller, or mesh.refinement larger: straight element sides leave the wall"
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
         stretches = prestretch(natural, local_axes, domain)
@@ -165,7 +163,7 @@ def check_files(scene: Scene) -> str:
             read_fibres(cells, name)
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if large or number > ELEMENTS_OF_A_LOOK:
-        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; a run checks this"
+        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; a run does"
     scene = with_choices(scene)
     domain = checked_domain(mesh_of(scene, MPI.COMM_SELF), scene)
     scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
@@ -255,7 +253,7 @@ def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict
         raise SceneError(f"{key}: has {', '.join(changed)} of an earlier run; {rule}")
     of_turnover = [name for name in TURNED_OVER if name in changed]
     if wanted and of_turnover and not scene.remodeling.turnover.is_on:
-        raise SceneError(f"{key}: has {' and '.join(of_turnover)}, which needs remodeling.turnover; it is not set")
+        raise SceneError(f"{key}: has {' and '.join(of_turnover)}, which needs remodeling.turnover")
     if wanted and GROWTH in changed:
         _check_growth(measured[GROWTH], key, scene.remodeling.turnover)
     return {name: values for name, values in measured.items() if wanted or name not in held}

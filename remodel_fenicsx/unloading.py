@@ -105,7 +105,7 @@ Array = NDArray[np.float64]
 Said = Callable[[str], object]
 
 LEAST_SHARE = 1 / 16  # smallest load increment, as a fraction of the loads
-MOST_LOADINGS = 30  # per load increment
+MOST_LOADINGS = 30  # forward runs per load increment
 ON_THE_WAY = 0.01  # relative tolerance of dimensions at intermediate load factors
 REFUSALS = (ArithmeticError, FaceError, StepFailure, SceneError)
 
@@ -157,8 +157,9 @@ def found_unloaded(
             step /= 2
             if step < LEAST_SHARE:
                 raise NoUnloadedShape(
-                    f"geometry.is = 'loaded': no unloaded configuration at {100 * share:g} % of the loads "
-                    f"(last converged: {100 * done:g} %): {reason}; lower the loads or stiffen the tissue"
+                    f"geometry.is = 'loaded': no unloaded configuration at {100 * share:g} % of the "
+                    f"loads (last converged: {100 * done:g} %): {reason}; lower the loads or stiffen "
+                    "the tissue"
                 ) from refusal
     return start(1.0) + change, runs
 
@@ -171,8 +172,8 @@ def found_unloaded(
 # about as the unloaded ones do.
 
 LOADED_AGAIN = 1e-9  # relative tolerance of the loaded dimensions
-LOAD_STEPS = 10  # of a run to the end of the ramps
-# Settings without remodeling. Custom laws may have further keys, which their law removes.
+LOAD_STEPS = 10  # steps of a forward run to the end of the ramps
+# Settings without remodeling. Keys that belong to a law get their defaults.
 PASSIVE: dict[str, object] = {
     "remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {},
     "remodeling.exponent": 2.0, "remodeling.threshold": 0.0, "time.tolerance": None,

@@ -66,7 +66,7 @@ class Profile:
         """Describe the keys that the profile sets."""
         settings = ", ".join(f"{key} = {value}" for key, value in self.values.items())
         if self.is_for_means:
-            settings += " or, for a tube, sector with cells.antithetic: their means over seeds nearly equal the tube's"
+            settings += " or, for a tube, sector with cells.antithetic (nearly the same means over seeds)"
         return settings
 
     def settings(self, scene: Any) -> dict[str, object]:
@@ -179,7 +179,7 @@ def without_coupling(base: dict[str, Any], over: Mapping[str, object]) -> None:
 
 
 def without_replaced(values: dict[str, Any], changed: Collection[str]) -> None:
-    """Remove values that changed experimental parameters replace, and an unfit coupling."""
+    """Remove values that experimental parameters replace, and a coupling unsuited to the law."""
     if "remodeling.law" in changed and "remodeling.coupling" not in changed:
         without_coupling(values, values)
     for name, part in parts_of(values):

@@ -40,7 +40,7 @@ def _shapes(kind: type, mark: str = ", ") -> str:
 
 
 def named_regions(scene: Scene) -> Faults:
-    """Regions: only for shapes with regions; names must suit column names."""
+    """Check that the shape can have regions, and that their names suit column names."""
     shape = scene.geometry
     for name in scene.regions:
         key = f"regions.{quoted(name)}"
@@ -54,7 +54,7 @@ def named_regions(scene: Scene) -> Faults:
 
 
 def tissue_of_regions(scene: Scene) -> Faults:
-    """Regions: their keys together with those of the whole body."""
+    """Check the keys of regions together with those of the whole body."""
     law, turnover = LAWS[scene.remodeling.law], scene.remodeling.turnover
     for name, (material, cells, kappa) in scene.properties().items():
         region, length = in_region(name), cells.end_to_end_length
@@ -67,7 +67,7 @@ def tissue_of_regions(scene: Scene) -> Faults:
             yield "needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial
         are_apart = material.tells_volume_apart and scene.material.tells_volume_apart
         if material.matrix != scene.material.matrix and not are_apart:
-            rule = f"must be {scene.material.matrix!r}, or both matrices need a volumetric part (Matrix)"
+            rule = f"must be {scene.material.matrix!r}, or both need a volumetric part (Matrix)"
             yield rule, f"{region}material.matrix", material.matrix
         plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
         if kappa != plain and law.remodels and not law.asks_kappa:
@@ -84,7 +84,7 @@ def tissue_of_regions(scene: Scene) -> Faults:
 
 
 def meshed_body(scene: Scene) -> Faults:
-    """Mesh: sizes and layers that the shape allows."""
+    """Check that the shape allows the mesh's sizes and the layers."""
     scene.geometry.check_size(scene.mesh)
     if isinstance(scene.geometry, WithRegions):
         scene.geometry.check_regions(scene.regions, scene.mesh)
@@ -92,23 +92,23 @@ def meshed_body(scene: Scene) -> Faults:
 
 
 def loads_beside_others(scene: Scene) -> Faults:
-    """Loads: two loads that exclude each other."""
+    """Check that no two loads exclude each other."""
     for name, load in scene.loads.items():
         if (other := scene.load_kinds[name].instead_of) in scene.loads:
             yield f"not allowed together with loads.{other}", f"loads.{name}", load.value
 
 
 def loaded_body(scene: Scene) -> Faults:
-    """Loaded geometry: only for bodies whose unloaded shape can be computed."""
+    """Check that the unloaded shape of a loaded geometry can be computed."""
     if not scene.geometry.is_loaded:
         return
     key, value = "geometry.is", "loaded"
     if not isinstance(scene.geometry, Unloads):
         yield f"allowed only for the shapes {_shapes(Unloads)}", key, value
     if scene.supports.ends == "clamped":
-        yield "not allowed with supports.ends = 'clamped': the radius of the loaded tube would vary", key, value
+        yield "not allowed with supports.ends = 'clamped': the loaded radius would vary", key, value
     if measured := ", ".join(f"{in_region(name)}cells.fibres" for name in scene.measured_cells):
-        yield f"not allowed with {measured}: its rows belong to positions, which unloading changes", key, value
+        yield f"not allowed with {measured}: unloading moves the positions of its rows", key, value
     if scene.cases:
         rule = (
             "not allowed with [[cases]]: the loaded geometry belongs to one set of loads; run "
@@ -118,7 +118,7 @@ def loaded_body(scene: Scene) -> Faults:
 
 
 def same_strain(scene: Scene) -> Faults:
-    """Loads that prescribe one strain: only with homogeneous deformation."""
+    """Check that loads that need a uniform strain have homogeneous kinematics."""
     made = choice(scene)
     for name, load in scene.loads.items():
         if scene.load_kinds[name].of_one_strain and not KINEMATICS[made.name].homogeneous:
@@ -128,7 +128,7 @@ def same_strain(scene: Scene) -> Faults:
 
 
 def directions_of_matrices(scene: Scene) -> Faults:
-    """Directions of a matrix: must follow a round wall."""
+    """Check that the directions of a matrix follow a round wall."""
     if not isinstance(scene.geometry, RoundWall) or not KINEMATICS[choice(scene).name].three_dimensional:
         return
     for name, properties in scene.properties().items():
@@ -141,7 +141,7 @@ def directions_of_matrices(scene: Scene) -> Faults:
 
 
 def parts_of_the_energy(scene: Scene) -> Faults:
-    """Split formulations: need a matrix with a volumetric part."""
+    """Check that a split formulation has a matrix with a volumetric part."""
     name, matrix = scene.mesh.formulation, scene.material.matrix
     if name != AUTO and FORMULATIONS[name].takes_parts and not scene.material.tells_volume_apart:
         rule = f"needs a material.matrix with a volumetric part (Matrix); {matrix!r} has none"
@@ -149,14 +149,14 @@ def parts_of_the_energy(scene: Scene) -> Faults:
 
 
 def axes_of_the_shape(scene: Scene) -> Faults:
-    """Axes of cells: only those of the shape."""
+    """Check that the shape has the axes of the cells."""
     shape, axes = scene.geometry, scene.cells.axes
     if axes not in shape.axis_kinds:
         yield f"must be {' or '.join(map(repr, shape.axis_kinds))} for shape {shape.name!r}", "cells.axes", axes
 
 
 def supports_of_the_shape(scene: Scene) -> Faults:
-    """Supports: only those of the shape."""
+    """Check that the shape has the supports."""
     shape, ends, faces = scene.geometry, scene.supports.ends, scene.geometry.supported_faces
     if ends not in shape.ends:
         yield f"must be {' or '.join(map(repr, shape.ends))} for shape {shape.name!r}", "supports.ends", ends
@@ -173,7 +173,7 @@ def supports_of_the_shape(scene: Scene) -> Faults:
 
 
 def cells_of_the_loaded_body(scene: Scene) -> Faults:
-    """Cells in equilibrium under load: only for loaded round walls and time.end = "equilibrium"."""
+    """Check the conditions of natural.cells = "equilibrium"."""
     key, cells, shape = "natural.cells", scene.natural.cells, scene.geometry
     if cells != "equilibrium":
         return
@@ -184,7 +184,7 @@ def cells_of_the_loaded_body(scene: Scene) -> Faults:
 
 
 def measured_natural_state(scene: Scene) -> Faults:
-    """Prestretch from a fibre file: needs such a file and no other natural configuration."""
+    """Check the conditions of prestretch from a fibre file."""
     natural, key = scene.natural, "natural.fibres"
     if not natural.fibres:
         return
@@ -197,7 +197,7 @@ def measured_natural_state(scene: Scene) -> Faults:
 
 
 def natural_state(scene: Scene) -> Faults:
-    """Residual stress: shape, formulation and cells for which the ring can be closed."""
+    """Check that shape, formulation and cells allow residual stress."""
     natural, shape, able, none = scene.natural, scene.geometry, Walled, "none"
     if natural.is_of_the_mesh or natural.fibres:
         return
@@ -219,7 +219,7 @@ def natural_state(scene: Scene) -> Faults:
 
 
 def loads_of_the_body(scene: Scene) -> Faults:
-    """Loads: steps end at the corners of ramps; values stay allowed; one load sets the length."""
+    """Check times of ramps and values of loads, and that a free length is not prescribed."""
     time = scene.time
     for name, load in scene.loads.items():
         key, least = f"loads.{quoted(name)}", scene.load_kinds[name].above
@@ -237,7 +237,7 @@ def loads_of_the_body(scene: Scene) -> Faults:
 
 
 def weights_and_factors(scene: Scene) -> Faults:
-    """Load cases: weights sum to 1; factors belong to loads of the scene."""
+    """Check that weights of cases sum to 1, and that their factors belong to loads."""
     for index, case in enumerate(scene.cases):
         for name, factor in case.loads.items():
             if name not in scene.loads:
@@ -250,7 +250,7 @@ def weights_and_factors(scene: Scene) -> Faults:
 
 
 def coupling_and_mean(scene: Scene) -> Faults:
-    """Couplings and case averages: their requirements on the scene."""
+    """Check the conditions of the coupling and of the average over load cases."""
     remodeling, coupling = scene.remodeling, COUPLINGS[scene.remodeling.coupling]
     if missing := coupling.missing and coupling.missing(scene):
         yield f"needs {missing}", "remodeling.coupling", remodeling.coupling
@@ -264,7 +264,7 @@ def coupling_and_mean(scene: Scene) -> Faults:
 
 
 def growth(scene: Scene) -> Faults:
-    """Growth: only for walls in displacement formulation; its start must be a time of the run."""
+    """Check that the body can grow, and that growth starts at a time of the run."""
     turnover, time = scene.remodeling.turnover, scene.time
     if not turnover.grows:
         return
@@ -289,13 +289,13 @@ def growth(scene: Scene) -> Faults:
 
 
 def equilibrium(scene: Scene) -> Faults:
-    """Equilibrium: only for laws whose steady state is independent of the load path."""
+    """Check that the cells have a steady state that is independent of the load path."""
     law, parts, key, end = scene.remodeling.law, scene.properties().items(), "time.end", scene.time.end
     if not scene.time.is_equilibrium:
         return
     if not LAWS[law].has_limit:
         laws = named(LAWS, lambda law: law.has_limit)
-        rule = f"remodeling.law = {law!r} has no steady state independent of the load path; laws with one: {laws}"
+        rule = f"remodeling.law = {law!r} has no unique steady state; laws with one: {laws}"
         yield rule, key, end
     bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
     if bare:
@@ -305,7 +305,7 @@ def equilibrium(scene: Scene) -> Faults:
 
 
 def unknown_length(scene: Scene) -> Faults:
-    """Unknown length: multigrid cannot solve for it."""
+    """Check that an unknown length is solved without multigrid, which cannot include it."""
     method = scene.solver.method
     if scene.has_free_length and method == "iterative":
         names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != method)
@@ -314,7 +314,7 @@ def unknown_length(scene: Scene) -> Faults:
 
 
 def times_of_output(scene: Scene) -> Faults:
-    """Output times: must be times of steps."""
+    """Check that output times are times of steps."""
     for index, moment in enumerate(scene.output.times):
         key = f"output.times[{index}]"
         if scene.time.is_equilibrium:
@@ -325,7 +325,7 @@ def times_of_output(scene: Scene) -> Faults:
 
 
 def fields_of_the_body(scene: Scene) -> Faults:
-    """Output fields: must exist for the body."""
+    """Check that the body has the output fields."""
     fields = scene.output.fields
     for field, reason in scene.lacking_fields.items():
         if not isinstance(fields, bool) and field in fields:
@@ -333,12 +333,12 @@ def fields_of_the_body(scene: Scene) -> Faults:
 
 
 def columns_of_the_history(scene: Scene) -> Faults:
-    """Output columns: must exist for the scene."""
+    """Check that the scene has the output columns."""
     shape, turnover, key = scene.geometry, scene.remodeling.turnover, "output.columns"
     of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
     for name in scene.output.columns:
         if name == "time_error" and scene.time.is_equilibrium:
-            yield f"{name!r} is an error of time steps; not allowed with time.end = 'equilibrium'", key, name
+            yield f"{name!r} needs time steps; not allowed with time.end = 'equilibrium'", key, name
         if name in of_one_tissue and scene.regions:
             yield f"{name!r} is only for bodies without regions; the scene has regions", key, name
         if name in (*TURNED_OVER, TURNOVER_POWER) and not turnover.is_on:
@@ -351,20 +351,20 @@ def columns_of_the_history(scene: Scene) -> Faults:
 
 
 def kinematics(scene: Scene) -> Faults:
-    """Kinematics: must describe the scene's body and loads."""
+    """Check that the kinematics can describe the scene's body and loads."""
     name = scene.model.kinematics
     if name != AUTO and (reasons := objections(scene, name)):
         yield "; ".join(reasons), "model.kinematics", name
 
 
 def number_of_elements(scene: Scene) -> Faults:
-    """Elements: at most the number that Gmsh and the memory can handle."""
+    """Check that Gmsh and the memory can handle the number of elements."""
     if not isinstance(scene.geometry, FromFile) and (rule := too_many_elements(scene)):
         yield rule, "mesh.refinement", scene.mesh.refinement
 
 
 def names_of_columns(scene: Scene) -> Faults:
-    """Columns: names must be unique."""
+    """Check that column names are unique."""
     for name, count in Counter(column.name for column in scene.columns()).items():
         if count > 1:
             yield "two columns have this name; rename the custom component", name, None

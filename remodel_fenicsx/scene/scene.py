@@ -108,8 +108,8 @@ def doubts(
             f" ({density:g} in a scene in Pa corresponds to {density * pascal:g} in {unit})" if pascal > 1 else ""
         )
         yield (
-            f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} {unit}) "
-            f"is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
+            f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} "
+            f"{unit}) is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
             f"{material.lame_mu:.4g} {unit}); check its unit, which is 1/m^3{of_pascal}"
         )
     for key, words, ratio, decades in geometry.proportions:
@@ -124,8 +124,8 @@ def doubts(
         if stress and (way := _beyond(stress / stiffness, LOAD)):
             yield (
                 f"{key}: the largest stress, {stress:.3g} {unit}, is {_times(stress / stiffness)} "
-                f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network (lame_mu + "
-                f"c g(r0) r0^2 = {stiffness:.3g} {unit}); check the units, all are material.stress_unit"
+                f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network "
+                f"(lame_mu + c g(r0) r0^2 = {stiffness:.3g} {unit}); check material.stress_unit"
             )
 
 
@@ -164,8 +164,8 @@ def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
         unit = scene.material.stress_unit
         yield (
             f"loads.pressure.value: the largest p r/h is {stress:.3g} {unit}, but with chains at "
-            f"r = {NEAR_LOCKING:g} L the tissue bears {most:.3g} {unit}. The tissue is too soft: steps "
-            "take minutes or fail; check the units, all are material.stress_unit"
+            f"r = {NEAR_LOCKING:g} L the tissue bears {most:.3g} {unit}. The tissue is too soft: "
+            "steps take minutes or fail; check material.stress_unit"
         )
 
 
@@ -206,9 +206,9 @@ def _times(ratio: float) -> str:
 PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}
 FORMAT = 2  # format of recorded scenes; increased if earlier versions could not read them
 COLUMNS_THAT_WENT = ("held_points",)  # columns of earlier versions
-# Per kind of table. Each table is checked against all others and has its own columns.
+# per kind of table; each table is checked against all others and has its own columns
 MOST_TABLES = 200
-# of k a; below it a wall with turnover decays by a factor of e in more than about 5 T
+# value of k a below which a wall with turnover takes more than about 5 T for a factor of e
 SLOW_REST = 3.0
 # times 1/kappa: no trace of the start is left, also in cells below a hundredth of a tension
 FORGOTTEN_AFTER = 1000.0
@@ -534,23 +534,23 @@ class Scene(Table):
         return [*found, *self.turned_away(), *self._of_turnover(), *self.remodeling.warnings()]
 
     def turned_away(self) -> list[str]:
-        """Warn if rows leave the loaded geometry because the cells reorient; name the remedy."""
+        """Return a warning if the cells reorient, so that rows leave the loaded geometry."""
         turns = LAWS[self.remodeling.law].remodels and any(one.kappa for one in self.properties().values())
         if not (self.geometry.is_loaded and turns and self.natural.cells == AS_GIVEN):
             return []
         way = "apply all loads in the first step to have a row with this shape"
         if isinstance(self.geometry, RoundWall):
             way = (
-                "set natural.cells = 'equilibrium' and time.end = 'equilibrium' if its cells are in "
-                f"equilibrium, or {way}"
+                "set natural.cells = 'equilibrium' and time.end = 'equilibrium' if its cells are "
+                f"in equilibrium, or {way}"
             )
         return [
-            "geometry.is = 'loaded': the shape belongs to all loads with the cells of t = 0. The cells "
-            f"reorient while the loads rise and afterwards, so rows differ from this shape; {way}"
+            "geometry.is = 'loaded': the shape belongs to all loads with the cells of t = 0. The "
+            f"cells reorient while the loads rise and afterwards, so rows differ from this shape; {way}"
         ]
 
     def _of_turnover(self) -> Iterator[str]:
-        """Warn of gains without stable or fast equilibrium, and of steps that overshoot."""
+        """Yield warnings on gains without stable or fast equilibrium, and on large steps."""
         turnover, step = self.remodeling.turnover, self.time.step
         if turnover.time is None:
             return
@@ -559,15 +559,15 @@ class Scene(Table):
             says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
             if power <= 2:
                 least = 2 * turnover.gain / power if turnover.gain else math.inf
-                yield f"{says}: no stable homeostatic state for this deposition_stretch; must exceed {least:.3g}"
+                yield f"{says}: no stable homeostasis for this deposition_stretch; must exceed {least:.3g}"
             elif power < SLOW_REST:
                 words = "if collagen alone carries the loads, shorter with a matrix"
-                yield f"{says}: reaches equilibrium slowly, with the time constant {slowly:.3g} {words}"
+                yield f"{says}: reaches equilibrium slowly, time constant {slowly:.3g} {words}"
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
         if not chosen and not COUPLINGS[self.remodeling.coupling].solves_cells and step > turnover.time:
             yield (
-                f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: content and "
-                "natural length overshoot in each step; reduce time.step or set time.tolerance"
+                f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: content "
+                "and natural length overshoot in each step; reduce time.step or set time.tolerance"
             )
 
     def _values(self) -> dict[str, Any]:
@@ -621,7 +621,7 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
         raise fault(rule, "format", written)
     values = {**values, "format": FORMAT}
     turnover, columns = presets.said(values, "remodeling", "turnover"), presets.said(values, "output", "columns")
-    if isinstance(turnover, Mapping) and "time" in turnover:  # Version 0.3.0 had these values.
+    if isinstance(turnover, Mapping) and "time" in turnover:  # defaults of version 0.3.0
         values = merged({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
     if isinstance(columns, list | tuple):
         values = merged(values, {"output": {"columns": [name for name in columns if name not in COLUMNS_THAT_WENT]}})
@@ -645,7 +645,7 @@ def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
 
 
 def _beside(values: dict[str, object], folder: Path) -> dict[str, object]:
-    """Make the paths of files that a scene names relative to its folder absolute."""
+    """Resolve the file names of a scene against its folder."""
     for name, part in presets.parts_of(values):
         if isinstance(file := presets.said(part, "cells", "fibres"), str):
             values = presets.with_part(values, name, {"cells": {"fibres": str(folder.absolute() / file)}})
@@ -660,7 +660,7 @@ def _words(region: str) -> str:
 
 
 def _follow(values: dict[str, Any], changed: Mapping[str, object], is_whole: bool) -> None:
-    """Remove values that changed keys make invalid, and choices of the run (`is_whole`)."""
+    """Remove values that no longer fit changed keys; with `is_whole` also replaced values."""
     times, end = presets.said(values, "output", "times"), presets.said(values, "time", "end")
     if "time.end" in changed and "output.times" not in changed and is_number(end) and isinstance(times, list | tuple):
         values["output"]["times"] = [time for time in times if not is_number(time) or time <= end]
@@ -890,7 +890,7 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
             if moment <= time and abs(old_value - value) > SAME_LOAD * max(abs(old_value), abs(value)):
                 raise SceneError(f"loads.{name} = {value:g} at time {moment:g}: was {old_value:g}; {rule}")
     if new.last_time < time:
-        raise SceneError(f"time.end = {shown(new.time.end)}: must be at least {time:g}, the time of the checkpoint")
+        raise SceneError(f"time.end = {shown(new.time.end)}: must be at least {time:g}, the checkpoint's time")
 
 
 def _ramp_times(load: Load | None) -> list[float]:

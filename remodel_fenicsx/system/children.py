@@ -169,7 +169,7 @@ class NoRoomError(RemodelError):
     exit_code = BAD_ENVIRONMENT
 
     def __init__(self) -> None:
-        super().__init__("cannot store the arrays of a file: the disk is full, or a file size limit is set (ulimit -f)")
+        super().__init__("cannot store the arrays of a file: full disk, or a file size limit (ulimit -f)")
 
 
 def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], bytes]:
@@ -182,7 +182,7 @@ def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], byte
 def made_apart(
     data: bytes, name: str, reader: str, seconds: float = FOR_EVER, memory: int = NO_LIMIT
 ) -> dict[str, NDArray[Any]]:
-    """Call a reader on these bytes in a child process, with limits of CPU time and memory."""
+    """Call a reader on these bytes in a child with limits; return the arrays."""
     with os.fdopen(os.memfd_create("read"), "wb") as source, os.fdopen(os.memfd_create("found"), "rb") as found:
         try:
             with open(source.fileno(), "wb", closefd=False) as copy:
@@ -210,7 +210,7 @@ def made_apart(
             raise UnreadableFile(f"takes more than {seconds:.3g} seconds or {memory / 1e6:.0f} MB to read")
         if done.returncode < 0:
             raise UnreadableFile(
-                f"{DAMAGED}its reader has crashed, so the file is corrupt ({signal.Signals(-done.returncode).name})"
+                f"{DAMAGED}file is corrupt, its reader has crashed ({signal.Signals(-done.returncode).name})"
             )
         if done.returncode or said:
             raise UnreadableFile(DAMAGED + (said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]} ..."))

@@ -98,15 +98,15 @@ def reason_unusable() -> str | None:
         return str(error)
     if (tasks := os.environ.get("SLURM_STEP_NUM_TASKS", "1")) != "1" and MPI.COMM_WORLD.size == 1:
         return (
-            f"srun has started {tasks} processes without a common MPI: use mpirun -n {tasks} or srun "
-            "--mpi=pmix (for independent runs unset SLURM_STEP_NUM_TASKS)"
+            f"srun has started {tasks} processes without a common MPI: use mpirun -n {tasks} or "
+            "srun --mpi=pmix (for independent runs unset SLURM_STEP_NUM_TASKS)"
         )
     major, minor = (int(part) for part in dolfinx.__version__.split(".")[:2])
     if (major, minor) < OLDEST_DOLFINX:
         oldest = ".".join(map(str, OLDEST_DOLFINX))
         return f"dolfinx {dolfinx.__version__} is too old; the oldest supported version is {oldest}"
     if numpy.issubdtype(PETSc.ScalarType, numpy.complexfloating):
-        return "PETSc is built with complex numbers; must be a real build (Debian: python3-dolfinx-real)"
+        return "PETSc is built with complex numbers; must be real (Debian: python3-dolfinx-real)"
     return None
 
 
@@ -201,6 +201,4 @@ def check_extensions(versions: Mapping[str, str], place: Path) -> None:
     """Check that all extensions of a run are loaded."""
     for name, version in versions.items():
         if version.startswith(SUM) and name not in _loaded:
-            raise ExtensionError(
-                f"{place}: was started with the extension {name}; add --with and the path of this file"
-            )
+            raise ExtensionError(f"{place}: was started with extension {name}; add --with and its path")

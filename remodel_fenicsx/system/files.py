@@ -158,7 +158,7 @@ def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
 
 
 class ClosedAtEnd:
-    """Base class with a `with` statement that closes the object on exit."""
+    """Base class of context managers that close themselves on exit."""
 
     def __enter__(self) -> Self:
         return self

@@ -142,7 +142,7 @@ def held_back() -> Iterator[None]:
 def is_first_rank() -> bool:
     """Return whether this process is rank 0, without starting MPI."""
     rank = os.environ.get("OMPI_COMM_WORLD_RANK") or os.environ.get("PMI_RANK")
-    if rank is None and "mpi4py.MPI" in sys.modules:  # another MPI
+    if rank is None and "mpi4py.MPI" in sys.modules:  # MPI without these variables
         rank = str(sys.modules["mpi4py.MPI"].COMM_WORLD.rank)
     return rank in (None, "0")
 
