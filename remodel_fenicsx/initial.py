@@ -88,8 +88,8 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
         elements = domain.gather_mesh()[1]
         if tensors is not None and elements is not None:
             log.info(
-                "natural.fibres: files have element means, so the first row has an error from variations "
-                "inside elements; at nodes the means differ by up to %.1f %% of tr A",
+                "natural.fibres: files have element means, so the first row has an error from "
+                "variations inside elements; at nodes the means differ by up to %.1f %% of tr A",
                 100 * unevenness(elements, tensors),
             )
     return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]

@@ -157,9 +157,9 @@ def found_unloaded(
             step /= 2
             if step < LEAST_SHARE:
                 raise NoUnloadedShape(
-                    f"geometry.is = 'loaded': no unloaded configuration at {100 * share:g} % of the "
-                    f"loads (last converged: {100 * done:g} %): {reason}; lower the loads or stiffen "
-                    "the tissue"
+                    f"geometry.is = 'loaded': no unloaded configuration at {100 * share:g} % of "
+                    f"the loads (last converged: {100 * done:g} %): {reason}; lower the loads or "
+                    "stiffen the tissue"
                 ) from refusal
     return start(1.0) + change, runs
 

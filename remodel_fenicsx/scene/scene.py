@@ -109,8 +109,8 @@ def doubts(
         )
         yield (
             f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} "
-            f"{unit}) is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
-            f"{material.lame_mu:.4g} {unit}); check its unit, which is 1/m^3{of_pascal}"
+            f"{unit}) is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix "
+            f"(lame_mu = {material.lame_mu:.4g} {unit}); check its unit, which is 1/m^3{of_pascal}"
         )
     for key, words, ratio, decades in geometry.proportions:
         if _beyond(ratio, decades):
@@ -546,7 +546,7 @@ class Scene(Table):
             )
         return [
             "geometry.is = 'loaded': the shape belongs to all loads with the cells of t = 0. The "
-            f"cells reorient while the loads rise and afterwards, so rows differ from this shape; {way}"
+            f"cells reorient while and after the loads rise, so rows differ from it; {way}"
         ]
 
     def _of_turnover(self) -> Iterator[str]:
@@ -559,15 +559,15 @@ class Scene(Table):
             says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
             if power <= 2:
                 least = 2 * turnover.gain / power if turnover.gain else math.inf
-                yield f"{says}: no stable homeostasis for this deposition_stretch; must exceed {least:.3g}"
+                yield f"{says}: no stable homeostasis with this deposition_stretch; must exceed {least:.3g}"
             elif power < SLOW_REST:
                 words = "if collagen alone carries the loads, shorter with a matrix"
                 yield f"{says}: reaches equilibrium slowly, time constant {slowly:.3g} {words}"
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
         if not chosen and not COUPLINGS[self.remodeling.coupling].solves_cells and step > turnover.time:
             yield (
-                f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: content "
-                "and natural length overshoot in each step; reduce time.step or set time.tolerance"
+                f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: "
+                "content and natural length overshoot in each step; reduce time.step or set time.tolerance"
             )
 
     def _values(self) -> dict[str, Any]:

@@ -312,7 +312,7 @@ def test_tissue_that_is_lost_is_refused() -> None:
 @pytest.mark.parametrize(
     ("turnover", "says"),
     [
-        ({"gain": 0.35}, "gain = 0.35: no stable homeostasis for this deposition_stretch; must exceed 0.397"),
+        ({"gain": 0.35}, "gain = 0.35: no stable homeostasis with this deposition_stretch; must exceed 0.397"),
         ({"gain": 0.45}, "gain = 0.45: reaches equilibrium slowly"),
         ({"gain": 0.45, "rates": "tension"}, "rest needs more than 0.496"),
         ({"gain": 0.45, "deposition_stretch": 1.2}, "reaches equilibrium slowly"),
