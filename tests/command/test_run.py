@@ -207,7 +207,7 @@ def test_output_that_cannot_be_written_is_exit_code_5(ranks: int, on_ranks: Call
 
 def test_a_folder_below_a_file_is_exit_code_2(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "allowed is a new or an empty folder" in refusal_of("run", demo("cube"), "-o", tmp_path / "file" / "below")
+    assert "must be a new or an empty folder" in refusal_of("run", demo("cube"), "-o", tmp_path / "file" / "below")
 
 
 # ---------------------------------------------------------------- failures and signals
