@@ -1,4 +1,4 @@
-"""The command remodel-fenicsx: thin, no numerics."""
+"""The command line: arguments, exit codes and output of all commands; no numerics."""
 
 from __future__ import annotations
 
@@ -37,17 +37,18 @@ if TYPE_CHECKING:
     from remodel_fenicsx.studies.study import Answer
     from remodel_fenicsx.scene.scene import Scene
 
-presets, scenes = Late("remodel_fenicsx.scene.presets"), Late("remodel_fenicsx.scene.scene")  # no help needs them
+# No help text needs these modules.
+presets, scenes = Late("remodel_fenicsx.scene.presets"), Late("remodel_fenicsx.scene.scene")
 
 EXIT_CODES = {
     0: "finished",
-    BAD_INPUT: "bad input",
-    SOLVE_FAILED: "the solve failed",
-    PAUSED: "stopped on purpose",
+    BAD_INPUT: "invalid input",
+    SOLVE_FAILED: "solve failed",
+    PAUSED: "stopped on request",
     BAD_ENVIRONMENT: "environment not usable",
-    129: "hung up",
-    130: "interrupted",
-    143: "terminated",
+    129: "hangup (SIGHUP)",
+    130: "interrupted (SIGINT)",
+    143: "terminated (SIGTERM)",
 }
 MAIN_EPILOG = (
     "examples:\n"
@@ -59,7 +60,7 @@ MAIN_EPILOG = (
 )
 
 
-# ---------------------------------------------------------------- how a command is typed and ends
+# ---------------------------------------------------------------- definition and end of a command
 Do = Callable[[argparse.Namespace], int | None]
 Needs = Sequence[Callable[[], str | None]]
 KINDS: dict[str, Callable[[str], object]] = {
@@ -76,7 +77,7 @@ MARKS: dict[str, dict[str, Any]] = {
 
 
 class Command(NamedTuple):
-    """What a command takes and does; an example is what follows the program's name."""
+    """A command: function, example arguments, option blocks and requirements."""
 
     do: Do
     example: str
@@ -89,10 +90,11 @@ COMMANDS: dict[str, Command] = {}  # by name, in the order of the help
 
 
 def command(example: str, *usage: str, needs: Needs = (), alone: bool = False) -> Callable[[Do], Do]:
-    """Of a function: makes it a command, whose help is its docstring."""
+    """Make a decorator that registers a function as a command; its docstring is the help text."""
 
-    # it gets the options, with the scene where the command takes one, and returns an exit code, or None for 0; it is
-    # called where nothing that it needs is missing; where it works alone, on the first of several ranks only
+    # The function receives the options, with `scene` if the command takes a scene file, and returns
+    # an exit code or None for 0. It runs only if all requirements are met. With `alone`, only the
+    # first of several ranks runs it.
     def listed(do: Do) -> Do:
         COMMANDS[example.partition(" ")[0]] = Command(do, example, usage, needs, alone)
         return do
@@ -101,31 +103,31 @@ def command(example: str, *usage: str, needs: Needs = (), alone: bool = False) -
 
 
 class _Parser(argparse.ArgumentParser):
-    """What it complains of stays on one line, control characters and all."""
+    """Parser with errors on one line, without control characters."""
 
     def error(self, message: str) -> NoReturn:
         super().error(shortened(printable(message)))
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Make the parser of all commands."""
     raw = argparse.RawDescriptionHelpFormatter
     text = "Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007)."
     found = _Parser(prog="remodel-fenicsx", description=text, epilog=MAIN_EPILOG, formatter_class=raw)
     _add(found, WITH)
-    found.add_argument("--version", action="version", version=__version__, help="Print the version and end.")
+    found.add_argument("--version", action="version", version=__version__, help="Print the version and exit.")
     commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, each in COMMANDS.items():
         text, epilog = each.do.__doc__ or "", f"example:\n  remodel-fenicsx {each.example}"
         about: dict[str, Any] = {"description": text, "epilog": epilog, "formatter_class": raw}
-        if text:  # else it is for the processes of a study
+        if text:  # Commands without help text are for the processes of a study.
             about["help"] = text.replace("%", "%%")
         _add(commands.add_parser(name, **about), *each.usage, WITH)
     return found
 
 
 def _add(found: argparse.ArgumentParser, *usage: str) -> None:
-    """Add the options of blocks with a line for each: names, its value with a mark and " = DEFAULT", meaning."""
+    """Add options from blocks with a line each: names, value with a mark, " = DEFAULT", meaning."""
     for line in "\n".join(map(inspect.cleandoc, usage)).replace("\n    ", " ").splitlines():
         words, _, text = line.partition("  ")
         words, _, default = words.partition(" = ")
@@ -144,8 +146,9 @@ def _add(found: argparse.ArgumentParser, *usage: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code, one of `EXIT_CODES`."""
-    for stream in (0, 1, 2):  # where one is closed a file of the run would get its number, and what libraries print
+    """Run the command line; return the exit code, one of `EXIT_CODES`."""
+    # Replace closed streams: a file of the run would get the number and the output of libraries.
+    for stream in (0, 1, 2):
         with contextlib.suppress(OSError):
             os.fstat(stream)
             continue
@@ -156,11 +159,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _done(arguments: list[str]) -> int:
-    """Do a command; returns its exit code. What ends it is said in one line."""
+    """Run a command and return its exit code; print errors on one line."""
     options = argparse.Namespace()
     try:
         options = _parsed(arguments)
-        kernels()  # not after minutes, when they are asked for
+        kernels()  # Checked now: a wrong value would fail only after minutes.
         chosen = COMMANDS[options.command]
         if chosen.alone and not interrupts.is_first_rank():
             return 0
@@ -177,21 +180,22 @@ def _done(arguments: list[str]) -> int:
         if error.errno == errno.ENAMETOOLONG:
             text, code = refusal_in_words(error), BAD_INPUT
         if getattr(options, "output", None) and isinstance(error, (FileExistsError, NotADirectoryError)):
-            # lies in a file, or just taken
-            text = f"-o {options.output}: {refusal_in_words(error)}; allowed is a new or an empty folder"
+            # The path lies in a file, or was created meanwhile.
+            text = f"-o {options.output}: {refusal_in_words(error)}; must be a new or an empty folder"
             code = BAD_INPUT
         return _fail(text, code, on_all_ranks=False)
     except Exception as error:
         if words := blamed(error):
             return _fail(words, BAD_INPUT, on_all_ranks=False)
         traceback.print_exc()
-        return _fail("stopped by a defect of the program, see above", 1, on_all_ranks=False)
+        return _fail("internal error (traceback above); please report it with run.log", 1, on_all_ranks=False)
 
 
 def _parsed(arguments: list[str]) -> argparse.Namespace:
-    """The options, after the extensions; of several ranks only the first says what is wrong with them."""
+    """Load extensions, then parse the arguments; only the first rank prints usage errors."""
     for word in (*arguments, os.environ.get(EXTENSIONS, "")):
-        if re.search("[\ud800-\udfff]", word):  # records and other programs could not name it
+        # Other programs and files could not represent this name.
+        if re.search("[\ud800-\udfff]", word):
             raise RemodelError(f"{ascii(word)}: must be UTF-8")
     first = _Parser(prog="remodel-fenicsx", add_help=False, allow_abbrev=False)
     _add(first, WITH)
@@ -203,12 +207,12 @@ def _parsed(arguments: list[str]) -> argparse.Namespace:
         found, rest = first.parse_known_args(arguments)
         load_extensions(getattr(found, "with"))
         if rest[:1] == ["figures"]:
-            raise RemodelError("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8")
+            raise RemodelError("figures: replaced by a script: ./with-fenicsx python3 demos/figures.py fig8")
         return parser().parse_args(arguments)
 
 
 class OutputError(RemodelError):
-    """What a command says cannot be written."""
+    """Failure to write the output of a command."""
 
     exit_code = BAD_ENVIRONMENT
 
@@ -219,13 +223,14 @@ def _say(*lines: object) -> None:
     try:
         print(*lines, sep="\n", flush=True)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python will flush once more
-        if not isinstance(error, BrokenPipeError):  # whoever read the output has seen enough
+        # Python flushes again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):  # The reader of a pipe has read enough.
             raise OutputError(f"cannot write to the standard output: {error.strerror}") from error
 
 
 def _complain(message: str) -> None:
-    with contextlib.suppress(OSError):  # nobody is there to read it
+    with contextlib.suppress(OSError):  # stderr is closed
         print(f"remodel-fenicsx: {shortened(printable(message))}", file=sys.stderr, flush=True)
 
 
@@ -235,7 +240,7 @@ def _complain_of(failed: Mapping[str, str]) -> None:
 
 
 def _fail(message: str, code: int, on_all_ranks: bool) -> int:
-    """Say what has ended the command; an error on one of several ranks would leave the others waiting for ever."""
+    """Print the error and return its code; an error on one of several ranks aborts the others."""
     if interrupts.is_first_rank() or not on_all_ranks:
         _complain(message)
     mpi = sys.modules.get("mpi4py.MPI")
@@ -246,7 +251,7 @@ def _fail(message: str, code: int, on_all_ranks: bool) -> int:
 
 @contextlib.contextmanager
 def _stopping(kept: str) -> Iterator[None]:
-    """Within, a signal ends the command at once, which says what is kept."""
+    """End the command with a line on what is saved if a signal arrives while the block runs."""
     try:
         with interrupts.StopRequest(), interrupts.stopping_at_once():
             yield
@@ -255,36 +260,35 @@ def _stopping(kept: str) -> Iterator[None]:
         raise
 
 
-# ---------------------------------------------------------------- what several commands take
+# ---------------------------------------------------------------- options of several commands
 def _study(name: str) -> str:
-    """What those take that run a scene several times."""
+    """Return the options of commands that run a scene several times."""
     return f"""
-    -o --output DIR  Put the results into this folder (default: results/NAME-{name}). The same
-        command goes on there: finished runs are used again.
-    --jobs N  Do at most N runs at a time (default: as many as there are cores).
+    -o --output DIR  Write the results to this folder (default: results/NAME-{name}). Repeat the
+        command to resume: finished runs are reused.
+    --jobs N  Run at most N runs at a time (default: the number of cores).
     {QUIET}"""
 
 
 WITH = f"""
-    --with FILE.py*  Run this Python file first, whose parts scenes may then name; repeatable (or
-        {EXTENSIONS})."""
-QUIET = "-q --quiet  Show no progress, only warnings."
+    --with FILE.py*  Load a Python file with custom components before reading the scene; repeatable
+        (or {EXTENSIONS})."""
+QUIET = "-q --quiet  Show warnings only, no progress."
 RUN_FOLDER = "folder DIR  The folder of a run."
 SCENE_AND_CHANGES = """
     file SCENE  The scene file (TOML); docs/scene.md lists its keys.
-    --set KEY=VALUE*  Change one key of the scene, such as cells.seed=2 or time.end=10. May be
-        repeated.
-    --profile NAME  Mesh, step and element as measured for speed or accuracy: fast, balanced or
-        reference."""
+    --set KEY=VALUE*  Set one key of the scene, such as cells.seed=2 or time.end=10; repeatable.
+    --profile NAME  Use settings of mesh, step and element with a measured error and cost: fast,
+        balanced or reference."""
 VIEWING = """
-    --layers K  Show this many layers: of a tube from the inside, of others from the bottom
-        (default: all).
-    --cut half|quarter  Leave out the half in front of the middle, or only the quarter in front and
-        to the right.
-    --view VIEW = front  Look from the front, from above, or from X,Y,Z of the middle: --view=X,Y,Z
+    --layers K  Show K layers: of a tube from the inside, of other bodies from the bottom (default:
+        all).
+    --cut half|quarter  Remove the front half of the body, or the quarter in front and to the
+        right.
+    --view VIEW = front  View from the front, from above, or from a direction: --view=X,Y,Z
         (default: %(default)s).
-    -o --output FILE  Write to this new file, whose ending says the kind (default: {} in DIR,
-        numbered when taken)."""
+    -o --output FILE  Output file; its suffix selects the format. Must not exist (default: {} in
+        DIR, numbered if it exists)."""
 COMPUTES, DRAWS = (reason_unusable,), (reason_undrawable,)
 
 
@@ -293,24 +297,23 @@ COMPUTES, DRAWS = (reason_unusable,), (reason_undrawable,)
     "run artery.toml -o artery",
     SCENE_AND_CHANGES.replace("SCENE ", "SCENE? "),
     """
-    --resume DIR  Go on with the run in DIR from its last checkpoint, in place of a new run of
-        SCENE.
-    -o --output DIR  Put the results into this folder, which must be new or empty (default:
+    --resume DIR  Resume the run in DIR from its last checkpoint, in place of a new run of SCENE.
+    -o --output DIR  Write the results to this folder, which must be new or empty (default:
         results/NAME).
-    --max-wall-time TIME  Stop before this time (30min, 2h) is over: after a whole step, with exit
-        code 4.
-    --no-report  Make no report.html at the end, as with output.report = false.
+    --max-wall-time TIME  Stop after a whole step before this wall time (30min, 2h) is over, with
+        exit code 4.
+    --no-report  Write no report.html at the end, as with output.report = false.
     """,
     QUIET,
 )
 def _run(options: argparse.Namespace) -> None:
-    """Solve a scene, or go on with a run that was stopped."""
+    """Solve a scene, or resume a run that was stopped."""
     deadline = None if options.max_wall_time is None else clock.monotonic() + options.max_wall_time
     if (options.file is None) == (options.resume is None):
         raise RemodelError("run: one of SCENE and --resume DIR is required")
     if options.resume and (options.output or options.profile):
         key = "-o" if options.output else "--profile"
-        raise RemodelError(f"{key}: a run goes on in its own folder, with its own settings")
+        raise RemodelError(f"{key}: a run resumes in its own folder, with its own settings")
     check_usable(reason_unusable())
     from remodel_fenicsx.running import resume, run
 
@@ -324,7 +327,7 @@ def _run(options: argparse.Namespace) -> None:
 
 @command("status artery", RUN_FOLDER)
 def _status(options: argparse.Namespace) -> None:
-    """Say where the run in DIR is, how fast it is, and whether it is alive."""
+    """Print the progress of the run in DIR, its speed, and whether its process is alive."""
     from remodel_fenicsx.results.status import status
 
     _say(*map(printable, status(options.folder)))
@@ -334,23 +337,22 @@ def _status(options: argparse.Namespace) -> None:
     "report artery --open",
     RUN_FOLDER,
     """
-    -o --output FILE  Write the page to this new file (default: DIR/report.html, which is made
-        anew).
+    -o --output FILE  Output file; must not exist (default: DIR/report.html, which is replaced).
     --open  Show the page in a browser.
     """,
     alone=True,
 )
 def _report(options: argparse.Namespace) -> None:
-    """Make the page of the run in DIR for a browser, finished or not."""
+    """Write the run in DIR, finished or not, as a page for a browser."""
     from remodel_fenicsx.report import write_report
 
     written = write_report(options.folder, options.output)
     _say(written)
     if options.open:
-        import webbrowser  # slow to import, and seldom asked for
+        import webbrowser  # slow to import and seldom needed
 
         if not webbrowser.open(written.resolve().as_uri()):
-            _complain(f"warning: no browser was found; open {written} in yours")
+            _complain(f"warning: no browser found; open {written} yourself")
 
 
 @command(
@@ -358,14 +360,14 @@ def _report(options: argparse.Namespace) -> None:
     RUN_FOLDER,
     VIEWING.format("NAME-t150.png"),
     """
-    --time T+  Show these times beside each other, each the nearest recorded one (default: the
+    --time T+  Show these times next to each other, each the nearest recorded time (default: the
         last).
     """,
     needs=DRAWS,
     alone=True,
 )
 def _picture(options: argparse.Namespace) -> None:
-    """Draw the body of the run in DIR: PNG or PDF."""
+    """Draw the body of the run in DIR as PNG or PDF."""
     from remodel_fenicsx.pictures import Viewing, draw_picture
 
     viewing = Viewing(options.layers, options.cut, options.view)
@@ -377,14 +379,13 @@ def _picture(options: argparse.Namespace) -> None:
     RUN_FOLDER,
     VIEWING.format("NAME-t0-t150.gif"),
     """
-    --frames N = 60  Show this many recorded times, 2 to 500 (default: %(default)s, or all where
-        there are fewer).
+    --frames N = 60  Show at most N recorded times, 2 to 500 (default: %(default)s).
     """,
     needs=DRAWS,
     alone=True,
 )
 def _animate(options: argparse.Namespace) -> None:
-    """Draw the body of the run in DIR as it moves: GIF or WebP."""
+    """Animate the body of the run in DIR as GIF or WebP."""
     from remodel_fenicsx.pictures import Viewing, draw_animation
 
     viewing = Viewing(options.layers, options.cut, options.view)
@@ -405,14 +406,14 @@ def _revolve(options: argparse.Namespace) -> None:
     """
     --format vtu|febio|abaqus|csv!  Write vtu (ParaView, meshio), febio (.feb), abaqus (.inp,
         CalculiX too) or csv.
-    -o --output FILE  Write to this new file (default: fibres in DIR, with the ending of the
+    -o --output FILE  Output file; must not exist (default: fibres in DIR, with the suffix of the
         format).
-    --time T  Take this recorded time (default: the last).
+    --time T  Export this recorded time (default: the last).
     """,
     alone=True,
 )
 def _export(options: argparse.Namespace) -> None:
-    """Write the fibres of the run in DIR for FEBio, Abaqus, ParaView or as a table."""
+    """Export the fibres of the run in DIR for FEBio, Abaqus or ParaView, or as a table."""
     from remodel_fenicsx.results.export import export
 
     _say(export(options.folder, options.format, options.output, options.time))
@@ -435,18 +436,18 @@ def _new(options: argparse.Namespace) -> None:
     "wall lumen.stl --thickness 0.6 --size 0.9 -o vessel.msh",
     """
     surface FILE  The surface of the lumen, open at its ends: STL, PLY, VTP or OBJ.
-    --thickness VALUE  Thickness of the wall in the unit of the surface, or the name of an array at
-        its points.
-    --layers NAME=VALUE+  Layers from the lumen outwards, each a region, with their thickness.
-    --size LENGTH!  Length of an element along the wall, about its thickness.
-    --through K = 2  Elements through the wall, at least one a layer (default: %(default)s).
-    -o --output FILE  Write to this new file (default: SURFACE.msh).
+    --thickness VALUE  Thickness of the wall in the unit of the surface, or the name of a point
+        array.
+    --layers NAME=VALUE+  Layers with their thickness, from the lumen outwards; each is a region.
+    --size LENGTH!  Element size along the wall, about its thickness.
+    --through K = 2  Elements through the wall, at least one per layer (default: %(default)s).
+    -o --output FILE  Output file; must not exist (default: SURFACE.msh).
     """,
     needs=COMPUTES,
     alone=True,
 )
 def _wall(options: argparse.Namespace) -> None:
-    """Make the mesh of a vessel's wall from the surface of its lumen."""
+    """Mesh a vessel's wall from the surface of its lumen."""
     from remodel_fenicsx.body.lumen import write_wall
 
     path = options.output or options.surface.with_suffix(".msh")
@@ -459,7 +460,7 @@ def _wall(options: argparse.Namespace) -> None:
 
 @command("validate artery.toml", SCENE_AND_CHANGES)
 def _validate(options: argparse.Namespace) -> None:
-    """Check a scene without running it, and show what it means."""
+    """Check a scene without running it, and show the settings that a run would use."""
     from remodel_fenicsx.body.reductions import explained
 
     scene, unseen, warnings = options.scene, "", []
@@ -472,15 +473,15 @@ def _validate(options: argparse.Namespace) -> None:
     for warning in warnings:
         _complain(f"warning: {warning}")
     if unseen:
-        _say(f"not looked at: {unseen}")
+        _say(f"not checked: {unseen}")
 
 
 def _unseen_files(scene: Scene) -> str:
-    """What was not looked at of the files that a scene names; an error where a run would refuse one."""
+    """Check a scene's files as a run would; describe those that were not checked."""
     if not scene.measured_cells and not scene.geometry.kept_files()[1]:
         return ""
     if (reason := reason_unusable()) is not None:
-        return f"the files that it names; {reason}"
+        return f"the scene's files; {reason}"
     from remodel_fenicsx.initial import check_files
 
     return check_files(scene)
@@ -489,7 +490,7 @@ def _unseen_files(scene: Scene) -> str:
 @command(
     "axes artery.toml -o artery-axes.vtu",
     SCENE_AND_CHANGES,
-    "-o --output FILE  Write to this new file (default: NAME-axes.vtu).",
+    "-o --output FILE  Output file; must not exist (default: NAME-axes.vtu).",
     needs=COMPUTES,
 )
 def _axes(options: argparse.Namespace) -> None:
@@ -504,15 +505,15 @@ def _axes(options: argparse.Namespace) -> None:
 @command(
     "unload scanned.toml -o unloaded",
     SCENE_AND_CHANGES,
-    "-o --output FOLDER  Put its scene and mesh into this new folder (default: NAME-unloaded).",
+    "-o --output FOLDER  Write scene and mesh to this new folder (default: NAME-unloaded).",
     needs=COMPUTES,
 )
 def _unload(options: argparse.Namespace) -> None:
-    """Find the unloaded body of a scene whose geometry is the loaded one."""
+    """Compute the unloaded body of a scene whose geometry is the loaded one."""
     from remodel_fenicsx.running import write_unloaded
 
     if not options.scene.geometry.is_loaded:
-        raise scenes.SceneError("geometry.is = 'unloaded': the body is unloaded already; allowed is 'loaded'")
+        raise scenes.SceneError("geometry.is = 'unloaded': must be 'loaded' to compute the unloaded body")
     place = options.output or Path(f"{options.scene.name}-unloaded")
     with _stopping("nothing is written"):
         write_unloaded(options.scene, place)
@@ -521,7 +522,7 @@ def _unload(options: argparse.Namespace) -> None:
 
 @command(
     "schema -o scene.schema.json",
-    "-o --output FILE  Write it to this new file (default: print it).",
+    "-o --output FILE  Output file; must not exist (default: print the schema).",
     alone=True,
 )
 def _schema(options: argparse.Namespace) -> None:
@@ -536,8 +537,8 @@ def _schema(options: argparse.Namespace) -> None:
 
 
 def _answer(study: Callable[..., tuple[Path, Answer]], *wishes: object) -> int:
-    """Do a study; say what it has found, where, and which of its runs have failed."""
-    with _stopping("all that is recorded is kept, the same command goes on"):
+    """Run a study; print its result, its folder and its failed runs."""
+    with _stopping("all recorded results are saved; repeat the command to resume"):
         folder, found = study(*wishes)
     _say(f"{found.in_words()}\nresults in {folder}")
     _complain_of(found.failed)
@@ -548,17 +549,17 @@ def _answer(study: Callable[..., tuple[Path, Answer]], *wishes: object) -> int:
     "sweep mine.toml loads.pressure.value=2:6:5",
     SCENE_AND_CHANGES,
     """
-    axes KEY=a:b:n+  Vary a key: KEY=a:b:n takes n numbers from a to b, KEY=a,b,... these. Keys are
-        combined.
-    --latin N  Take N points of a Latin hypercube in place of all combinations. Each key is then
+    axes KEY=a:b:n+  Vary a key: KEY=a:b:n takes n values from a to b, KEY=a,b,... takes these
+        values. All combinations are run.
+    --latin N  Run N points of a Latin hypercube in place of all combinations; each key is then
         KEY=a:b.
-    --seed SEED = 1  Draw the Latin hypercube from this seed (default: %(default)s).
+    --seed SEED = 1  Seed of the Latin hypercube (default: %(default)s).
     """,
     _study("sweep"),
     needs=COMPUTES + DRAWS,
 )
 def _sweep(options: argparse.Namespace) -> int:
-    """Run a scene with other numbers, and show how its end depends on them."""
+    """Run a scene over parameter values, and show how its end depends on them."""
     from remodel_fenicsx.studies import sweep as study
 
     is_sampled = options.latin is not None
@@ -571,7 +572,7 @@ def _sweep(options: argparse.Namespace) -> int:
 @command(
     "ensemble artery.toml --seeds 32 -o seeds",
     SCENE_AND_CHANGES,
-    "--seeds N = 32  Use this many seeds (default: %(default)s; at least 2).",
+    "--seeds N = 32  Number of seeds, at least 2 (default: %(default)s).",
     _study("ensemble"),
     needs=COMPUTES + DRAWS,
 )
@@ -587,13 +588,13 @@ def _ensemble(options: argparse.Namespace) -> int:
     SCENE_AND_CHANGES,
     """
     --budget TIME = 10min  Stop after this wall time (default: %(default)s). Cheap runs come first;
-        a larger budget goes on.
+        repeat the command with a larger budget to resume.
     """,
     _study("trade"),
     needs=COMPUTES + DRAWS,
 )
 def _trade(options: argparse.Namespace) -> int:
-    """Run a scene with coarse and fine settings: what each costs, and how far off it is."""
+    """Run a scene with coarse and fine settings, and show the cost and error of each."""
     from remodel_fenicsx.studies.trade import trade
 
     return _answer(trade, options.scene, options.output, options.budget, options.jobs, options.quiet)
@@ -605,16 +606,15 @@ def _trade(options: argparse.Namespace) -> int:
     """
     data DATA  A TOML file with the unknowns and the tables of measurements; docs/fit.md explains
         it.
-    --no-likelihood-profiles  Leave out the likelihood profiles of unknowns that depend on each
-        other.
-    --starts N = 3  Start from N points: the given one, and others within a factor of two (default:
-        %(default)s).
+    --no-likelihood-profiles  Skip the likelihood profiles of correlated unknowns.
+    --starts N = 3  Start from N points: the point of DATA, and others within a factor of two
+        (default: %(default)s).
     """,
     _study("fit"),
     needs=COMPUTES + DRAWS,
 )
 def _fit(options: argparse.Namespace) -> int:
-    """Find numbers of a scene from measurements, with 95 % bands."""
+    """Fit parameters of a scene to measurements, with 95 % confidence intervals."""
     from remodel_fenicsx.studies.fit import fit
 
     wishes = options.starts, options.quiet, options.likelihood_profiles, options.jobs
@@ -625,15 +625,15 @@ def _fit(options: argparse.Namespace) -> int:
     "stability artery.toml --times 5 -o stable",
     SCENE_AND_CHANGES,
     """
-    -o --output DIR  Put the results into this new or empty folder (default:
+    -o --output DIR  Write the results to this folder, which must be new or empty (default:
         results/NAME-stability).
-    --times N = 10  Look at N times of the run (default: %(default)s).
+    --times N = 10  Analyse N times of the run (default: %(default)s).
     """,
     QUIET,
     needs=DRAWS + COMPUTES,
 )
 def _stability(options: argparse.Namespace) -> None:
-    """Run a scene and say whether its remodeling passes damp small errors or amplify them."""
+    """Run a scene and report whether its remodeling passes damp or amplify small errors."""
     from remodel_fenicsx.studies.stability import stability
 
     place, found = stability(options.scene, options.output, options.times, quiet=options.quiet)
@@ -647,14 +647,14 @@ def _info(options: argparse.Namespace) -> None:
     from remodel_fenicsx.kernels import is_available
 
     found = versions() | {
-        "kept factors": f"in {'single' if is_available() else 'double'} precision",
+        "factorisations": f"lagged, in {'single' if is_available() else 'double'} precision",
         "solver methods": ", ".join(SOLVER_METHODS),
     }
     for name, version in found.items():
         _say(f"{name:16} {version}")
 
 
-@command(PART, "file_of_part FILE  The task, which its answer replaces.", needs=COMPUTES)
+@command(PART, "file_of_part FILE  The task; the answer replaces it.", needs=COMPUTES)
 def _part(options: argparse.Namespace) -> None:
     from remodel_fenicsx.studies.fit import do_part
 

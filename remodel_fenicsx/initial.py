@@ -1,4 +1,4 @@
-"""How a body begins: choices and mesh of a scene, its files of fibres, natural configuration, and unloaded states."""
+"""Initial state of a body: kinematics, formulation, mesh, fibre files and unloaded states."""
 
 from __future__ import annotations
 
@@ -36,23 +36,25 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Fibres = Mapping[str, Mapping[str, Array]]  # measured: by region and name, a row for each element of the mesh
-# what files of fibres may have beside the fibres, as it is at the start of a run
+# measured fibres by region and name, with a row for each element of the mesh
+Fibres = Mapping[str, Mapping[str, Array]]
+# Fields of a fibre file that continue an earlier run, with their values at the start of a new run.
 UNCHANGED: Mapping[str, ArrayLike] = {NATURAL_GRADIENT: np.eye(3), "content": 1.0, "natural_length": 1.0, GROWTH: 1.0}
 NO_FIBRES: Fibres = {}
 BEYOND = 0.5
-"""Widths of the innermost layer: points that lie so far inside of a thin wall have rounding for stretches, for
-polynomials of degree 24 grow by T_24(1 + 2 BEYOND) = 3e13 up to there."""
+"""Largest extrapolation of the closing's polynomials, in widths of the innermost layer.
+
+At points farther inside a thin wall the stretches are rounding errors: polynomials of degree 24
+grow by T_24(1 + 2 BEYOND) = 3e13 up to there.
+"""
 ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
-"""Elements of a body, and bytes of a file of fibres, that are looked at in a few seconds without a run."""
+"""Elements of a body and bytes of a fibre file that `validate` checks in a few seconds."""
 
 
 def meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Scene, Domain]:
-    """The scene with its choices made, which are said, and the mesh."""
+    """Resolve and log the scene's choices; return the resolved scene and its mesh. Collective."""
     if scene.geometry.is_loaded:
-        raise SceneError(
-            f"geometry.is = 'loaded': the unloaded body is needed; {typed()} unload SCENE writes its scene"
-        )
+        raise SceneError(f"geometry.is = 'loaded': needs the unloaded body, from {typed()} unload SCENE")
     if domain is None and comm.rank == 0:
         for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
             log.info("%s", line)
@@ -63,7 +65,7 @@ def meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Sc
 
 
 def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
-    """One for each load case; made in the order of those of the first, so that all have the same kernels."""
+    """Make the unloaded state of each load case, all with the same compiled kernels."""
     made = [on_mesh_alone(scene, domain) for _ in scene.each_case()]
     unknowns = [one.unknown(domain.mesh, scene.mesh.degree) for one in made]
     quadrature = Quadrature(domain.mesh, scene.mesh.degree, made[0].weight(domain.mesh))
@@ -86,15 +88,15 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
         elements = domain.gather_mesh()[1]
         if tensors is not None and elements is not None:
             log.info(
-                "natural.fibres: files have the mean of each element, and the first row is off by what varies inside "
-                "them: at nodes they differ by up to %.1f %% of tr A",
+                "natural.fibres: files have element means, so the first row has an error from "
+                "variations inside elements; at nodes the means differ by up to %.1f %% of tr A",
                 100 * unevenness(elements, tensors),
             )
     return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 
 
 def on_mesh_alone(scene: Scene, domain: Domain) -> Any:
-    """The scene's kinematics, of a mesh that is free of stress."""
+    """Return the scene's kinematics on a stress-free mesh."""
     kinematics = KINEMATICS[scene.model.kinematics].on(domain.mesh, scene.geometry)
     return FreeLength(kinematics, scene.geometry) if scene.has_free_length else kinematics
 
@@ -106,7 +108,7 @@ def unloaded_state(
     cells: UnitCells,
     domain: Domain,
 ) -> State:
-    """Unknowns of the body with its supports, and with loads that are zero."""
+    """Make the state of a body with its supports and zero loads."""
     shape, loading = scene.geometry, Loading(domain, unknown, kinematics)
     shape.support(loading, scene.supports.ends, scene.loads)
     matrices = [one.material for one in scene.properties().values()]
@@ -118,7 +120,7 @@ def unloaded_state(
 def natural_gradient(
     scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes, fibres: Fibres = NO_FIBRES
 ) -> tuple[Array, Closing | None]:
-    """G (elements, points, 3, 3) of a body whose tissue is free of stress elsewhere; what closes to it, if anything."""
+    """Return G of the natural configuration (elements, points, 3, 3); the closed ring or None."""
     from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import closing
 
@@ -126,7 +128,8 @@ def natural_gradient(
     if natural.fibres:
         present, ratio = (in_files(fibres, name, quadrature, domain) for name in (NATURAL_GRADIENT, GROWTH))
         across = np.einsum("...j,...k->...jk", *(2 * [local_axes.axes[..., 2, :]]))
-        return present @ (np.eye(3) + (ratio - 1.0)[..., None, None] * across), None  # G_0 of `evolution.turnover`
+        # G_0 of `evolution.turnover`
+        return present @ (np.eye(3) + (ratio - 1.0)[..., None, None] * across), None
     for index, layer in enumerate(natural.layers):
         if layer.region is not None and layer.region not in domain.regions:
             known = ", ".join(map(repr, domain.regions))
@@ -142,7 +145,7 @@ def natural_gradient(
         stretches = found.stretches(radii)
         beyond = quadrature.maximum(((inner - radii) / (next_one - inner)).reshape(quadrature.shape))
         if beyond > BEYOND or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:
-            rule = "must be smaller, or mesh.refinement larger: the sides of elements are chords that leave the wall"
+            rule = "must be smaller, or mesh.refinement larger: straight element sides leave the wall"
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
         stretches = prestretch(natural, local_axes, domain)
@@ -150,7 +153,7 @@ def natural_gradient(
 
 
 def check_files(scene: Scene) -> str:
-    """Refuse what a run would, of the files that a scene names; in words what was not looked at. For one rank."""
+    """Check a scene's files on one rank; describe those that are too large to check here."""
     large = []
     for name, cells in scene.measured_cells.items():
         file = Path(str(cells.fibres))
@@ -160,7 +163,7 @@ def check_files(scene: Scene) -> str:
             read_fibres(cells, name)
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if large or number > ELEMENTS_OF_A_LOOK:
-        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; the run does"
+        return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; a run does"
     scene = with_choices(scene)
     domain = checked_domain(mesh_of(scene, MPI.COMM_SELF), scene)
     scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
@@ -169,7 +172,7 @@ def check_files(scene: Scene) -> str:
 
 
 def with_choices(scene: Scene, domain: Domain | None = None) -> Scene:
-    """The scene with what it is run with where it leaves the choice. A mesh of one's own is full."""
+    """Replace "auto" in a scene by its kinematics and formulation. A user-supplied mesh is full."""
     if AUTO not in (scene.model.kinematics, scene.mesh.formulation):
         return scene
     name = choice(scene).name if domain is None or scene.model.kinematics != AUTO else "full"
@@ -177,7 +180,7 @@ def with_choices(scene: Scene, domain: Domain | None = None) -> Scene:
 
 
 def mesh_of(scene: Scene, comm: MPI.Intracomm) -> Domain:
-    """The mesh of a scene: of its body, or of the part that stands for it. Collective."""
+    """Return the mesh of a scene: of its body, or of a reduction's part of the body. Collective."""
     if KINEMATICS[scene.model.kinematics].reduced:
         domain: Domain = scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
         return domain
@@ -185,7 +188,7 @@ def mesh_of(scene: Scene, comm: MPI.Intracomm) -> Domain:
 
 
 def checked_domain(domain: Domain, scene: Scene) -> Domain:
-    """The domain, if it is a mesh of the scene's body and elements."""
+    """Return the domain if it is a mesh of the scene's body and elements; raise otherwise."""
     shape, mesh = scene.geometry, domain.mesh
     kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
     if domain.shape != shape.name:
@@ -207,7 +210,7 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     for name, value in domain.dimensions.items():
         wanted = getattr(shape, name, value)
         if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
-            raise SceneError(f"geometry.{name} = {wanted:g}: that of the mesh is {value:g}")
+            raise SceneError(f"geometry.{name} = {wanted:g}: the mesh has {value:g}")
     empty = [name for name in needed if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
     if empty:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
@@ -216,12 +219,13 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     return domain
 
 
-# ---------------------------------------------------------------- files of fibres
-# Measured ones, and what an earlier run has left: from the files that a scene names to the points of a mesh.
+# ---------------------------------------------------------------- fibre files
+# From the files that a scene names to the points of a mesh: measured fibres, and fields that
+# continue an earlier run.
 
 
 def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Array]]:
-    """Measured fibres by region and name, a row for each element of the mesh, on all ranks. Collective."""
+    """Return measured fibres by region and name, with a row for each element. Collective."""
     if not scene.measured_cells:
         return {}
     points, elements = domain.gather_mesh()
@@ -241,31 +245,31 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Array]]
 
 
 def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict[str, Array]:
-    """Measured fibres, with prestretch, content and natural length where the scene begins with those of the file."""
+    """Select the fields of a fibre file that the scene starts with (natural.fibres)."""
     wanted, held = scene.natural.fibres, [name for name in UNCHANGED if name in measured]
     changed = [name for name in held if not np.allclose(measured[name], np.reshape(UNCHANGED[name], -1))]
     if changed and wanted is None:
-        rule = "set natural.fibres = true to begin with them, or false to leave them out"
+        rule = "set natural.fibres = true to start with them, or false to ignore them"
         raise SceneError(f"{key}: has {', '.join(changed)} of an earlier run; {rule}")
     of_turnover = [name for name in TURNED_OVER if name in changed]
     if wanted and of_turnover and not scene.remodeling.turnover.is_on:
-        raise SceneError(f"{key}: has {' and '.join(of_turnover)}, which only remodeling.turnover knows; it is not set")
+        raise SceneError(f"{key}: has {' and '.join(of_turnover)}, which needs remodeling.turnover")
     if wanted and GROWTH in changed:
         _check_growth(measured[GROWTH], key, scene.remodeling.turnover)
     return {name: values for name, values in measured.items() if wanted or name not in held}
 
 
 def _check_growth(growth: Array, key: str, turnover: Turnover) -> None:
-    """Whether tissue that has grown in an earlier run can go on as the scene says."""
+    """Check that the scene can continue the growth of an earlier run."""
     if turnover.start:
         raise SceneError(f"{key}: has {GROWTH} of an earlier run; remodeling.turnover.from must be 0 with it")
     if growth.min() <= 1.0 - turnover.volume:
         volume = f"remodeling.turnover.volume must be above {1.0 - growth.min():.3g} with it"
-        raise SceneError(f"{key}: has {GROWTH} of an earlier run, {growth.min():.3g} at the least; {volume}")
+        raise SceneError(f"{key}: has {GROWTH} of an earlier run, minimum {growth.min():.3g}; {volume}")
 
 
 def read_fibres(cells: Cells, region: str) -> FibreFile:
-    from remodel_fenicsx.body.fibres import read_fibre_file  # few scenes have one
+    from remodel_fenicsx.body.fibres import read_fibre_file  # Few scenes have fibre files.
 
     try:
         file = read_fibre_file(Path(str(cells.fibres)))
@@ -283,13 +287,13 @@ def _fibres_of(cells: Cells, region: str, corners: Array, chosen: Flags) -> dict
     except UnreadableFile as error:
         raise SceneError(f"{key} = {cells.fibres!r}: {error}") from error
     count, names = len(next(iter(file.measured.values()))), ", ".join(file.measured)
-    way = "by number" if farthest is None else f"the nearest ones, {farthest:.3g} away at most"
+    way = "by number" if farthest is None else f"nearest rows, largest distance {farthest:.3g}"
     log.info("%s: %s of %d rows, %s; SHA-256 %s", key, names, count, way, file.sha256)
     return {name: values[rows] for name, values in file.measured.items()}
 
 
 def in_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Array:
-    """An array of files of fibres at the points, (elements, points, ...); `UNCHANGED` where they have none."""
+    """Return a fibre field at the points (elements, points, ...); `UNCHANGED` if absent."""
     plain = np.asarray(UNCHANGED[name])
     found = np.tile(plain, (*quadrature.shape, *(1 for _ in plain.shape)))
     for region, measured in fibres.items():

@@ -1,8 +1,8 @@
-"""The body of a run in PyVista: a grid with its fields, a plotter with its chains, pictures and animations.
+"""Pictures and animations of a run's body in PyVista, with its fields and chains.
 
-A child process draws pictures, ``python3 -m remodel_fenicsx.pictures JOB``: a VTK that
-knows only X (Debian 13's) kills its process where there is no display, so the child gets one of its
-own from xvfb-run. A VTK that can draw without (EGL) gets by without that program.
+A child process renders pictures: ``python3 -m remodel_fenicsx.pictures JOB``. A VTK build that
+supports only X11 (Debian 13's) aborts without a display, so the child runs under xvfb-run, if that
+is installed. A VTK build with EGL needs no display.
 """
 
 from __future__ import annotations
@@ -45,12 +45,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
-ANGLE = "fibre_angle_deformed"  # colours the bodies
+ANGLE = "fibre_angle_deformed"  # field that colours the bodies
 ANGLES = ("fibre_angle", ANGLE)  # fields in degrees, from 0 to 90
-OF_TUBES = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)  # fields that chains are made of
+# fields from which chains are drawn
+OF_TUBES = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)
 SHOWN_FIELDS = ("displacement", ANGLE, *OF_TUBES)
-NOTHING_KNOWN = "#999ea6"  # where chains have no angle
-LIFT = 0.03  # of chains over the width of a face, which need not be plane
+NOTHING_KNOWN = "#999ea6"  # colour of points without a fibre angle
+LIFT = 0.03  # distance of chains above a face, which may be curved, over the width of the face
 LIGHT: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular": 0.0}
 
 
@@ -63,7 +64,7 @@ def grid(
     shown: NDArray[np.bool_] | None = None,
     names: Collection[str] | None = None,
 ) -> pyvista.UnstructuredGrid:
-    """Make the reference body of the elements that are shown, with the fields of a recorded time."""
+    """Make the grid of the visible elements, undeformed, with the fields of a recorded time."""
     import pyvista
 
     displacement, fields = whole.fields(time, names)
@@ -77,12 +78,12 @@ def grid(
 
 
 def deformed(found: pyvista.UnstructuredGrid) -> pyvista.UnstructuredGrid:
-    """Move the points of a grid, where displacements were recorded."""
+    """Displace the points of a grid, if displacements were recorded."""
     return found.warp_by_vector("displacement") if "displacement" in found.point_data else found
 
 
 def new_plotter(**options: Any) -> pyvista.Plotter:
-    """Make a white plotter with the light where the eye is."""
+    """Make a plotter with a white background and a light at the camera."""
     import pyvista
 
     plotter = pyvista.Plotter(lighting="none", **options)
@@ -99,7 +100,7 @@ def add_body(
     with_chains: bool = True,
     **options: Any,
 ) -> pyvista.Actor:
-    """Put a deformed body and its chains, as far as they were recorded, into a plotter."""
+    """Add a grid to a plotter, with its chains if they were recorded."""
     looks: dict[str, Any] = {"scalars": name, "show_edges": True, "edge_color": "#777777", **LIGHT}
     if name in ANGLES:
         looks |= {"cmap": list(ANGLE_COLOURS), "clim": (0, 90), "nan_color": NOTHING_KNOWN}
@@ -110,7 +111,7 @@ def add_body(
 
 
 def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
-    """Make the four chains of each element, deformed, as tubes on its outer faces."""
+    """Make the four deformed chains of each element as tubes on its outer faces."""
     import pyvista
 
     surface = body.extract_surface().compute_normals(point_normals=False, split_vertices=False)
@@ -132,21 +133,21 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
 
 
 def _width(corners: Array) -> Array:
-    """Measure faces with these corners (m, k, 3): their shortest side, of which wedges have one without length."""
+    """Return the shortest nonzero side of each face (m,) from its corners (m, k, 3)."""
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     return np.where(sides > 0, sides, np.inf).min(axis=1)
 
 
 # ---------------------------------------------------------------- pictures, by a child process
 
-LETTER, NOTE = 15, 11  # sizes of letters
+LETTER, NOTE = 15, 11  # font sizes
 PANEL = 600  # pixels: height of a body with its title
-FOOT = 150  # pixels: what stands below all bodies
-ZOOM = 0.8  # leaves room for the title
+FOOT = 150  # pixels: height of the footer
+ZOOM = 0.8  # leaves space for the title
 
 
 class Job(NamedTuple):
-    """What the child draws: sheets of bodies, each with its title; the words below them."""
+    """A drawing job: sheets of bodies with titles, view direction, and texts below them."""
 
     sheets: Sequence[Sequence[tuple[str, pyvista.UnstructuredGrid]]]
     direction: tuple[float, float, float]
@@ -155,28 +156,28 @@ class Job(NamedTuple):
 
 
 def render(job: Job) -> list[Pixels]:
-    """Draw sheets off-screen, each (rows, columns, 3)."""
+    """Draw sheets off-screen in a child process, each (rows, columns, 3)."""
     with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
         file = Path(folder) / "job"
         file.write_bytes(pickle.dumps(job))
         command = [sys.executable, "-m", __name__, str(file)]
         if shutil.which("xvfb-run"):
             command = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24", *command]
-        # the backend of a notebook is one that only its kernel may know
+        # The backend of a notebook works in its kernel alone.
         environment = environment_of_child() | {"PYVISTA_OFF_SCREEN": "true", "MPLBACKEND": "agg"}
-        # Python looks for modules where it is started, which must not be anybody's folder
+        # Python imports modules from the working folder first, which must not be a user's folder.
         child = subprocess.run(
             command, env=environment, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True
         )
         result = file.with_suffix(".npy")
         if child.returncode != 0 or not result.exists():
             said = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"
-            raise FigureError(f"no picture in space: {said}; are xvfb and xauth there?", BAD_ENVIRONMENT)
+            raise FigureError(f"rendering failed: {said}; check that xvfb and xauth are installed", BAD_ENVIRONMENT)
         return list(np.load(result))
 
 
 def main(file: str) -> None:
-    """Draw the sheets of a job file and save the pictures beside it."""
+    """Draw the sheets of a job file and save the pictures next to it."""
     job = pickle.loads(Path(file).read_bytes())
     bounds = np.array([body.bounds for sheet in job.sheets for _, body in sheet]).reshape(-1, 3, 2)
     extent = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1).ravel()
@@ -184,7 +185,7 @@ def main(file: str) -> None:
 
 
 def _drawn(job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], bounds: Array) -> Pixels:
-    """Draw bodies of one scale beside each other."""
+    """Draw the bodies of a sheet next to each other, at one scale."""
     columns = min(len(sheet), MOST_COLUMNS)
     rows = math.ceil(len(sheet) / columns)
     size = [max(800, PANEL * columns), PANEL * rows + FOOT]
@@ -215,14 +216,14 @@ def _drawn(job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], boun
     plotter.add_axes(viewport=(0.84, 0.0, 1.0, 1.0), color="black")
     image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True, scale=2)))
     plotter.close()
-    return np.asarray(image.reduce(2))  # smooth edges with every VTK
+    return np.asarray(image.reduce(2))  # antialiasing with every VTK
 
 
-# ---------------------------------------------------------------- what is seen of a body, and from where
+# ---------------------------------------------------------------- visible elements and view
 
 
 class Viewing(NamedTuple):
-    """How a body is looked at."""
+    """View options of a picture: visible layers, cut and view direction."""
 
     layers: int | None = None
     cut: str | None = None
@@ -230,7 +231,7 @@ class Viewing(NamedTuple):
 
     @property
     def direction(self) -> tuple[float, float, float]:
-        """Towards the eye."""
+        """Direction from the body towards the camera."""
         if self.view in VIEWS:
             return VIEWS[self.view]
         try:
@@ -238,41 +239,41 @@ class Viewing(NamedTuple):
         except ValueError:
             x = y = z = math.nan
         if not 0 < math.hypot(x, y, z) < math.inf:
-            allowed = f"{', '.join(VIEWS)} or X,Y,Z, where the eye is from the middle of the body"
-            raise FigureError(f"view {self.view}: allowed is {allowed}")
+            allowed = f"{', '.join(VIEWS)} or X,Y,Z, the direction from the body to the camera"
+            raise FigureError(f"view {self.view}: must be {allowed}")
         return x, y, z
 
 
 def shown_elements(whole: WholeBody, viewing: Viewing) -> NDArray[np.bool_]:
-    """Mark the elements that are neither peeled nor cut off, (elements,)."""
+    """Return which elements are visible: neither peeled nor cut off, (elements,)."""
     layers, count = viewing.layers, len(whole.depth)
     if layers is not None and not 1 <= layers <= count:
         start = whole.recording.scene.geometry.depth_in_words[1]
-        rule = f"allowed is a whole number from 1 to {count}, from the {start}"
+        rule = f"must be an integer from 1 to {count}, from the {start}"
         raise FigureError(f"layers {layers}: {rule}")
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
 
 
 def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
-    """Mark the elements that lie in front as a whole."""
+    """Return which elements are cut off: those that lie completely in front, (elements,)."""
     if cut is None:
         return np.zeros(len(whole.elements), dtype=bool)
     middle = (whole.points.min(axis=0) + whole.points.max(axis=0)) / 2
     x, y, _ = (whole.centres - middle).T
-    slack = 1e-6 * np.ptp(whole.points)  # an element on the border stays
+    slack = 1e-6 * np.ptp(whole.points)  # An element that touches the plane stays.
     found = {"half": y < -slack, "quarter": (y < -slack) & (x > slack)}
     if cut not in found:
-        raise FigureError(f"cut {cut}: allowed are {', '.join(found)}")
+        raise FigureError(f"cut {cut}: must be {' or '.join(found)}")
     if not found[cut].any():
-        raise FigureError(f"cut {cut}: no whole element of this body lies in that part")
+        raise FigureError(f"cut {cut}: no element of this body lies completely in that part")
     return found[cut]
 
 
 # ---------------------------------------------------------------- pictures and animations as files
 
 MOST_PANELS, MOST_COLUMNS = 12, 4
-FEWEST_FRAMES, MOST_FRAMES = 2, 500  # an animation of one is a picture
-FRAME_TIME, LAST_TIME = 80, 1600  # ms that a frame stands; multiples of 10, as GIF counts
+FEWEST_FRAMES, MOST_FRAMES = 2, 500  # An animation of one frame is a picture.
+FRAME_TIME, LAST_TIME = 80, 1600  # ms per frame; multiples of 10, the unit of GIF
 
 
 def draw_picture(
@@ -281,48 +282,48 @@ def draw_picture(
     viewing: Viewing,
     path: Path | None,
 ) -> Path:
-    """Draw the body of a run at some of its times, beside each other."""
+    """Draw the body of a run at recorded times, next to each other."""
     whole = _body_for(folder, path, (".png", ".pdf"))
     recorded = whole.recording.times
     for time in times or ():
         if not recorded[0] <= time <= recorded[-1]:
-            raise FigureError(f"times {time:g}: allowed are times from {recorded[0]:g} to {recorded[-1]:g}")
+            raise FigureError(f"times {time:g}: must be from {recorded[0]:g} to {recorded[-1]:g}")
     shown = dict.fromkeys(float(recorded[np.abs(recorded - time).argmin()]) for time in times or recorded[-1:])
     if len(shown) > MOST_PANELS:
-        rule = f"allowed are {MOST_PANELS} in a picture (animate shows more)"
+        rule = f"must be at most {MOST_PANELS} (animate shows more)"
         raise FigureError(f"times: {len(shown)} times; {rule}")
     return _draw(whole, [[*shown]], viewing, path, ".png")
 
 
 def draw_animation(folder: str | os.PathLike[str], frames: int, viewing: Viewing, path: Path | None) -> Path:
-    """Draw the body of a run as it moves through time."""
+    """Draw the body of a run over time."""
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
-        rule = f"allowed is a whole number from {FEWEST_FRAMES} to {MOST_FRAMES}"
+        rule = f"must be an integer from {FEWEST_FRAMES} to {MOST_FRAMES}"
         raise FigureError(f"--frames {frames}: {rule}")
     whole = _body_for(folder, path, (".gif", ".webp"))
     recorded = whole.recording.times
     if len(recorded) == 1:
-        fault = "fields of one time alone are recorded, so nothing moves"
+        fault = "fields are recorded at one time only; an animation needs two"
         raise FigureError(f"{whole.recording.path}: {fault}")
     return _draw(whole, [[float(time)] for time in kept_times(recorded, frames)], viewing, path, ".gif")
 
 
 def _body_for(folder: str | os.PathLike[str], path: Path | None, endings: Sequence[str]) -> WholeBody:
-    """Read the body of a run; a file that cannot be made is refused before anything is drawn."""
+    """Read the body of a run; first check that the output file can be written."""
     if path is not None:
         if path.suffix.lower() not in endings:
-            raise FigureError(f"path {path}: allowed is a name that ends in {', '.join(endings)}")
+            raise FigureError(f"path {path}: the suffix must be {' or '.join(endings)}")
         if os.path.lexists(path):
             raise TakenError(path)
         if not path.parent.is_dir():
-            raise FigureError(f"path {path}: there is no folder {path.parent}")
+            raise FigureError(f"path {path}: folder {path.parent} does not exist")
     return WholeBody(RecordedRun(folder))
 
 
 def _draw(
     whole: WholeBody, sheets: Sequence[Sequence[float]], viewing: Viewing, path: Path | None, ending: str
 ) -> Path:
-    """Draw sheets of some times each, and write them into a new file."""
+    """Draw sheets, each with some times, and write them to a new file."""
     recording, scene, shown = whole.recording, whole.recording.scene, shown_elements(whole, viewing)
     if ANGLE not in recording.fields(sheets[0][0], {ANGLE}):
         raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)")

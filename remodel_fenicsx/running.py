@@ -1,4 +1,4 @@
-"""Recorded runs: a scene run in a folder, or a run in a folder that goes on."""
+"""Recorded runs: start a run in a folder, resume one, and write files before any solve."""
 
 from __future__ import annotations
 
@@ -64,42 +64,43 @@ def run(
     report: bool = True,
     watchers: Sequence[Watcher | Callable[[Simulation], Watcher]] = (),
 ) -> Path:
-    """Run a scene and record it.
+    """Run a scene and record the results.
 
     Parameters
     ----------
     scene
         The validated scene.
     folder
-        New or empty folder for the results; default: results/NAME, numbered when taken.
+        New or empty folder for the results. Default: results/NAME, numbered if it exists.
     comm
         MPI communicator.
     quiet
-        No progress on the terminal.
+        Show no progress on the terminal.
     deadline
-        `time.monotonic` before which it shall stop, between two steps; None: never.
+        Value of `time.monotonic` before which the run stops, between two steps. None: no limit.
     report
-        Whether it leaves report.html at its end, if the scene does not say otherwise (`output.report`).
+        Whether to write report.html at the end, unless the scene sets `output.report = false`.
     watchers
-        Who else follows the steps, before they are recorded, or functions of the `Simulation` that make them; those of
-        every run are in `extend.WATCHERS`.
+        Further watchers, or functions that make one from the `Simulation`. They see each step
+        before it is recorded. Watchers for every run are in `extend.WATCHERS`.
 
     Returns
     -------
     Path
-        The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log, report.html and the
-        checkpoints.
+        The folder with history.csv, fields.vtkhdf, fields_chains.vtkhdf, scene.toml, run.log,
+        report.html and the checkpoints.
 
     Raises
     ------
     FolderTaken
         If the folder is not empty.
     StepFailure
-        If a step has no admissible equilibrium; all steps before it are recorded, with a checkpoint.
+        If a step has no admissible equilibrium. The steps before it are recorded, with a
+        checkpoint.
     Interrupted
-        On SIGINT, SIGTERM or SIGHUP; all accepted steps are recorded.
+        On SIGINT, SIGTERM or SIGHUP. All accepted steps are recorded.
     Paused
-        On SIGUSR1, or before the deadline; all is recorded, with a checkpoint.
+        On SIGUSR1, or before the deadline. All steps are recorded, with a checkpoint.
     OSError
         If the results cannot be written.
 
@@ -113,16 +114,17 @@ def run(
     >>> run(scene, "one-step")
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.results.recording.FolderTaken: folder one-step: is not empty; allowed is a new or an empty folder
+    remodel_fenicsx.results.recording.FolderTaken: folder one-step: is not empty; ...
     """
     interrupts.end_all_ranks_on_exception()
-    # what the scene asks for is built before anything is written
+    # The simulation is built before anything is written.
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
     with interrupts.StopRequest() as stop, ExitStack() as body:
         with hold_log(comm.rank, quiet=quiet) as held:
             scene = body.enter_context(as_unloaded(scene, comm, quiet))
             found = comm.bcast(agreed(comm, lambda: _kept_files(scene)[0] if comm.rank == 0 else {}))
-            # a file that is replaced from here on is refused, so what is kept is what is read
+            # A file that is replaced after this point is refused, so the stored files are those
+            # that are read.
             if sums := {key: value for key, value in found.items() if key.endswith("sha256")}:
                 scene = scene.with_values(sums)
             simulation = body.enter_context(_built(scene, comm))
@@ -141,7 +143,7 @@ def resume(
     deadline: float | None = None,
     report: bool = True,
 ) -> Path:
-    """Go on with a recorded run from its last checkpoint, or from t = 0 where it has none yet."""
+    """Resume a recorded run from its last checkpoint, or from t = 0 if it has none. Collective."""
     interrupts.end_all_ranks_on_exception()
     place = Path(folder)
     with interrupts.StopRequest() as stop, locked(place, comm, new=False), ExitStack() as body:
@@ -155,7 +157,7 @@ def resume(
 
 
 def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
-    """Scene, and checkpoint on rank 0, of a run that goes on; or the refusal on all ranks."""
+    """Return scene, and checkpoint on rank 0, of a run to resume; raise errors on all ranks."""
 
     def read() -> tuple[Scene, Checkpoint | None]:
         begun = versions_as_run(place)
@@ -163,13 +165,14 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
         try:
             scene = read_scene(place / SCENE, overrides)
         except SceneError:
-            scene_as_run(place)  # which may say that the folder is damaged; else it is the overrides
+            # A corrupt folder raises its own error here; otherwise the overrides are wrong.
+            scene_as_run(place)
             raise
         checkpoint, values = read_checkpoint(place), read_toml(place / SCENE)
         for name in set(values.get("output", {}).get("columns", ())) & set(COLUMNS_THAT_WENT):
-            log.warning("goes on without the column %s, which this version does not have", name)
+            log.warning("resumes without the column %s, which this version does not have", name)
         if checkpoint is None:
-            log.info("no checkpoint yet: starts again at t = 0")
+            log.info("no checkpoint: restarting at t = 0")
         else:
             try:
                 before = tomllib.loads(checkpoint.scene)
@@ -177,12 +180,12 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
                 raise CheckpointError(f"the checkpoint's scene is not TOML: {error}") from error
             check_continuation(scene_from_dict(before), scene, checkpoint.time)
             _check_whole(values, before, place)
-            log.info("goes on from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
+            log.info("resumes from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
             begun = checkpoint.versions
         now = versions()
         for name, version in begun.items():
             if now.get(name) != version:
-                log.warning("goes on with %s %s, the run was begun with %s", name, now.get(name), version)
+                log.warning("resumes with %s %s, but was started with %s", name, now.get(name), version)
         return scene, checkpoint
 
     scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
@@ -190,16 +193,16 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
 
 
 def _check_whole(values: dict[str, Any], before: dict[str, Any], place: Path) -> None:
-    """A scene as run has all values: one that was cut might still be valid, with defaults that nobody asked for."""
+    """Check that a recorded scene has all values: a truncated file could be valid with defaults."""
     had, has = (dict(leaves(scene, ("loads",))) for scene in (before, values))
     if lost := had.keys() - has.keys():
-        rule = f"lacks {min(lost)}, which the run had; write it as it was, or another value"
+        rule = f"lacks {min(lost)}, which the run had; restore the key, or set another value"
         raise RecordingError(f"{place / SCENE}: {rule}")
 
 
 @contextmanager
 def _built(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
-    """It is closed at the end, if all ranks come there: the others would wait for ever."""
+    """Open a simulation and close it on exit, unless only some ranks have raised. Collective."""
     try:
         with interrupts.stopping_at_once(), _options_blamed(scene):
             simulation = Simulation(scene, comm)
@@ -216,19 +219,19 @@ def _built(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
 
 
 def _is_everywhere(error: BaseException, comm: MPI.Intracomm) -> bool:
-    """Whether all ranks have it, and may do together what ends a run."""
+    """Return whether all ranks have raised the error and may call collective functions."""
     return comm.size == 1 or getattr(error, "on_all_ranks", False)
 
 
 @contextmanager
 def _options_blamed(scene: Scene) -> Iterator[None]:
-    """What PETSc refuses is the scene's own options, where it has any: many are looked at in the first solve only."""
+    """Raise PETSc errors as a SceneError on solver.petsc_options, if the scene sets any."""
     try:
         yield
     except PETSc.Error as error:
         if not (given := scene.solver.petsc_options):
             raise
-        rule = f"PETSc refuses them (error {error.ierr}); allowed are the options of its manual pages"
+        rule = f"PETSc rejects them (error {error.ierr}); must be options of its manual pages"
         raise SceneError(f"solver.petsc_options = {shown(given)}: {rule}") from error
 
 
@@ -243,7 +246,7 @@ def _record(
     resumes: bool = False,
     watchers: Sequence[Watcher] = (),
 ) -> None:
-    """March through time in the folder; `held` is what was logged before the run had one."""
+    """Run a simulation in its folder; `held` has the log records of its construction."""
     scene, comm, state = simulation.scene, simulation.domain.mesh.comm, simulation.state
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
@@ -272,7 +275,8 @@ def _record(
         unknowns = simulation.unknown.x.petsc_vec.getSize()
         if comm.size > 1 and unknowns < WORTH_RANKS:
             log.info("%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)", unknowns, comm.size)
-        for warning in simulation.scene.warnings(simulation.domain):  # the one whose files have places
+        # This scene has the paths of its files; `scene` has their names in the run's folder.
+        for warning in simulation.scene.warnings(simulation.domain):
             log.warning("%s", warning)
         followers, kept = list(watchers), [record.flush]
         if scene.output.fields:
@@ -294,16 +298,17 @@ def _record(
         except (StepFailure, interrupts.Interrupted, interrupts.Paused) as reason:
             if isinstance(reason, StepFailure):
                 log.info(FAILED + "%s. %s", reason, reason.refusal)
-                reason.kept += ", and run --resume goes on from there"
+                reason.kept += ", and run --resume continues from there"
             else:
                 log.info(STOPPED + "%s", reason)
             if _is_everywhere(reason, comm):
                 checkpoints.write()
-            if not isinstance(reason, (interrupts.Interrupted, interrupts.Paused)):  # these shall end soon
+            # Interrupted and paused runs must end soon, without a report.
+            if not isinstance(reason, (interrupts.Interrupted, interrupts.Paused)):
                 leave_report()
             raise
         except Exception as defect:
-            with suppress(OSError):  # the disk may be full
+            with suppress(OSError):  # The disk may be full.
                 log.info(FAILED + "%s: %s", type(defect).__name__, defect)
             raise
         log.info("finished")
@@ -311,7 +316,7 @@ def _record(
 
 
 def with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
-    """The scene with the names that its files have in the folder of the run and their SHA-256, and these files."""
+    """Return the scene with file names relative to the run folder and SHA-256, and these files."""
     changes, files = _kept_files(scene)
     return scene.with_values(changes) if changes else scene, files
 
@@ -333,43 +338,43 @@ def _kept_files(scene: Scene) -> tuple[dict[str, object], dict[str, bytes]]:
 
 
 def _leave_report(place: Path) -> None:
-    """The page of the run. Where it cannot be made the run is none the worse."""
+    """Write the page of the run. Log a warning if that fails: the results are complete."""
     from remodel_fenicsx.report import REPORT, write_report
 
     try:
         write_report(place)
-    except Exception as error:  # whatever it is: the results are there
+    except Exception as error:  # No error of the report may end a run whose results are complete.
         words = f"no {REPORT}: {' '.join(str(error).split()) or type(error).__name__}"
         try:
             log.warning("%s", words)
-        except OSError:  # the disk is full
+        except OSError:  # The disk is full.
             announce(f"WARNING: {words}")
 
 
 class _Report(Watcher):
-    """Each accepted step in the log and on the terminal."""
+    """Watcher that writes each accepted step to the log and the terminal."""
 
     def __init__(self, scene: Scene, progress: Progress):
         self.progress, self.time = progress, scene.time
         self.loads = [kind.column or name for name, kind in scene.load_kinds.items()]
 
     def committed(self, step: Step) -> None:
-        """Say it."""
+        """Log the step's row and update the progress display."""
         log.info("%s", ", ".join(f"{name} {value:.6g}" for name, value in step.row.items()))
         if (parts := step.work.substeps) > 1:
-            log.log(NOTICE, "time %g solved in %d parts", step.time, parts)
+            log.log(NOTICE, "time %g solved in %d substeps", step.time, parts)
         loads = [f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row]
         state = ", ".join([f"t = {step.time:g}", *loads, f"{step.work.newton_iterations} Newton"])
         count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.chooses else None
         self.progress.step(self.time.progress(step.number, step.time), state, count)
 
 
-# ---------------------------------------------------------------- what may be looked at before any solve
-# The scene of an unloaded body, and local axes on the mesh.
+# ---------------------------------------------------------------- before any solve
+# The scene of the unloaded body, and the local axes on the mesh.
 
 
 def write_unloaded(scene: Scene, folder: Path) -> None:
-    """Write scene.toml of the unloaded body into a new folder, with unloaded.msh of an own one."""
+    """Write scene.toml of the unloaded body, and its mesh if it has one, into a new folder."""
     part = part_of(folder)
     with RunLock(part), hold_log(quiet=False):
         try:
@@ -387,7 +392,7 @@ def write_unloaded(scene: Scene, folder: Path) -> None:
 
 
 def write_axes(scene: Scene, path: Path) -> str:
-    """Write local axes, depth, station, thickness, and where the axes are undefined, by element. Collective."""
+    """Write local axes, depth, station and thickness by element; describe them. Collective."""
     scene = with_choices(scene)
     domain, shape = checked_domain(mesh_of(scene, MPI.COMM_WORLD), scene), scene.geometry
     mesh = domain.mesh

@@ -1,4 +1,4 @@
-"""A scene whose geometry is the loaded one, as a scene of the unloaded body that its loads bring there."""
+"""Unloaded bodies: the scene of the unloaded body for a scene with loaded geometry."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 @contextlib.contextmanager
 def as_unloaded(scene: Scene, comm: MPI.Intracomm, quiet: bool = True) -> Iterator[Scene]:
-    """The scene itself, or that of its unloaded body, whose mesh is there as long as this context. Collective."""
+    """Yield the scene, or that of its unloaded body with a temporary mesh file. Collective."""
     if not scene.geometry.is_loaded:
         yield scene
         return
@@ -47,30 +47,30 @@ def as_unloaded(scene: Scene, comm: MPI.Intracomm, quiet: bool = True) -> Iterat
 def unloaded(
     scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | None = None, quiet: bool = True
 ) -> Scene:
-    """The scene of the body that the loads, at the end of their ramps, bring to the geometry of this one. Collective.
+    """Compute the unloaded body that the loads, after their ramps, deform to this one. Collective.
 
     Parameters
     ----------
     scene
-        With `geometry.is = "loaded"`; another is given back.
+        Scene with `geometry.is = "loaded"`. Any other scene is returned unchanged.
     comm
         MPI communicator.
     folder
-        Where the mesh of an own body is written, on rank 0.
+        Folder for the unloaded mesh if the geometry is a mesh file; written on rank 0.
     quiet
-        No progress on the terminal.
+        Show no progress on the terminal.
 
     Returns
     -------
     Scene
-        With the geometry of the unloaded body in place of the loaded one.
+        The scene with the geometry of the unloaded body in place of the loaded one.
 
     Raises
     ------
     SceneError
-        If the body has no numbers or nodes to be found, or an own body no folder.
+        If the unloaded body of this geometry cannot be computed, or a mesh file has no `folder`.
     NoUnloadedShape
-        If none is found.
+        If the iteration does not converge.
 
     Examples
     --------
@@ -78,10 +78,12 @@ def unloaded(
 
     >>> from remodel_fenicsx import preset_scene, unloaded
     >>> tube = preset_scene("kuhl-holzapfel-2007", "tube")
-    >>> seen = tube.with_values({"geometry.is": "loaded", "model.kinematics": "radial", "cells.axes": "cylindrical",
-    ...                          "cells.initial": "isotropic", "loads.pressure.value": 0.5})
-    >>> found = unloaded(seen).geometry
-    >>> round(found.inner_radius, 3), round(found.outer_radius, 3)  # 1 and 3 are under pressure and elongation
+    >>> loaded = tube.with_values({
+    ...     "geometry.is": "loaded", "model.kinematics": "radial", "cells.axes": "cylindrical",
+    ...     "cells.initial": "isotropic", "loads.pressure.value": 0.5})
+    >>> geometry = unloaded(loaded).geometry
+    >>> # radii of 1 and 3 under pressure and elongation
+    >>> round(geometry.inner_radius, 3), round(geometry.outer_radius, 3)
     (0.968, 3.101)
     """
     if not scene.geometry.is_loaded:
@@ -91,24 +93,25 @@ def unloaded(
             _warn(scene)
             return unloaded_tube(scene, comm, line.show)
         if folder is None:
-            raise SceneError("geometry.is = 'loaded': a folder is needed for the unloaded mesh")
+            raise SceneError("geometry.is = 'loaded': needs a folder for the unloaded mesh")
         return unloaded_mesh(scene, comm, folder, line.show)
 
 
-# ---------------------------------------------------------------- numbers that the loads bring to the given ones
-# By Broyden's method, whose first guess is that loaded numbers change as the unloaded ones do.
+# ---------------------------------------------------------------- nonlinear solver
+# Broyden's method for unloaded dimensions or nodes. Its first Jacobian assumes that loaded values
+# change as the unloaded ones do.
 
 Array = NDArray[np.float64]
 Said = Callable[[str], object]
 
-LEAST_SHARE = 1 / 16  # of the loads, in which they are taken where they cannot be in one piece
-MOST_LOADINGS = 30  # for one share of the loads
-ON_THE_WAY = 0.01  # relative: how far numbers may be off at a share of the loads
+LEAST_SHARE = 1 / 16  # smallest load increment, as a fraction of the loads
+MOST_LOADINGS = 30  # forward runs per load increment
+ON_THE_WAY = 0.01  # relative tolerance of dimensions at intermediate load factors
 REFUSALS = (ArithmeticError, FaceError, StepFailure, SceneError)
 
 
 class NoUnloadedShape(RemodelError, RuntimeError):
-    """There is none that the loads bring to the given one; one line with the share of the loads, and why."""
+    """Failure to find an unloaded shape; one line with the load factor and the reason."""
 
     exit_code = SOLVE_FAILED
 
@@ -120,11 +123,12 @@ def found_unloaded(
     said: Said,
     scale: float = 1.0,
 ) -> tuple[Array, int]:
-    """Numbers that the loads bring to the given ones, and how often they were loaded.
+    """Solve for the unloaded values; return them and the number of forward runs.
 
-    `start` guesses them at a share of the loads, `missed` says how far the given ones are from those loaded.
+    `start` guesses the values at a load factor. `missed` returns the differences of the target
+    from the values under load.
     """
-    from scipy.optimize import NoConvergence, broyden1  # which no run needs
+    from scipy.optimize import NoConvergence, broyden1  # No other run needs SciPy's solvers.
 
     runs, words = 0, ""
 
@@ -133,12 +137,12 @@ def found_unloaded(
         runs += 1
         said(f"iteration {runs}{words}, {100 * share:g} % of the loads")
         found = missed(numbers, share)
-        words = f", off by {np.abs(found).max():.0e} before"
+        words = f", last error {np.abs(found).max():.0e}"
         return found
 
     how: dict[str, Any] = {"alpha": scale, "line_search": None, "maxiter": MOST_LOADINGS}
     done, step = 0.0, 1.0
-    change: Any = 0.0  # of the start, per share of the loads
+    change: Any = 0.0  # correction of `start` per unit of the load factor
     while done < 1.0:
         share, words = min(done + step, 1.0), ""
         try:
@@ -146,28 +150,30 @@ def found_unloaded(
             change = (broyden1(error, first + share * change, f_tol=nearly, **how) - first) / share
             done = share
         except (*REFUSALS, NoConvergence) as refusal:
-            reason = f"not found in {MOST_LOADINGS} iterations{words}"
+            reason = f"no convergence in {MOST_LOADINGS} iterations{words}"
             if not isinstance(refusal, NoConvergence):
                 reason = " ".join(str(refusal).split())
-            log.info("unloading at %g %% of the loads failed (%s); they are now taken in parts", 100 * share, reason)
+            log.info("unloading at %g %% of the loads failed (%s); using smaller load increments", 100 * share, reason)
             step /= 2
             if step < LEAST_SHARE:
                 raise NoUnloadedShape(
-                    f"geometry.is = 'loaded': no unloaded body was found at {100 * share:g} % of the loads, there is "
-                    f"one at {100 * done:g} %: {reason}; try lower loads, or a stiffer tissue"
+                    f"geometry.is = 'loaded': no unloaded configuration at {100 * share:g} % of "
+                    f"the loads (last converged: {100 * done:g} %): {reason}; lower the loads or "
+                    "stiffen the tissue"
                 ) from refusal
     return start(1.0) + change, runs
 
 
-# ---------------------------------------------------------------- the unloaded tube of a loaded one
+# ---------------------------------------------------------------- unloaded tubes
 # Radii and length.
-#  They are found by runs of the scene's own kinematics, so that the run that follows comes to the given numbers:
-# by Broyden's method for their logarithms, from what inverse elastostatics of one radius says
-# (`model.residual_stress.closing`). There the loaded numbers change about as the unloaded ones do.
+#  Forward runs have the scene's own kinematics, so that the following run reaches the dimensions of
+# the scene. Broyden's method solves for the logarithms of the dimensions. It starts from inverse
+# elastostatics of one radius (`model.residual_stress.closing`), where loaded dimensions change
+# about as the unloaded ones do.
 
-LOADED_AGAIN = 1e-9  # relative: how far the loaded numbers may be from those of the scene
-LOAD_STEPS = 10  # of a run to the end of the ramps
-# cells that stay; what says how to remodel goes with a law
+LOADED_AGAIN = 1e-9  # relative tolerance of the loaded dimensions
+LOAD_STEPS = 10  # steps of a forward run to the end of the ramps
+# Settings without remodeling. Keys that belong to a law get their defaults.
 PASSIVE: dict[str, object] = {
     "remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {},
     "remodeling.exponent": 2.0, "remodeling.threshold": 0.0, "time.tolerance": None,
@@ -175,7 +181,7 @@ PASSIVE: dict[str, object] = {
 
 
 def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
-    """From inverse elastostatics."""
+    """Return the scene of the unloaded tube, starting from inverse elastostatics. Collective."""
     shape: Any = scene.geometry
     inside = [radius for radius in _outer_radii(scene).values() if radius < shape.outer_radius]
     given = np.array([shape.inner_radius, *inside, shape.outer_radius, shape.length])
@@ -186,18 +192,18 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
     numbers, runs = found_unloaded(lambda share: np.log(_inverse(scene, given, share)), missed, LOADED_AGAIN, said)
     found = np.exp(numbers)
     unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
-    log.log(NOTICE, "unloaded: %s, so that under the loads it has the given %s (%d runs)", unloaded, loaded, runs)
+    log.log(NOTICE, "unloaded: %s; under the loads: %s (%d runs)", unloaded, loaded, runs)
     return _with_numbers(scene, found)
 
 
 def _outer_radii(scene: Scene) -> dict[str, float]:
-    """Of the regions that say one, from the lumen outwards."""
+    """Return the outer radii of the regions that set one, from the lumen outwards."""
     said = {name: region.outer_radius for name, region in scene.regions.items() if region.outer_radius is not None}
     return dict(sorted(said.items(), key=lambda item: item[1]))
 
 
 def _inverse(scene: Scene, given: Array, share: float) -> Array:
-    """Unloaded radii and length of a tube with these loaded ones, whose mesh is free of stress; on one radius."""
+    """Return unloaded radii and length of a stress-free tube by inverse elastostatics."""
     tissues = {name: properties.tissue for name, properties in scene.properties().items()}
     layers = scene.geometry.layers_of_tissue(Natural(), scene.regions, tissues)
     end = scene.end_of_ramps
@@ -208,7 +214,7 @@ def _inverse(scene: Scene, given: Array, share: float) -> Array:
 
 
 def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
-    """Radii and length under a share of the loads, as a run has them."""
+    """Return radii and length of a forward run at a load factor. Collective."""
     end = scene.end_of_ramps or 1.0
     changes: dict[str, object] = {"output.columns": [], "output.times": [], "output.fields": False}
     if scene.natural.cells == AS_GIVEN:
@@ -236,7 +242,7 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
 
 
 def _with_numbers(scene: Scene, numbers: Array) -> Scene:
-    """The scene of an unloaded tube of these radii, from the lumen outwards, and this length."""
+    """Return the scene of an unloaded tube with these radii (inner to outer) and length."""
     changes: dict[str, object] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
     changes |= {"geometry.inner_radius": float(numbers[0]), "geometry.outer_radius": float(numbers[-2])}
     changes |= {"geometry.length": float(numbers[-1])}
@@ -245,16 +251,17 @@ def _with_numbers(scene: Scene, numbers: Array) -> Scene:
     return scene.with_values(changes)
 
 
-# ---------------------------------------------------------------- the unloaded mesh of a loaded one
-# The places of all nodes. The residual is that of the unloaded body under its loads, displaced to the given places.
-# How far these are from the loaded ones is what one Newton step of that body adds to its displacement.
+# ---------------------------------------------------------------- unloaded meshes
+# Positions of all nodes. The residual is that of the unloaded body under its loads, displaced to
+# the measured positions. Their distance from the loaded positions is the increment of one Newton
+# step of that body.
 
 UNLOADED_MESH = "unloaded.msh"
-LEAST_MOVE = 1e-10  # of the body's extent: how far a node may be from its given place
+LEAST_MOVE = 1e-10  # largest distance of a node from its measured position, over the body's extent
 
 
 def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -> Scene:
-    """The scene of the unloaded body, whose mesh is written into the folder. Collective."""
+    """Return the scene of the unloaded body and write its mesh into the folder. Collective."""
     shape: Any = scene.geometry
     file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
     given: Array = comm.bcast(None if file is None else file.points)
@@ -263,7 +270,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
     def missed(places: Array, share: float) -> Array:
         moved: Any = file and replace(file, points=places)
         if not comm.bcast(moved is None or _is_whole(moved)):
-            raise ArithmeticError("elements would turn inside out")
+            raise ArithmeticError("inverted elements")
         domain = shared(lambda: (moved, shape.boundary(moved), regions or {}), comm)
         with unsaid(), contextlib.closing(Simulation(as_unloaded, comm, domain)) as simulation:
             return np.divide(_missed(simulation, given, share), extent, dtype=np.float64)
@@ -274,7 +281,7 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
         path.write_text(gmsh_text(places, file.blocks, file.names), encoding="ascii")
     comm.barrier()
     moved = np.linalg.norm(places - given, axis=1).max()
-    log.log(NOTICE, "unloaded: %d nodes, moved by %.6g at most, found in %d iterations", len(places), moved, runs)
+    log.log(NOTICE, "unloaded: %d nodes, largest movement %.6g, found in %d iterations", len(places), moved, runs)
     changes: dict[str, object] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
     changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
     if shape.regions:
@@ -296,13 +303,13 @@ def _read(scene: Scene) -> tuple[MeshFile, dict[str, int]]:
 
 
 def _is_whole(file: MeshFile) -> bool:
-    """Whether no element is twisted."""
+    """Return whether no element is inverted."""
     determinants = jacobian_determinants(file)
     return bool((determinants * np.sign(determinants.mean()) > 0).all())
 
 
 def _missed(simulation: Simulation, given: Array, share: float) -> Array:
-    """How far the given places are from the loaded ones, (nodes, 3) in the order of the file, on all ranks."""
+    """Return distances to loaded positions (nodes, 3), in file order on all ranks. Collective."""
     domain, coupling, unknown = simulation.domain, simulation.stepper.coupling, simulation.unknown
     loads = simulation.load_values(simulation.scene.end_of_ramps)
     simulation.loading.set({name: share * value for name, value in loads.items()})

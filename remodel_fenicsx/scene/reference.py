@@ -1,4 +1,4 @@
-"""The keys of scenes as JSON Schema (draft 2020-12), for editors."""
+"""JSON Schema (draft 2020-12) of scene files, for editors."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from remodel_fenicsx.schema.units import STRESS, schema_with_unit
 if TYPE_CHECKING:
     from pydantic_core import core_schema
 
-# What an editor needs to complete keys, to show their meanings and to mark faults. It knows each key by itself. What
-# depends on several keys (loads on the shape, say), or must be there without a preset, `validate` alone can tell.
+# An editor uses the schema to complete keys, show their meanings and mark errors key by key. Only
+# `validate` checks what depends on several keys (loads on the shape, for example) or must be set
+# without a preset.
 
 Schema = dict[str, Any]
 
 
 class _Keys(GenerateJsonSchema):
-    """No key is required, for a preset may lie under it; nothing is null, which TOML does not have."""
+    """Generator of a schema without required keys, which a preset may set, and without null."""
 
     def field_is_required(self, field: object, total: bool) -> bool:
         return False
@@ -37,7 +38,7 @@ class _Keys(GenerateJsonSchema):
 
 
 def json_schema() -> Schema:
-    """The JSON Schema (draft 2020-12) of a scene file of this version, what scripts have registered included."""
+    """Return the JSON Schema (draft 2020-12) of scene files, with registered components."""
     schema = Scene.model_json_schema(schema_generator=_Keys)
     properties = schema["properties"]
     load = schema["$defs"]["Load"]["properties"]["value"]

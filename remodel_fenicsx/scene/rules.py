@@ -1,6 +1,6 @@
-"""What fits with what across the tables of a scene: rules in their order, of which the first that is broken is told.
+"""Rules across the tables of a scene, in order; the first one that is broken gives the error.
 
-A rule yields what does not fit: what is allowed, the key and its value. Tables know their own keys alone.
+A rule yields (message, key, value) for each fault. The tables check their own keys.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from remodel_fenicsx.schema.tables import Faults, listed, named, quoted, shown
 
 
 def _shapes(kind: type, mark: str = ", ") -> str:
-    """Names of the shapes that are of a kind."""
+    """Return the names of the shapes of a kind."""
     return named(SHAPES, lambda shape: issubclass(shape, kind)).replace(", ", mark)
 
 
 def named_regions(scene: Scene) -> Faults:
-    """Regions of bodies that have some; their names are parts of the names of columns."""
+    """Check that the shape can have regions, and that their names suit column names."""
     shape = scene.geometry
     for name in scene.regions:
         key = f"regions.{quoted(name)}"
@@ -50,11 +50,11 @@ def named_regions(scene: Scene) -> Faults:
             yield "the name of a region must be a letter, then letters, digits and _, at most 40 in all", key, None
         columns = [column for column in scene.column_names if column.endswith(f"_{name}")]
         if twice := {column for column in columns if columns.count(column) > 1}:
-            yield f"the column {min(twice)!r} has another meaning; choose another name", key, None
+            yield f"the column {min(twice)!r} already exists; choose another name", key, None
 
 
 def tissue_of_regions(scene: Scene) -> Faults:
-    """The keys of a region together with those of the whole body."""
+    """Check the keys of regions together with those of the whole body."""
     law, turnover = LAWS[scene.remodeling.law], scene.remodeling.turnover
     for name, (material, cells, kappa) in scene.properties().items():
         region, length = in_region(name), cells.end_to_end_length
@@ -67,7 +67,7 @@ def tissue_of_regions(scene: Scene) -> Faults:
             yield "needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial
         are_apart = material.tells_volume_apart and scene.material.tells_volume_apart
         if material.matrix != scene.material.matrix and not are_apart:
-            rule = f"allowed beside {scene.material.matrix!r} are those that are made as a Matrix, if it is one"
+            rule = f"must be {scene.material.matrix!r}, or both need a volumetric part (Matrix)"
             yield rule, f"{region}material.matrix", material.matrix
         plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
         if kappa != plain and law.remodels and not law.asks_kappa:
@@ -84,7 +84,7 @@ def tissue_of_regions(scene: Scene) -> Faults:
 
 
 def meshed_body(scene: Scene) -> Faults:
-    """Sizes and layers that the shape can have."""
+    """Check that the shape allows the mesh's sizes and the layers."""
     scene.geometry.check_size(scene.mesh)
     if isinstance(scene.geometry, WithRegions):
         scene.geometry.check_regions(scene.regions, scene.mesh)
@@ -92,33 +92,33 @@ def meshed_body(scene: Scene) -> Faults:
 
 
 def loads_beside_others(scene: Scene) -> Faults:
-    """One of two loads in whose place the other stands."""
+    """Check that no two loads exclude each other."""
     for name, load in scene.loads.items():
         if (other := scene.load_kinds[name].instead_of) in scene.loads:
-            yield f"not allowed beside loads.{other}: either", f"loads.{name}", load.value
+            yield f"not allowed together with loads.{other}", f"loads.{name}", load.value
 
 
 def loaded_body(scene: Scene) -> Faults:
-    """Bodies whose unloaded shape can be found."""
+    """Check that the unloaded shape of a loaded geometry can be computed."""
     if not scene.geometry.is_loaded:
         return
     key, value = "geometry.is", "loaded"
     if not isinstance(scene.geometry, Unloads):
-        yield f"allowed for the shapes {_shapes(Unloads)}", key, value
+        yield f"allowed only for the shapes {_shapes(Unloads)}", key, value
     if scene.supports.ends == "clamped":
-        yield "not allowed with supports.ends = 'clamped': the loaded tube would not have one radius", key, value
+        yield "not allowed with supports.ends = 'clamped': the loaded radius would vary", key, value
     if measured := ", ".join(f"{in_region(name)}cells.fibres" for name in scene.measured_cells):
-        yield f"not allowed with {measured}: its rows belong to places, which unloading moves", key, value
+        yield f"not allowed with {measured}: unloading moves the positions of its rows", key, value
     if scene.cases:
         rule = (
-            "not allowed with [[cases]]: the loaded body belongs to one set of loads; remodel-fenicsx unload SCENE, "
-            "with those alone, writes the scene of the unloaded one, to which [[cases]] may be added"
+            "not allowed with [[cases]]: the loaded geometry belongs to one set of loads; run "
+            "remodel-fenicsx unload SCENE with these loads and add [[cases]] to its result"
         )
         yield rule, key, value
 
 
 def same_strain(scene: Scene) -> Faults:
-    """Loads that are the strain of the whole body."""
+    """Check that loads that need a uniform strain have homogeneous kinematics."""
     made = choice(scene)
     for name, load in scene.loads.items():
         if scene.load_kinds[name].of_one_strain and not KINEMATICS[made.name].homogeneous:
@@ -128,52 +128,52 @@ def same_strain(scene: Scene) -> Faults:
 
 
 def directions_of_matrices(scene: Scene) -> Faults:
-    """Directions of a matrix that turn with a round wall."""
+    """Check that the directions of a matrix follow a round wall."""
     if not isinstance(scene.geometry, RoundWall) or not KINEMATICS[choice(scene).name].three_dimensional:
         return
     for name, properties in scene.properties().items():
         if not properties.tissue.is_round():
             rule = (
-                "has directions along x, y and z, which follow the wall in the kinematics 'radial' and "
-                "'axisymmetric' alone: the radius, the circumference and the length"
+                "has directions along x, y and z; only the kinematics 'radial' and 'axisymmetric' "
+                "rotate them with the wall (radial, circumferential, axial)"
             )
             yield rule, f"{in_region(name)}material.matrix", properties.material.matrix
 
 
 def parts_of_the_energy(scene: Scene) -> Faults:
-    """A formulation that takes W apart needs its parts."""
+    """Check that a split formulation has a matrix with a volumetric part."""
     name, matrix = scene.mesh.formulation, scene.material.matrix
     if name != AUTO and FORMULATIONS[name].takes_parts and not scene.material.tells_volume_apart:
-        rule = f"needs a material.matrix with a known volumetric part, made as a Matrix; {matrix!r} has none"
+        rule = f"needs a material.matrix with a volumetric part (Matrix); {matrix!r} has none"
         yield rule, "mesh.formulation", name
 
 
 def axes_of_the_shape(scene: Scene) -> Faults:
-    """Axes that a shape has."""
+    """Check that the shape has the axes of the cells."""
     shape, axes = scene.geometry, scene.cells.axes
     if axes not in shape.axis_kinds:
-        yield f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.axis_kinds))}", "cells.axes", axes
+        yield f"must be {' or '.join(map(repr, shape.axis_kinds))} for shape {shape.name!r}", "cells.axes", axes
 
 
 def supports_of_the_shape(scene: Scene) -> Faults:
-    """Supports that a shape can have."""
+    """Check that the shape has the supports."""
     shape, ends, faces = scene.geometry, scene.supports.ends, scene.geometry.supported_faces
     if ends not in shape.ends:
-        yield f"allowed for shape {shape.name!r} is {', '.join(map(repr, shape.ends))}", "supports.ends", ends
+        yield f"must be {' or '.join(map(repr, shape.ends))} for shape {shape.name!r}", "supports.ends", ends
     if faces is None:
         return
     for name, support in scene.supports.faces.items():
         key = f"supports.{quoted(name)}"
         if name not in faces:
             springs = " or ".join(f"supports.{face} of kind 'elastic'" for face in faces)
-            beside = f"; allowed beside is {springs}" if springs else ""
-            yield f"a {shape.name} is held by supports.ends{beside}", key, None
+            beside = f", or by {springs}" if springs else ""
+            yield f"not allowed: a {shape.name} is supported by supports.ends{beside}", key, None
         if support.kind != "elastic":
-            yield "allowed here is 'elastic'", f"{key}.kind", support.kind
+            yield "must be 'elastic'", f"{key}.kind", support.kind
 
 
 def cells_of_the_loaded_body(scene: Scene) -> Faults:
-    """Cells that have come to rest in the loaded body."""
+    """Check the conditions of natural.cells = "equilibrium"."""
     key, cells, shape = "natural.cells", scene.natural.cells, scene.geometry
     if cells != "equilibrium":
         return
@@ -184,20 +184,20 @@ def cells_of_the_loaded_body(scene: Scene) -> Faults:
 
 
 def measured_natural_state(scene: Scene) -> Faults:
-    """Prestretch from the file of the cells."""
+    """Check the conditions of prestretch from a fibre file."""
     natural, key = scene.natural, "natural.fibres"
     if not natural.fibres:
         return
     if not scene.measured_cells:
         yield "needs cells.fibres, a file that export has written", key, True
     if natural.opening_angle or natural.layers:
-        yield "natural.opening_angle or layers are there too; one of them is enough", key, True
+        yield "natural.opening_angle or natural.layers is also set; set only one of them", key, True
     if scene.formulation != "displacement":
         yield "must be false unless mesh.formulation is 'displacement'", key, True
 
 
 def natural_state(scene: Scene) -> Faults:
-    """Bodies with residual stress, with cells that the closing knows."""
+    """Check that shape, formulation and cells allow residual stress."""
     natural, shape, able, none = scene.natural, scene.geometry, Walled, "none"
     if natural.is_of_the_mesh or natural.fibres:
         return
@@ -219,12 +219,12 @@ def natural_state(scene: Scene) -> Faults:
 
 
 def loads_of_the_body(scene: Scene) -> Faults:
-    """Times at which steps end, values that the body can have, and a length that is prescribed or unknown."""
+    """Check times of ramps and values of loads, and that a free length is not prescribed."""
     time = scene.time
     for name, load in scene.loads.items():
         key, least = f"loads.{quoted(name)}", scene.load_kinds[name].above
         if name == "elongation" and scene.has_free_length and any(load.value * factor for _, factor in load.ramp):
-            rule = "must be 0 where the length is an unknown, with loads.axial_force or closed ends"
+            rule = "must be 0 if the length is an unknown (loads.axial_force or closed ends)"
             yield rule, f"{key}.value", load.value
         for index, (moment, factor) in enumerate(load.ramp):
             if not time.is_equilibrium and moment <= time.end:
@@ -237,7 +237,7 @@ def loads_of_the_body(scene: Scene) -> Faults:
 
 
 def weights_and_factors(scene: Scene) -> Faults:
-    """Load cases that are shares of one whole, and factors on loads that there are."""
+    """Check that weights of cases sum to 1, and that their factors belong to loads."""
     for index, case in enumerate(scene.cases):
         for name, factor in case.loads.items():
             if name not in scene.loads:
@@ -245,12 +245,12 @@ def weights_and_factors(scene: Scene) -> Faults:
                 yield rule, f"cases[{index}].loads.{quoted(name)}", factor
     total = math.fsum(case.weight for case in scene.cases)
     if scene.cases and abs(total - 1.0) > SUM_OF_WEIGHTS:
-        rule = f"the weights of all cases sum to {total:.10g}; they must sum to 1"
+        rule = f"the weights of all cases must sum to 1; their sum is {total:.10g}"
         yield rule, f"cases[{len(scene.cases) - 1}].weight", scene.cases[-1].weight
 
 
 def coupling_and_mean(scene: Scene) -> Faults:
-    """What the coupling and the mean over load cases ask of the rest."""
+    """Check the conditions of the coupling and of the average over load cases."""
     remodeling, coupling = scene.remodeling, COUPLINGS[scene.remodeling.coupling]
     if missing := coupling.missing and coupling.missing(scene):
         yield f"needs {missing}", "remodeling.coupling", remodeling.coupling
@@ -260,11 +260,11 @@ def coupling_and_mean(scene: Scene) -> Faults:
         yield f"needs a remodeling.law with a target: {laws_with_a_target()}", "remodeling.mean", remodeling.mean
     if scene.cases[1:] and not coupling.takes_cases:
         able = named(COUPLINGS, lambda kind: kind.takes_cases)
-        yield f"with [[cases]] must be one of: {able}", "remodeling.coupling", remodeling.coupling
+        yield f"must be one of {able} with [[cases]]", "remodeling.coupling", remodeling.coupling
 
 
 def growth(scene: Scene) -> Faults:
-    """Which bodies grow, and from when."""
+    """Check that the body can grow, and that growth starts at a time of the run."""
     turnover, time = scene.remodeling.turnover, scene.time
     if not turnover.grows:
         return
@@ -275,9 +275,9 @@ def growth(scene: Scene) -> Faults:
         yield "must be 0 unless mesh.formulation is 'displacement'", "remodeling.turnover.volume", volume
     if turnover.starts_at_rest:
         if not time.is_equilibrium:
-            yield "needs time.end = 'equilibrium'; give the time of rest", key, AT_REST
+            yield "needs time.end = 'equilibrium'; otherwise set a time", key, AT_REST
         if scene.last_hold is None:
-            yield "needs loads.NAME.ramp that stay for a while and change again", key, AT_REST
+            yield "needs loads.NAME.ramp with a hold before a further change", key, AT_REST
         if scene.cases:
             yield "needs a scene without [[cases]]", key, AT_REST
     elif start and time.is_equilibrium:
@@ -289,13 +289,13 @@ def growth(scene: Scene) -> Faults:
 
 
 def equilibrium(scene: Scene) -> Faults:
-    """An equilibrium of the cells that depends on no way there."""
+    """Check that the cells have a steady state that is independent of the load path."""
     law, parts, key, end = scene.remodeling.law, scene.properties().items(), "time.end", scene.time.end
     if not scene.time.is_equilibrium:
         return
     if not LAWS[law].has_limit:
         laws = named(LAWS, lambda law: law.has_limit)
-        rule = f"remodeling.law = {law!r} has no limit that is the same on every path; allowed are the laws {laws}"
+        rule = f"remodeling.law = {law!r} has no unique steady state; laws with one: {laws}"
         yield rule, key, end
     bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
     if bare:
@@ -305,16 +305,16 @@ def equilibrium(scene: Scene) -> Faults:
 
 
 def unknown_length(scene: Scene) -> Faults:
-    """Multigrid has no place for one more unknown."""
+    """Check that an unknown length is solved without multigrid, which cannot include it."""
     method = scene.solver.method
     if scene.has_free_length and method == "iterative":
         names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != method)
-        rule = f"allowed where the length is an unknown, with loads.axial_force or closed ends, are {names}"
+        rule = f"must be one of {names} if the length is an unknown (loads.axial_force or closed ends)"
         yield rule, "solver.method", method
 
 
 def times_of_output(scene: Scene) -> Faults:
-    """Times at which there are rows."""
+    """Check that output times are times of steps."""
     for index, moment in enumerate(scene.output.times):
         key = f"output.times[{index}]"
         if scene.time.is_equilibrium:
@@ -325,7 +325,7 @@ def times_of_output(scene: Scene) -> Faults:
 
 
 def fields_of_the_body(scene: Scene) -> Faults:
-    """Fields that the run will have."""
+    """Check that the body has the output fields."""
     fields = scene.output.fields
     for field, reason in scene.lacking_fields.items():
         if not isinstance(fields, bool) and field in fields:
@@ -333,41 +333,41 @@ def fields_of_the_body(scene: Scene) -> Faults:
 
 
 def columns_of_the_history(scene: Scene) -> Faults:
-    """Columns that the run will have."""
+    """Check that the scene has the output columns."""
     shape, turnover, key = scene.geometry, scene.remodeling.turnover, "output.columns"
     of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
     for name in scene.output.columns:
         if name == "time_error" and scene.time.is_equilibrium:
-            yield f"{name!r} is an error of steps; must be left out with time.end = 'equilibrium'", key, name
+            yield f"{name!r} needs time steps; not allowed with time.end = 'equilibrium'", key, name
         if name in of_one_tissue and scene.regions:
-            yield f"{name!r} is for bodies of one tissue; the scene has regions", key, name
+            yield f"{name!r} is only for bodies without regions; the scene has regions", key, name
         if name in (*TURNED_OVER, TURNOVER_POWER) and not turnover.is_on:
             yield f"{name!r} changes only with remodeling.turnover, which is not set", key, name
         if name in GROWTH_COLUMNS and not turnover.grows:
             yield f"{name!r} needs remodeling.turnover with a volume above 0", key, name
         if name not in (known := dict.fromkeys(scene.column_names)):
             names = listed(map(repr, known), repr(name))
-            yield f"no such column on request; allowed for shape {shape.name!r} are {names}", key, name
+            yield f"no such column on request; allowed for shape {shape.name!r}: {names}", key, name
 
 
 def kinematics(scene: Scene) -> Faults:
-    """Kinematics that are right for the scene."""
+    """Check that the kinematics can describe the scene's body and loads."""
     name = scene.model.kinematics
     if name != AUTO and (reasons := objections(scene, name)):
         yield "; ".join(reasons), "model.kinematics", name
 
 
 def number_of_elements(scene: Scene) -> Faults:
-    """As many elements as Gmsh and memory bear."""
+    """Check that Gmsh and the memory can handle the number of elements."""
     if not isinstance(scene.geometry, FromFile) and (rule := too_many_elements(scene)):
         yield rule, "mesh.refinement", scene.mesh.refinement
 
 
 def names_of_columns(scene: Scene) -> Faults:
-    """A name for each column of the history."""
+    """Check that column names are unique."""
     for name, count in Counter(column.name for column in scene.columns()).items():
         if count > 1:
-            yield "there are two columns of this name; parts of your own need other names", name, None
+            yield "two columns have this name; rename the custom component", name, None
 
 
 RULES = (

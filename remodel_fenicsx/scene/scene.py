@@ -1,7 +1,7 @@
-"""A scene: what to simulate, as TOML or as Python objects, validated before any solve.
+"""Scenes: the simulation to run, as TOML or as Python objects, validated before any solve.
 
-`read_scene` reads a file, `Scene(...)` and `scene_from_dict` take the same keys from Python. docs/scene.md lists all
-keys.
+`read_scene` reads a file; `Scene(...)` and `scene_from_dict` take the same keys from Python.
+docs/scene.md lists all keys.
 """
 
 from __future__ import annotations
@@ -85,31 +85,36 @@ from remodel_fenicsx.system.interrupts import is_first_rank
 log = logging.getLogger(__name__)
 
 
-# ---------------------------------------------------------------- what a scene may say but hardly means
-# Numbers in another unit than the others, told from ratios by decades.
+# ---------------------------------------------------------------- plausibility
+# Numbers that are probably in another unit than the rest, from ratios in decades.
 
-# Decades in which a ratio may lie. Units differ by a thousand and more, choices seldom by a hundred.
-NETWORK = (-2, 2)  # initial stiffness of the network over that of the matrix; the paper's bodies: 1.1 and 1.5
-LOAD = (-4, 2)  # largest stress of a load over the stiffness of both; the paper's: 0.7 to 4.6. Weak loads are a choice
+# Usual ranges of ratios in decades. Units differ by a factor of 1000 or more, deliberate choices
+# seldom by 100. NETWORK: initial stiffness of the network over that of the matrix; the paper's
+# bodies have 1.1 and 1.5. LOAD: largest stress of a load over the stiffness of both; the paper's
+# loads have 0.7 to 4.6, and weak loads can be deliberate.
+NETWORK = (-2, 2)
+LOAD = (-4, 2)
 
 
 def doubts(
     material: Material, geometry: Shape, loads: Mapping[str, Load], end_to_end_length: float, end: float
 ) -> Iterator[str]:
-    """Lines on what is hardly meant; none on bodies of plausible tissue."""
+    """Yield a line for each implausible value; none for plausible tissue."""
     unit, pascal, density = material.stress_unit, STRESS_UNITS[material.stress_unit], material.chain_density
     network = chain_stress(material, end_to_end_length)
     ratio, stiffness = network / material.lame_mu, material.lame_mu + network
     if network and (way := _beyond(ratio, NETWORK)):
-        of_pascal = f": {density:g} of a scene in Pa is {density * pascal:g} in {unit}" if pascal > 1 else ""
+        of_pascal = (
+            f" ({density:g} in a scene in Pa corresponds to {density * pascal:g} in {unit})" if pascal > 1 else ""
+        )
         yield (
-            f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} {unit}) is "
-            f"{_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix (lame_mu = "
-            f"{material.lame_mu:.4g} {unit}); the density is in 1/m^3 in every scene{of_pascal}"
+            f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} "
+            f"{unit}) is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix "
+            f"(lame_mu = {material.lame_mu:.4g} {unit}); check its unit, which is 1/m^3{of_pascal}"
         )
     for key, words, ratio, decades in geometry.proportions:
         if _beyond(ratio, decades):
-            one = "all lengths are in one unit, geometry.length_unit"
+            one = "check the units, all lengths are in geometry.length_unit"
             yield f"geometry.{key} = {getattr(geometry, key):g}: {words} is {ratio:.3g}; {one}"
     for name, load in loads.items():
         key, kind, value = f"loads.{name}.value", geometry.loads_on(faces_of(loads))[name], load.largest(end)
@@ -118,23 +123,24 @@ def doubts(
         stress = abs(largest_stress(kind, value, geometry) or 0.0)
         if stress and (way := _beyond(stress / stiffness, LOAD)):
             yield (
-                f"{key}: a stress of {stress:.3g} {unit} at its largest, {_times(stress / stiffness)} "
-                f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network (lame_mu + c g(r0) r0^2 = "
-                f"{stiffness:.3g} {unit}); all are in one unit, material.stress_unit"
+                f"{key}: the largest stress, {stress:.3g} {unit}, is {_times(stress / stiffness)} "
+                f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network "
+                f"(lame_mu + c g(r0) r0^2 = {stiffness:.3g} {unit}); check material.stress_unit"
             )
 
 
-# r/L at which a wall is too soft: in three dimensions a thin one that comes to 0.98 takes 1,200 Newton iterations in
-# its first step, to 0.96 100, to 0.90 23
+# r/L above which a wall is too soft. In three dimensions a thin wall that reaches 0.98 takes 1,200
+# Newton iterations in its first step; with 0.96 it takes 100, with 0.90 23.
 NEAR_LOCKING = 0.9
 
 
 def borne(tissue: Tissue, is_loaded: bool) -> float:
-    """p / ln(r_o/r_i), radii as given, of a wall of neo-Hookean matrix and isotropic cells there; length, volume stay.
+    """Return p / ln(r_o/r_i) of a neo-Hookean wall with isotropic cells at r = `NEAR_LOCKING` L.
 
-    Without chains the most that the wall bears.
+    Radii are as prescribed; length and volume are constant. Without chains: the limit load.
     """
-    chain, modulus, stretch = tissue.chain, tissue.lame_mu, math.inf  # the square of that around
+    # The stretch is the square of the circumferential one.
+    chain, modulus, stretch = tissue.chain, tissue.lame_mu, math.inf
     if tissue.matrix is not neo_hookean:
         return math.inf
     if chain is not None:
@@ -148,7 +154,7 @@ def borne(tissue: Tissue, is_loaded: bool) -> float:
 
 
 def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
-    """A line where the pressure inside stretches the wall until its chains nearly lock."""
+    """Yield a line if the pressure stretches the wall until its chains nearly lock."""
     log_of_radii = scene.geometry.log_of_radii(wall)
     if log_of_radii is None or "pressure" not in scene.loads:
         return
@@ -157,14 +163,14 @@ def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
     if stress > most:
         unit = scene.material.stress_unit
         yield (
-            f"loads.pressure.value: p r/h = {stress:.3g} {unit} at its largest; where its chains come to "
-            f"{100 * NEAR_LOCKING:g} % of their length the tissue bears {most:.3g} {unit}. It is too soft: steps "
-            "take minutes or fail; all are in one unit, material.stress_unit"
+            f"loads.pressure.value: the largest p r/h is {stress:.3g} {unit}, but with chains at "
+            f"r = {NEAR_LOCKING:g} L the tissue bears {most:.3g} {unit}. The tissue is too soft: "
+            "steps take minutes or fail; check material.stress_unit"
         )
 
 
 def _doubted_keys(values: Mapping[str, object]) -> Iterator[str]:
-    """Yield a line on each number of tables, or list of numbers, that may be in another convention."""
+    """Yield a line for each number that may follow another convention, such as percent."""
     for key, value in leaves(values):
         numbers = value if isinstance(value, (list, tuple)) else [value]
         is_of_numbers = bool(numbers) and all(isinstance(number, float) for number in numbers)
@@ -173,53 +179,55 @@ def _doubted_keys(values: Mapping[str, object]) -> Iterator[str]:
 
 
 def chain_stress(material: Material, end_to_end_length: float) -> float:
-    """c g(r0) r0^2, in stress_unit: whatever the unit of chain lengths; 0 without chains."""
+    """Return the network's initial stiffness c g(r0) r0^2 in stress_unit; 0 without chains."""
     tissue = material.tissue(end_to_end_length)
     return float(tissue.repulsion_modulus * end_to_end_length**2) if tissue.chain is not None else 0.0
 
 
 def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | None:
-    """Of a load: a stress itself, or a force over its area; None of an elongation."""
+    """Return the stress of a load: the load itself, a force over its area, or None (elongation)."""
     if kind.dimension == FORCE and kind.area is not None:
         return value / kind.area(geometry)
     return value if kind.dimension == STRESS else None
 
 
 def _beyond(ratio: float, decades: tuple[float, float]) -> int:
-    """-1 or 1 where it is below or above them, else 0."""
+    """Return -1 below the range, 1 above it, and 0 inside."""
     return (ratio > 10.0 ** decades[1]) - (ratio < 10.0 ** decades[0])
 
 
 def _times(ratio: float) -> str:
-    """By what it differs from one: two digits, and decades."""
+    """Format a ratio's distance from one: a factor with two digits, and decades."""
     factor = max(ratio, 1 / ratio)
     return f"{float(f'{factor:.2g}'):g} times ({math.log10(factor):.1f} decades)"
 
 
-PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}  # which may bring keys of [material]
-FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
-COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
-MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
-SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
-FORGOTTEN_AFTER = (
-    1000.0  # times 1/kappa after which nothing is left of a start, of cells under a hundredth of a tension too
-)
+# components that may bring keys of [material]
+PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}
+FORMAT = 2  # format of recorded scenes; increased if earlier versions could not read them
+COLUMNS_THAT_WENT = ("held_points",)  # columns of earlier versions
+# per kind of table; each table is checked against all others and has its own columns
+MOST_TABLES = 200
+# value of k a below which a wall with turnover takes more than about 5 T for a factor of e
+SLOW_REST = 3.0
+# times 1/kappa: no trace of the start is left, also in cells below a hundredth of a tension
+FORGOTTEN_AFTER = 1000.0
 
 
 # ---------------------------------------------------------------- the scene
 
 
 class Scene(Table):
-    """A whole scene: all keys above the first table, and the tables.
+    """A scene: its top-level keys and its tables.
 
-    Its keyword arguments are the keys of a scene's file (docs/scene.md), each table a dictionary. Stresses are in
-    `material.stress_unit`, lengths in `geometry.length_unit`, times in any one unit. A scene never changes:
-    `with_values` gives a copy.
+    Its keyword arguments are the keys of a scene file (docs/scene.md), with a dictionary for each
+    table. Stresses are in `material.stress_unit`, lengths in `geometry.length_unit`, times in any
+    one unit. A scene is immutable: `with_values` returns a changed copy.
 
     Raises
     ------
     SceneError
-        If a key is unknown or missing, or a value is not allowed: one line.
+        If a key is unknown or missing, or a value is not allowed; one line.
 
     Examples
     --------
@@ -237,13 +245,14 @@ class Scene(Table):
     >>> scene.with_values({"remodeling.kappa": -1.0})
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.schema.tables.SceneError: remodeling.kappa = -1.0: must be a finite number at least 0
+    remodel_fenicsx.schema.tables.SceneError: remodeling.kappa = -1.0: must be a finite number ...
     """
 
-    _rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()  # those of `scene.rules`, in their order
+    # the rules of `scene.rules`, in order
+    _rules: ClassVar[Sequence[Callable[[Scene], Faults]]] = ()
 
     format: int = Field(default=FORMAT, ge=1, le=FORMAT)
-    """Number of the format of scenes. A scene as run has it; version 0.1.0 wrote none."""
+    """Format number of the scene. Recorded scenes have it; version 0.1.0 wrote none."""
     name: str = Field(
         default="scene",
         pattern=r"^\w(?:[\w .+-]{0,98}[\w+-])?$",
@@ -251,11 +260,11 @@ class Scene(Table):
             "allowed": "a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first"
         },
     )
-    """Name of the scene and of its results folder. Default: the name of the file without `.toml`."""
+    """Name of the scene and of its results folder. Default: the file name without `.toml`."""
     preset: Annotated[str | None, OneOf(presets.PRESETS)] = None
-    """A published model whose values hold where the scene says nothing, table by table (see the presets below)."""
+    """Published model with the values of all keys that the scene does not set (presets below)."""
     profile: Annotated[str | None, OneOf(presets.PROFILES)] = None
-    """Speed or accuracy: settings of mesh, kinematics and steps (docs/speed_and_accuracy.md)."""
+    """Settings of mesh, kinematics and steps for speed or accuracy (docs/speed_and_accuracy.md)."""
     geometry: Annotated[SerializeAsAny[Shape], VariantOf(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()
@@ -277,13 +286,13 @@ class Scene(Table):
     @model_validator(mode="wrap")
     @classmethod
     def _on_its_preset(cls, values: object, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
-        """The scene's keys over those of profile, preset and shape; numbers in place of values with units."""
+        """Merge the scene's keys over profile, preset and shape defaults; convert units."""
         if not isinstance(values, dict):
             return handler(values)
         own = _with_measured_cells(_in_present_format(_plain(values)))
         for name in ("regions", "loads", "cases", "supports"):
             if isinstance(found := own.get(name), dict | list | tuple) and len(found) > MOST_TABLES:
-                raise fault(f"has {len(found)} tables; at most {MOST_TABLES} are allowed", name, None)
+                raise fault(f"has {len(found)} tables; must have at most {MOST_TABLES}", name, None)
         presets.check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
@@ -313,7 +322,7 @@ class Scene(Table):
         return _with_profile(profile, made)
 
     def _faults(self) -> Faults:
-        """What its tables do not bear of each other, once numbers of experiments are those of the model."""
+        """Yield faults across tables, after conversion of the experimental parameters."""
         whole = presets.with_own_numbers(self, Scene.whole)
         over = partial(Region.over, others=whole.whole())
         regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
@@ -323,13 +332,13 @@ class Scene(Table):
 
     @property
     def _stiffness_ratio(self) -> float:
-        """Largest lambda/mu of its regions."""
+        """Largest lambda/mu over the regions."""
         materials = [one.material for one in self.properties().values()]
         return max(material.lame_lambda / material.lame_mu for material in materials)
 
     @property
     def formulation(self) -> str:
-        """That of `mesh.formulation`, or the one that "auto" takes."""
+        """The formulation that is set, or the one that "auto" resolves to."""
         if self.mesh.formulation != AUTO:
             return self.mesh.formulation
         return "displacement" if not self._bulk_is_stiff or self.needs_all_points() else NOT_LOCKING
@@ -339,7 +348,7 @@ class Scene(Table):
         return self._stiffness_ratio > FORMULATIONS[NOT_LOCKING].pays_above(self.mesh.element, self.mesh.degree)
 
     def needs_all_points(self) -> str:
-        """What keeps "auto" from the formulation that does not lock, in words; nothing where nothing does."""
+        """Return why "auto" cannot use the locking-free formulation, or an empty string."""
         if COUPLINGS[self.remodeling.coupling].solves_cells:
             return f"remodeling.coupling = {self.remodeling.coupling!r}"
         if not self.natural.is_of_the_mesh:
@@ -348,27 +357,27 @@ class Scene(Table):
             return "remodeling.turnover.volume above 0"
         if not self.material.tells_volume_apart:
             return f"material.matrix = {self.material.matrix!r}"
-        return "a body of one F" if KINEMATICS[choice(self).name].homogeneous else ""
+        return "homogeneous deformation" if KINEMATICS[choice(self).name].homogeneous else ""
 
     def formulation_in_words(self) -> str:
-        """What "auto" takes, and why."""
+        """Describe the resolved formulation and its reason."""
         needs = self.needs_all_points() if self._bulk_is_stiff else ""
         ratio = f"lambda/mu = {self._stiffness_ratio:.4g}"
         return f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
 
     @property
     def end_of_ramps(self) -> float:
-        """The time from which on no load changes; 0 without loads."""
+        """Time after which no load changes; 0 without loads."""
         return max((load.ramp[-1][0] for load in self.loads.values()), default=0.0)
 
     @property
     def hold_before_change(self) -> tuple[float, float] | None:
-        """The last hold, from and to, where all rests in it before collagen takes room; None otherwise."""
+        """Start and end of the hold in which cells reach equilibrium before growth, or None."""
         return self.last_hold if self.remodeling.turnover.starts_at_rest else None
 
     @property
     def last_hold(self) -> tuple[float, float] | None:
-        """When loads stay for the last time before they change again: from and to; None where they never do."""
+        """Start and end of the last hold of all loads before a further change, or None."""
         corners = sorted({time for load in self.loads.values() for time, _ in load.ramp})
         found, held = None, None
         for start, end in itertools.pairwise(corners):
@@ -380,7 +389,7 @@ class Scene(Table):
 
     @property
     def last_time(self) -> float:
-        """The time of the last row: where the equilibrium is asked for, one at which nothing is left of the start."""
+        """Time of the last row; with "equilibrium" a time at which the start has no effect."""
         if not self.time.is_equilibrium:
             return float(self.time.end)
         rates = [properties.kappa for properties in self.properties().values()]
@@ -388,7 +397,7 @@ class Scene(Table):
         return self.end_of_ramps + FORGOTTEN_AFTER / min(rates)
 
     def each_case(self) -> list[Scene]:
-        """Of each load case a scene with its loads alone; where there are no cases, the scene itself."""
+        """Return a scene for each load case with its loads; the scene itself if it has no cases."""
         found = []
         for case in self.cases:
             loads = dict(self.loads)
@@ -398,61 +407,61 @@ class Scene(Table):
         return found or [self]
 
     def whole(self) -> Properties:
-        """What holds where no region says otherwise."""
+        """Return the properties of the whole body, which hold unless a region sets its own."""
         return Properties(self.material, self.cells, self.remodeling.kappa)
 
     def properties(self) -> dict[str, Properties]:
-        """What holds in each region by its name, and under "" what holds beside them, where there may be anything."""
+        """Return the properties of each region, and under "" of the remaining body, if any."""
         body = self.whole()
         found = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
         if self.regions and isinstance(self.geometry, RoundWall):
             del found[""]
         has_chains = any(one.material.chain_density for one in found.values())
         for name, one in found.items():
-            stays = has_chains and not one.material.chain_density  # cells that hold no collagen
+            stays = has_chains and not one.material.chain_density  # These cells have no collagen.
             kappa = 0.0 if stays else self.remodeling.speed(one.kappa, one.material.temperature)
             found[name] = one._replace(kappa=kappa)
         return found
 
     @property
     def has_random_cells(self) -> bool:
-        """Whether cells are drawn anywhere."""
+        """Whether any cells are random."""
         return any(properties.cells.initial == "random" for properties in self.properties().values())
 
     @property
     def jumps_by_rank(self) -> bool:
-        """Whether cells whose lengths differ from point to point go from rank to rank, under a law of lengths."""
+        """Whether the law is ranked and the lengths of cells vary, so that their order can jump."""
         return LAWS[self.remodeling.law].is_ranked and (self.has_random_cells or bool(self.measured_cells))
 
     @property
     def is_as_run(self) -> bool:
-        """Whether it names its format, as scenes in the folders of runs do."""
+        """Whether the scene sets its format, as recorded scenes do."""
         return "format" in self.model_fields_set
 
     @property
     def measured_cells(self) -> dict[str, Cells]:
-        """Cells that a file gives, by region, "" for what holds beside them."""
+        """Cells from fibre files by region, under "" for the remaining body."""
         found = {name: properties.cells for name, properties in self.properties().items()}
         return {name: cells for name, cells in found.items() if cells.initial == MEASURED_CELLS}
 
     @property
     def column_names(self) -> list[str]:
-        """Of all that a history of it may have; one is there twice where a region's name makes it."""
+        """Names of all columns that a history can have; a region's name can cause duplicates."""
         always = columns_of(self.geometry, regions=self.regions)
         return [*columns_on_request(self.geometry, self.regions, self.held_faces), *(column.name for column in always)]
 
     def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
-        """Of its history, in the order of the file; with `more` of those on request."""
+        """Return the columns of the history in file order, with `more` of those on request."""
         requested = [*self.output.columns, *more]
         return columns_of(self.geometry, requested, self.loads, self.regions, len(self.cases), self.held_faces)
 
     @property
     def held_faces(self) -> list[str]:
-        """Faces with supports that have columns of their forces."""
+        """Supported faces that have force columns."""
         return self.geometry.held_faces(self.supports.faces)
 
     def stops(self) -> list[float]:
-        """Times at which a step ends, however long steps are: corners of ramps, output.times and the end."""
+        """Return the times that steps hit exactly: corners of ramps, output.times and the end."""
         end = self.last_time
         times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < end}
         growth = {self.remodeling.turnover.start} - {0.0, math.inf}
@@ -460,14 +469,14 @@ class Scene(Table):
 
     @property
     def load_kinds(self) -> dict[str, LoadKind]:
-        """All loads that it can have, by name."""
+        """All loads that the scene can have, by name."""
         return self.geometry.loads_on(faces_of(self.loads))
 
     @property
     def lacking_fields(self) -> dict[str, str]:
-        """Fields that the body has not, each with the reason."""
+        """Fields that the body does not have, each with the reason."""
         turnover, same = self.remodeling.turnover, self.natural.is_of_the_mesh
-        stress_free = "the mesh is free of stress ([natural]): 'fibre_angle' is that of the unloaded body"
+        stress_free = "the mesh is stress-free ([natural]): 'fibre_angle' is the angle in the unloaded body"
         reasons: list[tuple[bool, Sequence[str], str]] = [
             (not self.regions, (REGION,), "the scene has no regions"),
             (same, (UNLOADED,), stress_free),
@@ -486,7 +495,7 @@ class Scene(Table):
         )
 
     def summary(self) -> str:
-        """Stiffness of network and matrix and the largest loads, in one unit and on one line."""
+        """Describe stiffness of network and matrix and largest loads on one line, in one unit."""
         loads = {}
         for name in self.loads:
             largest = max((case.loads[name].largest(self.last_time) for case in self.each_case()), key=abs)
@@ -502,39 +511,46 @@ class Scene(Table):
         return "; ".join(parts)
 
     def warnings(self, wall: object = None) -> list[str]:
-        """What is allowed but hardly meant, each on one line; of a wall on a mesh with the areas of its faces."""
+        """Return warnings on values that are allowed but implausible, one line each.
+
+        Parameters
+        ----------
+        wall
+            Domain of a meshed wall, for the areas of its faces.
+        """
         found: dict[str, None] = {}
         properties = self.properties()
         if self.geometry.fills(self.regions):
-            properties.pop("", None)  # it holds nowhere
+            properties.pop("", None)  # The entry holds nowhere.
         for name, (material, cells, _) in properties.items():
             for case in self.each_case():
                 lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
                 found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
-        found |= {} if found else dict.fromkeys(too_soft(self, wall))  # units in doubt say why
+        # Doubtful units explain a soft wall.
+        found |= {} if found else dict.fromkeys(too_soft(self, wall))
         found |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
         tables = self.model_dump(exclude={"loads", "cases"})
         found |= dict.fromkeys(_doubted_keys(tables))
         return [*found, *self.turned_away(), *self._of_turnover(), *self.remodeling.warnings()]
 
     def turned_away(self) -> list[str]:
-        """Whether rows leave the loaded shape that is given, for its cells turn; with the way out."""
+        """Return a warning if the cells reorient, so that rows leave the loaded geometry."""
         turns = LAWS[self.remodeling.law].remodels and any(one.kappa for one in self.properties().values())
         if not (self.geometry.is_loaded and turns and self.natural.cells == AS_GIVEN):
             return []
-        way = "let all loads act in the first step to have a row with it"
+        way = "apply all loads in the first step to have a row with this shape"
         if isinstance(self.geometry, RoundWall):
             way = (
-                "natural.cells = 'equilibrium' with time.end = 'equilibrium' takes it for that of cells that have come "
-                f"to rest; or {way}"
+                "set natural.cells = 'equilibrium' and time.end = 'equilibrium' if its cells are "
+                f"in equilibrium, or {way}"
             )
         return [
-            "geometry.is = 'loaded': the given shape is that under all loads with the cells of t = 0. They turn while "
-            f"loads rise and afterwards, so rows have another one; {way}"
+            "geometry.is = 'loaded': the shape belongs to all loads with the cells of t = 0. The "
+            f"cells reorient while and after the loads rise, so rows differ from it; {way}"
         ]
 
     def _of_turnover(self) -> Iterator[str]:
-        """Gains that do not rest, or slowly; explicit steps longer than its time, in which content overshoots."""
+        """Yield warnings on gains without stable or fast equilibrium, and on large steps."""
         turnover, step = self.remodeling.turnover, self.time.step
         if turnover.time is None:
             return
@@ -543,33 +559,35 @@ class Scene(Table):
             says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
             if power <= 2:
                 least = 2 * turnover.gain / power if turnover.gain else math.inf
-                yield f"{says}: does not come to rest with this deposition_stretch; rest needs more than {least:.3g}"
+                yield f"{says}: no stable homeostasis with this deposition_stretch; must exceed {least:.3g}"
             elif power < SLOW_REST:
-                words = "by a factor of e where collagen alone bears the loads, and sooner with a matrix"
-                yield f"{says}: comes to rest slowly, in a time of {slowly:.3g} {words}"
+                words = "if collagen alone carries the loads, shorter with a matrix"
+                yield f"{says}: reaches equilibrium slowly, time constant {slowly:.3g} {words}"
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
         if not chosen and not COUPLINGS[self.remodeling.coupling].solves_cells and step > turnover.time:
             yield (
-                f"time.step = {step:g} is longer than remodeling.turnover.time = {turnover.time:g}: content and "
-                "natural length overshoot in each step; set a shorter time.step or time.tolerance"
+                f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: "
+                "content and natural length overshoot in each step; reduce time.step or set time.tolerance"
             )
 
     def _values(self) -> dict[str, Any]:
-        """All of them, from which the same scene can be made."""
+        """Return all values, from which the same scene can be made."""
         return self.model_dump(exclude_none=True, exclude=None if self.is_as_run else {"format"})
 
-    def __reduce__(self) -> tuple[object, ...]:  # for other processes: keys of parts are in no class that they find
+    # For child processes: classes with keys of components cannot be found by name there.
+    def __reduce__(self) -> tuple[object, ...]:
         return scene_from_dict, (self._values(),)
 
     def with_values(self, changes: Mapping[str, object]) -> Scene:
-        """A validated copy with other values by dotted key: ``scene.with_values({"loads.pressure.value": 2.4})``.
+        """Return a validated copy with other values by dotted key.
 
-        Every value of the copy is its own: changing `preset` alone changes nothing.
+        For example ``scene.with_values({"loads.pressure.value": 2.4})``. The copy has all values of
+        its own: changing only `preset` changes nothing.
 
         Raises
         ------
         SceneError
-            One line: key, value, what is allowed.
+            One line: key, value, allowed values.
         """
         values = self._values()
         for key, value in changes.items():
@@ -580,30 +598,30 @@ class Scene(Table):
         return type(self)(**values)
 
     def to_toml(self, header: str = "") -> str:
-        """The scene with all its values as TOML, each under its description; `read_scene` gives the same scene back.
+        """Return the scene with all its values as TOML, which `read_scene` reads back.
 
         Parameters
         ----------
         header
-            Lines for the top, each becomes a comment.
+            Lines of comment for the top.
         """
         return toml_text(self, header)
 
 
-# ---------------------------------------------------------------- values as they were read
+# ---------------------------------------------------------------- values as read from a file
 
 
 def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
-    """The values with the present format number; a newer one is refused before the keys that are new in it are."""
+    """Update values to the present format; reject a newer format before its unknown keys."""
     written = values.get("format")
     if not isinstance(written, int) or isinstance(written, bool) or written < 1:
-        return dict(values)  # none, or a fault that the field's own error describes
+        return dict(values)  # The field's own error describes a wrong value.
     if written > FORMAT:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
     values = {**values, "format": FORMAT}
     turnover, columns = presets.said(values, "remodeling", "turnover"), presets.said(values, "output", "columns")
-    if isinstance(turnover, Mapping) and "time" in turnover:  # as version 0.3.0 ran it, where it does not say
+    if isinstance(turnover, Mapping) and "time" in turnover:  # defaults of version 0.3.0
         values = merged({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
     if isinstance(columns, list | tuple):
         values = merged(values, {"output": {"columns": [name for name in columns if name not in COLUMNS_THAT_WENT]}})
@@ -611,13 +629,13 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
 
 
 def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
-    """cells.initial = 'fibres' wherever a file of fibres is given, in the whole body and in regions."""
+    """Set cells.initial = "fibres" for the body and for regions with a fibre file."""
     for name, part in presets.parts_of(values):
         fibres, initial = (presets.said(part, "cells", key) for key in ("fibres", "initial"))
         if fibres is not None and initial not in (None, MEASURED_CELLS):
             place = f"{presets.place_of(name)}cells"
             raise fault(
-                f"{place}.initial = {shown(initial)} is there too; one of them gives the cells",
+                f"{place}.initial = {shown(initial)} is also set; set only one of them",
                 f"{place}.fibres",
                 fibres,
             )
@@ -627,7 +645,7 @@ def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
 
 
 def _beside(values: dict[str, object], folder: Path) -> dict[str, object]:
-    """The keys of a file in this folder, with the places of the files that they name."""
+    """Resolve the file names of a scene against its folder."""
     for name, part in presets.parts_of(values):
         if isinstance(file := presets.said(part, "cells", "fibres"), str):
             values = presets.with_part(values, name, {"cells": {"fibres": str(folder.absolute() / file)}})
@@ -642,33 +660,33 @@ def _words(region: str) -> str:
 
 
 def _follow(values: dict[str, Any], changed: Mapping[str, object], is_whole: bool) -> None:
-    """Take out what no longer fits to changed values; of a scene that has all values, a choice may be the run's own."""
+    """Remove values that no longer fit changed keys; with `is_whole` also replaced values."""
     times, end = presets.said(values, "output", "times"), presets.said(values, "time", "end")
     if "time.end" in changed and "output.times" not in changed and is_number(end) and isinstance(times, list | tuple):
         values["output"]["times"] = [time for time in times if not is_number(time) or time <= end]
         if (dropped := len(times) - len(values["output"]["times"])) and is_first_rank():
-            log.warning("output.times: %d after time.end = %g dropped", dropped, end)
+            log.warning("output.times: dropped %d times after time.end = %g", dropped, end)
     if is_whole:
         presets.without_replaced(values, changed)
 
 
 def _check_name(key: str, name: object, names: Iterable[str]) -> None:
     if not isinstance(name, str) or name not in names:
-        raise fault("allowed are " + ", ".join(map(repr, names)), key, name)
+        raise fault("must be one of " + ", ".join(map(repr, names)), key, name)
 
 
 def _known_shape(geometry: object) -> str:
-    """The shape that is asked for. Without it nothing else can be judged: preset, loads and units depend on it."""
+    """Return the shape. Check it first: preset, loads and units depend on it."""
     if not isinstance(geometry, Mapping):
         raise fault("must be a table", "geometry", geometry)
     if "shape" not in geometry:
-        raise fault("missing; allowed are " + ", ".join(map(repr, SHAPES)), "geometry.shape", None)
+        raise fault("missing; must be one of " + ", ".join(map(repr, SHAPES)), "geometry.shape", None)
     _check_name("geometry.shape", geometry["shape"], SHAPES)
     return str(geometry["shape"])
 
 
 def _units(values: Mapping[str, object], shape: type[Shape]) -> dict[str, str | None]:
-    """The units that a scene chooses, by their keys."""
+    """Return the units that a scene chooses, by key."""
     units: dict[str, str | None] = {}
     for key, kind in ((STRESS_UNIT, Material), (LENGTH_UNIT, shape)):
         table, name = key.split(".")
@@ -680,7 +698,7 @@ def _units(values: Mapping[str, object], shape: type[Shape]) -> dict[str, str | 
 
 
 def _with_numbers_of_loads(values: Mapping[str, object], shape: type[Shape]) -> dict[str, object]:
-    """The values with numbers in place of units of loads, whose dimensions the shape knows."""
+    """Convert loads with units to numbers; the shape knows their dimensions."""
     loads = values.get("loads")
     if not isinstance(loads, Mapping):
         return dict(values)
@@ -693,7 +711,7 @@ def _with_numbers_of_loads(values: Mapping[str, object], shape: type[Shape]) -> 
 
 
 def _check_load_names(shape: str, loads: object) -> None:
-    """A load that the shape does not have, before anything is said about what is missing in it."""
+    """Reject loads that the shape does not have, before errors on their missing keys."""
     kind = SHAPES[shape]
     names = kind.loads
     for name, load in loads.items() if isinstance(loads, Mapping) else ():
@@ -709,9 +727,7 @@ def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object
     if not isinstance(load.get("face"), str):
         raise fault("missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face"))
     if name in shape.loads:
-        raise fault(
-            f"{shape.loads[name].meaning}; give a load on another face another name", f"{key}.face", load["face"]
-        )
+        raise fault(f"{shape.loads[name].meaning}; rename the load to use another face", f"{key}.face", load["face"])
     if not re.fullmatch(NAME, name) or name in {column.name for column in columns_of(shape)}:
         raise fault(
             "its name must be a letter, then letters, digits and _, at most 40 in all, and not the name of a column",
@@ -721,7 +737,7 @@ def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object
 
 
 def _plain(value: object) -> Any:
-    """Tables as dicts of the values that were set, so that they merge as the same keys in TOML do."""
+    """Convert tables to dicts of the values that were set, which merge as TOML keys do."""
     if isinstance(value, BaseModel):
         kind = {"shape": value.name} if isinstance(value, Shape) else {}
         return kind | value.model_dump(exclude_unset=True, exclude_none=True)
@@ -732,31 +748,31 @@ def _plain(value: object) -> Any:
 
 
 def scene_from_dict(values: Mapping[str, Any]) -> Scene:
-    """A scene from nested dicts with the keys of the TOML file."""
+    """Make a scene from nested dicts with the keys of a scene file."""
     if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
         raise SceneError(f"scene = {shown(values)}: must be a table")
     return Scene(**values)
 
 
 def preset_scene(preset: str, shape: str) -> Scene:
-    """The scene of a preset on one of its shapes, named after the shape.
+    """Make the scene of a preset on one of its shapes, named after the shape.
 
     Parameters
     ----------
     preset
-        Its name: "kuhl-holzapfel-2007" (the paper), "consistent" or "sun-2002".
+        Name of the preset: "kuhl-holzapfel-2007" (the paper), "consistent" or "sun-2002".
     shape
         "cube", "tendon" or "tube".
 
     Returns
     -------
     Scene
-        With all values of the preset; it has a unit of stress and of length where the preset has.
+        Scene with all values of the preset, and with its units of stress and length, if any.
 
     Raises
     ------
     SceneError
-        If there is no such preset or shape, or if the preset leaves something for a scene to choose.
+        If preset or shape are unknown, or the preset does not set all required keys.
 
     Examples
     --------
@@ -767,45 +783,47 @@ def preset_scene(preset: str, shape: str) -> Scene:
     >>> preset_scene("a", "tube")
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.schema.tables.SceneError: preset = 'a': allowed are 'kuhl-holzapfel-2007', 'consistent', 'sun-2002'
+    remodel_fenicsx.schema.tables.SceneError: preset = 'a': must be one of 'kuhl-holzap...
     """
     return scene_from_dict({"name": shape, "preset": preset, "geometry": {"shape": shape}})
 
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), profile: str | None = None) -> Scene:
-    """A scene from a TOML file.
+    """Read a scene from a TOML file.
 
     Parameters
     ----------
     path
-        The file, UTF-8.
+        The file, in UTF-8.
     overrides
-        "KEY=VALUE" with a dotted key and a TOML value (a bare word is a string): laid over the file's keys, before the
-        preset is.
+        "KEY=VALUE" with a dotted key and a TOML value (a bare word is a string). Overrides replace
+        keys of the file before the preset is applied.
     profile
-        Name of a profile whose settings are laid over the file's keys, under those of `overrides`.
+        Name of a profile. Its settings replace keys of the file, but not `overrides`.
 
     Returns
     -------
     Scene
-        Checked, with the preset's values where the file has none.
+        The validated scene, with the preset's values for all other keys.
 
     Raises
     ------
     SceneError
-        One line: file and line, or key, value and what is allowed.
+        One line: file and line, or key, value and allowed values.
 
     Examples
     --------
     >>> from pathlib import Path
     >>> from remodel_fenicsx import preset_scene, read_scene
-    >>> written = Path("cube.toml").write_text(preset_scene("kuhl-holzapfel-2007", "cube").to_toml())
+    >>> text = preset_scene("kuhl-holzapfel-2007", "cube").to_toml()
+    >>> size = Path("cube.toml").write_text(text)
     >>> scene = read_scene("cube.toml", ["time.end=5", "remodeling.kappa=0.1"])
     >>> scene.time.end, scene.remodeling.kappa
     (5.0, 0.1)
     """
     read = read_toml(Path(path))
-    name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)  # what follows another dot is part of it
+    # Other dots belong to the name.
+    name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)
     read.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
     changes = dict(parse_override(override) for override in overrides)
     chosen = set(CHOSEN_BY_RUNS) - set(changes) if changes and "format" in read else set()
@@ -826,7 +844,7 @@ CHOSEN_BY_RUNS = ("model.kinematics", "mesh.formulation")
 
 
 def _chosen_anew(values: dict[str, object], chosen: set[str]) -> Scene:
-    """The scene, with "auto" in place of what a run had chosen and what does not go with the rest any more."""
+    """Make the scene, with "auto" for choices of the run that are no longer valid."""
     try:
         return scene_from_dict(values)
     except SceneError as error:
@@ -835,32 +853,33 @@ def _chosen_anew(values: dict[str, object], chosen: set[str]) -> Scene:
             raise
         scene = _chosen_anew(merged(values, presets.nested({key: AUTO})), chosen - {key})
         if is_first_rank():
-            log.warning("%s; %s takes its place", error, shown(AUTO))
+            log.warning("%s; using %s instead", error, shown(AUTO))
         return scene
 
 
 def _with_profile(name: str, made: Callable[[Mapping[str, object]], Scene]) -> Scene:
-    """The scene that is made with a profile's settings: they depend on its cells and loads."""
-    scene = made(presets.PROFILES[name].values if name in presets.PROFILES else {})  # refuses a name that is none
+    """Make the scene with a profile's settings, which depend on its cells and loads."""
+    # An unknown name is rejected here.
+    scene = made(presets.PROFILES[name].values if name in presets.PROFILES else {})
     settings = presets.profile_for(name, scene).settings(scene)
     return scene if settings == presets.PROFILES[name].values else made(settings)
 
 
-# ---------------------------------------------------------------- where a run goes on
+# ---------------------------------------------------------------- resumed runs
 
-# what decides no number of the steps done, or only how they were solved
-# (of a file only its contents, geometry.sha256, count)
+# Keys that may change: they determine no result of the steps done, or only how these were solved.
+# Of a mesh file only the contents matter (geometry.sha256).
 FREE = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end", "geometry.file")
-SAME_LOAD = 1e-12  # relative difference of two loads that are the same
+SAME_LOAD = 1e-12  # relative difference below which two loads are equal
 
 
 def check_continuation(old: Scene, new: Scene, time: float) -> None:
-    """Check that the physics of a scene is that of the run so far, until `time`."""
+    """Check that a scene has the physics of the recorded run until `time`."""
     rule = f"a resumed run may change time.end, output, solver, and loads after its checkpoint at {time:g}"
     before, now = (dict(leaves(scene.model_dump(mode="json"), FREE)) for scene in (old, new))
     for key in [*before, *(key for key in now if key not in before)]:
         if before.get(key) != now.get(key):
-            was = shown(before[key]) if key in before else "not there"
+            was = shown(before[key]) if key in before else "not set"
             raise SceneError(f"{key} = {shown(now.get(key))}: was {was}; {rule}")
     for name in {**old.load_kinds, **new.load_kinds}:
         first, second = old.loads.get(name), new.loads.get(name)
@@ -871,7 +890,7 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
             if moment <= time and abs(old_value - value) > SAME_LOAD * max(abs(old_value), abs(value)):
                 raise SceneError(f"loads.{name} = {value:g} at time {moment:g}: was {old_value:g}; {rule}")
     if new.last_time < time:
-        raise SceneError(f"time.end = {shown(new.time.end)}: must be at least {time:g}, where the checkpoint is")
+        raise SceneError(f"time.end = {shown(new.time.end)}: must be at least {time:g}, the checkpoint's time")
 
 
 def _ramp_times(load: Load | None) -> list[float]:
@@ -879,8 +898,8 @@ def _ramp_times(load: Load | None) -> list[float]:
 
 
 def leaves(value: object, free: Sequence[str] = (), key: str = "") -> Iterator[tuple[str, object]]:
-    """(dotted key, value) of all values in tables and lists of tables, but those that are free."""
-    if key in free or key.endswith("cells.fibres"):  # the SHA-256 beside it must stay
+    """Yield (dotted key, value) of all values in tables and lists of tables, except free keys."""
+    if key in free or key.endswith("cells.fibres"):  # The file's SHA-256 must not change.
         return
     if isinstance(value, Mapping):
         for name, inner in value.items():

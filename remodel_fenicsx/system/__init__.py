@@ -1,7 +1,8 @@
-"""What surrounds the program: signals, the terminal, versions."""
+"""Interfaces to the system: signals, terminal, child processes, files and versions."""
 
 import logging
 
-# a level for the log, and for the terminal unless it is to be quiet: a wait with its reason. No warning: all is well
+# Level of lines that explain a long wait: in the log, and on the terminal unless the run is quiet.
+# They are not warnings.
 NOTICE = (logging.INFO + logging.WARNING) // 2
 logging.addLevelName(NOTICE, "NOTICE")

@@ -1,4 +1,4 @@
-"""Commands of this very package, and readers of files of others, in processes of their own."""
+"""Child processes: workers that run commands, and guarded readers of untrusted files."""
 
 from __future__ import annotations
 
@@ -28,17 +28,18 @@ from remodel_fenicsx.system.files import open_own, read_regular
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-SECONDS_TO_END = 30.0  # seconds
-SERVE, PART = "serve", "fit-part"  # commands of processes: of a worker, and of what it does for a fit
+SECONDS_TO_END = 30.0  # seconds until a worker is killed
+SERVE, PART = "serve", "fit-part"  # internal commands: of a worker, and of a parallel part of a fit
 
 
 class Worker:
-    """A process that does commands one after the other: what it has imported and compiled serves all of them."""
+    """A process that runs commands one after another, with modules and kernels loaded once."""
 
     def __init__(self) -> None:
-        # -P: no module is taken from the working folder, which may be somebody else's
+        # -P: import no module from the working folder, which may belong to somebody else.
         command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE]
-        if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
+        # The signal is set from here on. If the parent died before, the process has another parent.
+        if shutil.which("setpriv"):
             only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
             command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
         pipe = subprocess.PIPE
@@ -50,27 +51,29 @@ class Worker:
         self.is_at_work = False
 
     def begin(self, arguments: Sequence[str], messages: Path) -> None:
-        """Begin a command, with a file for all that it says."""
-        messages.unlink(missing_ok=True)  # whatever was in its place: a link too
+        """Start a command; its output goes to a new file."""
+        messages.unlink(missing_ok=True)  # The old entry may be a link.
         os.close(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         self.messages, self.is_at_work = messages, True
-        if self.is_alive:  # else `poll` will see it; PETSc, where it is loaded, aborts at a closed pipe
+        # Otherwise `poll` reports the end. PETSc, if loaded, aborts when a pipe closes.
+        if self.is_alive:
             self._tasks.write(json.dumps([list(arguments), str(messages.absolute())]) + "\n")
 
     def poll(self) -> int | None:
-        """Exit code of the command, negative for a signal that has ended the process; None while it is at work."""
+        """Return the exit code of the command (negative: signal), or None while it runs."""
         if not wait_for_one([self], 0.0):
             return None
         self.is_at_work, line = False, self._answers.readline()
-        return int(line) if line else self.process.wait() or 1  # it has ended without an answer
+        # The process has ended without an answer.
+        return int(line) if line else self.process.wait() or 1
 
     @property
     def is_alive(self) -> bool:
-        """Whether it takes another command."""
+        """Whether the worker accepts another command."""
         return self.process.poll() is None
 
     def last_words(self) -> str:
-        """The last line that the command has said, or what has ended the process."""
+        """Return the last line of the command's output, or the signal that killed the process."""
         code = self.process.poll()
         if code is not None and code < 0:
             return f"killed by {signal.Signals(-code).name}"
@@ -78,7 +81,7 @@ class Worker:
         return last_line(self.messages.read_text(errors="replace")).removeprefix("remodel-fenicsx: ")
 
     def stop(self) -> None:
-        """End it, by force if it takes too long."""
+        """Stop the worker; kill it after `SECONDS_TO_END`."""
         if self.is_at_work:
             self.process.terminate()
         self._tasks.close()
@@ -91,12 +94,12 @@ class Worker:
 
 
 def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
-    """Wait until a worker has something to say, at most so long; whether one has."""
+    """Wait at most this long for an answer of a worker; return whether there is one."""
     return bool(select.select([worker.process.stdout for worker in workers], [], [], seconds)[0])
 
 
 def serve(command: Callable[[Sequence[str]], int]) -> int:
-    """Do what a `Worker` asks for until it asks no more: the other end of its pipes."""
+    """Run the commands that a `Worker` sends, until it closes the pipe; return the exit code."""
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
             words, messages = json.loads(line)
@@ -106,52 +109,54 @@ def serve(command: Callable[[Sequence[str]], int]) -> int:
             os.close(descriptor)
             try:
                 code = command(words)
-            except SystemExit as end:  # argparse's way
+            except SystemExit as end:  # argparse ends in this way.
                 code = int(end.code or 0)
             sys.stdout.flush()
-            if code > 128:  # a signal has asked this process to end
+            if code > 128:  # A signal has stopped this process.
                 return code
             print(code, file=answers, flush=True)
-            gc.collect()  # meshes and matrices that refer to each other
+            gc.collect()  # Frees meshes and matrices in reference cycles.
     return 0
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 def environment_of_child() -> dict[str, str]:
-    """With this very package, and parts of one's own; one thread, as there are jobs for the cores."""
+    """Return a child's environment: this package, the loaded extensions, and one thread."""
     paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
     own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     return os.environ | own | extensions_for_children()
 
 
 def last_line(said: str) -> str:
-    """Of what a process has said."""
-    return (said.strip().splitlines() or ["it said nothing"])[-1]
+    """Return the last line of a process's output."""
+    return (said.strip().splitlines() or ["no output"])[-1]
 
 
-# ---------------------------------------------------------------- readers of files of others
-# With limits, by rule, and from no other file than this one. What holds for all formats stands here, so that a new
-# reader cannot miss it (docs/what_may_go_wrong.md).
+# ---------------------------------------------------------------- readers of untrusted files
+# Each reader runs with limits, checks the format first, and opens no other file. All rules that
+# hold for every format are here, so that a new reader cannot bypass them
+# (docs/what_may_go_wrong.md).
 
 LARGEST_FILE = 2 * 10**9  # bytes; ten million hexahedra take 1.1 GB
-SECONDS, SECONDS_PER_MB = 20.0, 1.0  # of processor time
-MEMORY, MEMORY_PER_BYTE = 10**9, 24  # bytes: of the libraries; of the file and all that it unfolds to
-WAITING = 10  # times the processor time: the machine may be busy
-ELSEWHERE = "its numbers stand in another file; allowed is a file that holds them (Format='XML')"
-LONGEST_REASON = 150  # characters of what is wrong
+SECONDS, SECONDS_PER_MB = 20.0, 1.0  # CPU time
+# bytes: for the libraries, and per byte of the file for its arrays
+MEMORY, MEMORY_PER_BYTE = 10**9, 24
+WAITING = 10  # wall time limit over CPU time limit, since the machine may be busy
+ELSEWHERE = "its data are in another file; save it with the data inside (Format='XML')"
+LONGEST_REASON = 150  # characters of a reader's error message
 DAMAGED = "cannot be read: "
-FOR_EVER, NO_LIMIT = 1e5, 10**15  # seconds, which the system takes ten times; bytes
+FOR_EVER, NO_LIMIT = 1e5, 10**15  # seconds (the system allows ten times this number) and bytes
 NO_ROOM = (errno.EFBIG, errno.ENOSPC, errno.EDQUOT)
-# as VTK adds to its words
+# Prefixes and addresses in VTK's error messages.
 _HEAD = r"\S+ \S+ \( *[\d.]+s\) \[ *\w+\] ?\S+ ERR\| "
 _LOGGED = re.compile(
     rf"\x1b\[[0-9;]*m|{_HEAD}vtkCompositeDataPipeline.*|{_HEAD}(\w+ \(0x[0-9a-f]+\): )?|\(0x[0-9a-f]+\)"
 )
-UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # marks of its byte order
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 _COUNTS = re.compile(r"(?i)^(number.*|dimensions|offset)$")
 _LINES = re.compile(
     rb"(?im)^\s*(?:points|cells|cell_types|point_data|cell_data|offsets|connectivity)\b[^\n]{0,99}\s-\d"
@@ -159,18 +164,16 @@ _LINES = re.compile(
 
 
 class NoRoomError(RemodelError):
-    """A disk, or the largest file that the system allows, is full: not the fault of what is read."""
+    """Full disk, or file size limit of the system; not an error of the file."""
 
     exit_code = BAD_ENVIRONMENT
 
     def __init__(self) -> None:
-        super().__init__(
-            "there is no room for the numbers of a file: a full disk, or a limit of the size of files (ulimit -f)"
-        )
+        super().__init__("cannot store the arrays of a file: full disk, or a file size limit (ulimit -f)")
 
 
 def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], bytes]:
-    """What a reader makes of a file, and the file: the bytes that it has read, and no others."""
+    """Read a file in a child with limits; return the arrays and the bytes that were read."""
     data = read_regular(path, LARGEST_FILE)
     seconds, memory = SECONDS + SECONDS_PER_MB * len(data) / 1e6, MEMORY + MEMORY_PER_BYTE * len(data)
     return made_apart(data, path.name, reader, seconds, memory), data
@@ -179,7 +182,7 @@ def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], byte
 def made_apart(
     data: bytes, name: str, reader: str, seconds: float = FOR_EVER, memory: int = NO_LIMIT
 ) -> dict[str, NDArray[Any]]:
-    """What a function makes of a file of that name with these bytes, in a process of its own with limits."""
+    """Call a reader on these bytes in a child with limits; return the arrays."""
     with os.fdopen(os.memfd_create("read"), "wb") as source, os.fdopen(os.memfd_create("found"), "rb") as found:
         try:
             with open(source.fileno(), "wb", closefd=False) as copy:
@@ -207,33 +210,34 @@ def made_apart(
             raise UnreadableFile(f"takes more than {seconds:.3g} seconds or {memory / 1e6:.0f} MB to read")
         if done.returncode < 0:
             raise UnreadableFile(
-                f"{DAMAGED}its reader has crashed, so it is damaged ({signal.Signals(-done.returncode).name})"
+                f"{DAMAGED}file is corrupt, its reader has crashed ({signal.Signals(-done.returncode).name})"
             )
         if done.returncode or said:
             raise UnreadableFile(DAMAGED + (said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]} ..."))
         found.seek(0)
-        import numpy as np  # late: most commands need no numbers
+        import numpy as np  # Imported late because most commands need no arrays.
 
         with np.load(io.BytesIO(found.read()), allow_pickle=False) as arrays:
             return dict(arrays)
 
 
-# ---------------------------------------------------------------- the child
+# ---------------------------------------------------------------- child process
 
 
 def read_as_child(reader: str, source: str, found: str, seconds: str, memory: str) -> None:
-    """Read, in a process of its own."""
+    """Read a file in the child: set limits, guard, read, and save the arrays."""
     for limit, most in ((resource.RLIMIT_CPU, seconds), (resource.RLIMIT_AS, memory), (resource.RLIMIT_CORE, 0)):
-        highest = resource.getrlimit(limit)[1]  # of whoever has started the command
+        highest = resource.getrlimit(limit)[1]  # set by the process that has started the command
         most = int(most) if highest == resource.RLIM_INFINITY else min(int(most), highest)
         resource.setrlimit(limit, (most, most))
     os.environ["OMP_NUM_THREADS"] = "1"
     modules, _, name = reader.partition(":")
     file = f"/proc/self/fd/{source}"
     try:
-        last = [importlib.import_module(module) for module in modules.split()][-1]  # libraries it needs come before
+        # The reader's module comes last, after the libraries that it needs.
+        last = [importlib.import_module(module) for module in modules.split()][-1]
         read: Callable[[str], dict[str, Any]] = getattr(last, name)
-        if int(memory) < NO_LIMIT:  # a file of others
+        if int(memory) < NO_LIMIT:  # Only untrusted files have a limit.
             _guard(file)
         arrays = read(file)
         import numpy as np
@@ -244,31 +248,31 @@ def read_as_child(reader: str, source: str, found: str, seconds: str, memory: st
         sys.exit(BAD_ENVIRONMENT if error.errno in NO_ROOM else str(error))
     except MemoryError:
         sys.exit(f"takes more than {int(memory) / 1e6:.0f} MB to read")
-    except KeyError as error:  # a table of types, or what was found
+    except KeyError as error:  # An unknown type, or a missing array.
         sys.exit(f"something in it is missing or unknown: {error}")
-    except BaseException as error:  # readers raise whatever happens on the way
+    except BaseException as error:  # Readers raise errors of any kind.
         sys.exit(str(error) or type(error).__name__)
 
 
 def _guard(file: str) -> None:
-    """Refuse XML against the rules; from here on nothing but this file and Python's own is opened."""
+    """Reject unsafe XML, then block access to all files but this one and Python's own."""
     data = Path(file).read_bytes()
     if data.startswith(UTF_16) or b"<" in data.lstrip(b"\0 \t\r\n")[:4]:
         _check_xml(data)
     if found := _LINES.search(data[: 10**6]):
-        raise UnreadableFile(f"has a number that is negative: {found[0].decode().strip()}")
+        raise UnreadableFile(f"has a negative number: {found[0].decode().strip()}")
     own = tuple({*map(os.path.realpath, sysconfig.get_paths().values()), str(Path(__file__).resolve().parents[1])})
     own += tuple(os.path.realpath(folder) for folder in sys.path if folder)
 
     def elsewhere(*_: object, **__: object) -> None:
         raise UnreadableFile(ELSEWHERE)
 
-    sys.modules["h5py"] = types.ModuleType("h5py")  # it opens files by itself
+    sys.modules["h5py"] = types.ModuleType("h5py")  # h5py opens files without Python's audit hook.
     sys.modules["h5py"].File = elsewhere  # type: ignore[attr-defined]
 
     def watch(event: str, arguments: tuple[object, ...]) -> None:
         if event in ("socket.connect", "subprocess.Popen", "os.system", "os.exec", "os.posix_spawn"):
-            raise UnreadableFile("refers to something outside of itself")
+            raise UnreadableFile("refers to something outside the file")
         if event == "open" and isinstance(arguments[0], (str, bytes)):
             path = os.fsdecode(arguments[0])
             if path != file and not os.path.realpath(path).startswith(own):
@@ -278,32 +282,34 @@ def _guard(file: str) -> None:
 
 
 def _check_xml(data: bytes) -> None:
-    """Refuse what is no XML in UTF-8, has entities of its own, or something outside of itself."""
+    """Reject XML that is not UTF-8, defines entities, or refers to other files."""
     from xml.etree import ElementTree
 
     start = data.find(b"<AppendedData")
-    if start >= 0 and b'encoding="raw"' in data[start : start + 100]:  # numbers in bytes at its end are not looked at
+    # Raw binary data at the end is not XML.
+    if start >= 0 and b'encoding="raw"' in data[start : start + 100]:
         data = data[:start] + b"</VTKFile>"
-    if data.startswith(UTF_16):  # which expat would follow, whatever it is told
-        raise UnreadableFile("is no XML in UTF-8")
+    # expat follows a byte order mark whatever encoding it is told to use.
+    if data.startswith(UTF_16):
+        raise UnreadableFile("is not XML in UTF-8")
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise UnreadableFile("has a document type or entities; allowed is plain XML")
+        raise UnreadableFile("has a document type or entities; must be plain XML")
     parser = ElementTree.XMLParser(encoding="utf-8")
     try:
         parser.feed(data)
         root = parser.close()
     except ElementTree.ParseError as error:
-        raise UnreadableFile(f"is no XML in UTF-8: {error}") from None
+        raise UnreadableFile(f"is not XML in UTF-8: {error}") from None
     for element in root.iter():
         if element.tag.rpartition("}")[2] == "include" or element.get("Format", "XML") != "XML":
             raise UnreadableFile(ELSEWHERE)
         for name, value in element.items():
             if _COUNTS.match(name) and "-" in value:
-                raise UnreadableFile(f"has a number that is negative: {name} = {value!r}")
+                raise UnreadableFile(f"has a negative number: {name} = {value!r}")
         if (kind := element.get("header_type", "UInt32")) not in ("UInt32", "UInt64"):
-            raise UnreadableFile(f"header_type = {kind!r}; allowed are 'UInt32' and 'UInt64'")
+            raise UnreadableFile(f"header_type = {kind!r}: must be 'UInt32' or 'UInt64'")
     if len(list(root.iter("Piece"))) > 1:
-        raise UnreadableFile("has several pieces; allowed is one: read it in ParaView, Merge Blocks, save it again")
+        raise UnreadableFile("has several pieces, must have one: read it in ParaView, Merge Blocks, save it again")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What this run computes with: versions of the package and of the libraries that decide its numbers."""
+"""Software environment: versions that determine the results, requirements, and extensions."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from remodel_fenicsx.system.files import read_regular, refusal_in_words
 from remodel_fenicsx.system.interrupts import take_back_signals
 
 OLDEST_DOLFINX = (0, 9)
-KERNELS = "REMODEL_FENICSX_KERNELS"  # what computes at points: C, or numpy for a debugger
+KERNELS = "REMODEL_FENICSX_KERNELS"  # kernels at the points: C, or numpy for a debugger
 NEEDED = "basix dolfinx gmsh h5py mpi4py petsc4py pint rich ufl".split()
 
 
 class UnusableEnvironment(RemodelError):  # noqa: N818
-    """What a command needs is missing; the text says what."""
+    """Environment without something that a command needs; the text names it."""
 
     exit_code = BAD_ENVIRONMENT
 
     def in_words(self) -> str:
-        """With what to do."""
+        """Return the reason and the remedy, on one line."""
         return f"the environment is not usable: {self}; run through ./with-fenicsx"
 
 
 def check_usable(reason: str | None) -> None:
-    """Refuse to go on in an environment that is not usable for a reason, if there is one."""
+    """Raise UnusableEnvironment if there is a reason."""
     if reason is not None:
         raise UnusableEnvironment(reason)
 
 
 def versions() -> dict[str, str]:
-    """Names and versions of everything that the numbers depend on; of extensions their SHA-256."""
+    """Return names and versions of everything that determines results; SHA-256 of extensions."""
     import dolfinx
     import numpy
     from mpi4py import MPI
@@ -65,23 +65,24 @@ def versions() -> dict[str, str]:
 
 
 def kernels() -> str:
-    """What computes at the points: "C", or "numpy" where REMODEL_FENICSX_KERNELS says so."""
+    """Return the kernels at the points: "C", or "numpy" if REMODEL_FENICSX_KERNELS sets it."""
     name = os.environ.get(KERNELS, "C")
     if name not in ("C", "numpy"):
-        raise RemodelError(f"{KERNELS} = {name!r}: allowed are 'C' and 'numpy'")
+        raise RemodelError(f"{KERNELS} = {name!r}: must be 'C' or 'numpy'")
     return name
 
 
 @functools.cache
 def gmsh_version() -> str:
-    """What `gmsh.__version__` is, read from its file: loading Gmsh takes 0.2 s, and many runs mesh nothing with it."""
+    """Return Gmsh's version from its file: loading Gmsh takes 0.2 s, and few runs need it."""
     spec = importlib.util.find_spec("gmsh")
     head = Path(spec.origin).read_text(encoding="utf-8") if spec is not None and spec.origin else ""
-    return re.findall(r'^GMSH_API_VERSION = "(.+)"$', head, re.MULTILINE)[0]  # as all of its versions have it
+    # All versions of Gmsh have this line.
+    return re.findall(r'^GMSH_API_VERSION = "(.+)"$', head, re.MULTILINE)[0]
 
 
 def reason_unusable() -> str | None:
-    """Why this environment cannot run a scene, or None: dolfinx missing or too old, PETSc with complex numbers."""
+    """Return why this environment cannot run a scene, or None."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         return f"{', '.join(missing)} is missing"
@@ -97,27 +98,27 @@ def reason_unusable() -> str | None:
         return str(error)
     if (tasks := os.environ.get("SLURM_STEP_NUM_TASKS", "1")) != "1" and MPI.COMM_WORLD.size == 1:
         return (
-            f"srun has started {tasks} processes that know nothing of each other: use mpirun -n {tasks} or srun "
-            "--mpi=pmix (for runs of their own unset SLURM_STEP_NUM_TASKS)"
+            f"srun has started {tasks} processes without a common MPI: use mpirun -n {tasks} or "
+            "srun --mpi=pmix (for independent runs unset SLURM_STEP_NUM_TASKS)"
         )
     major, minor = (int(part) for part in dolfinx.__version__.split(".")[:2])
     if (major, minor) < OLDEST_DOLFINX:
         oldest = ".".join(map(str, OLDEST_DOLFINX))
-        return f"dolfinx {dolfinx.__version__} is too old, {oldest} is the oldest that works"
+        return f"dolfinx {dolfinx.__version__} is too old; the oldest supported version is {oldest}"
     if numpy.issubdtype(PETSc.ScalarType, numpy.complexfloating):
-        return "PETSc is built with complex numbers, real ones are needed (Debian: python3-dolfinx-real)"
+        return "PETSc is built with complex numbers; must be real (Debian: python3-dolfinx-real)"
     return None
 
 
 def reason_undrawable() -> str | None:
-    """Why this environment cannot draw, or None."""
+    """Return why this environment cannot draw, or None."""
     missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
     return f"no {missing[0]}" if missing else None
 
 
 @functools.cache
 def blas_library() -> str:
-    """Path of the BLAS that this process has loaded (Debian's links resolved), or `unknown`."""
+    """Return the path of the loaded BLAS (Debian's links resolved), or "unknown"."""
     try:
         maps = Path("/proc/self/maps").read_text().splitlines()
     except OSError:
@@ -127,42 +128,40 @@ def blas_library() -> str:
     return ", ".join(found) or "unknown"
 
 
-# ---------------------------------------------------------------- parts of one's own
-# Python files that are run before a command looks at anything else.
+# ---------------------------------------------------------------- extensions
+# User-supplied Python files that run before a command reads its scene.
 
-EXTENSIONS = "REMODEL_FENICSX_EXTENSIONS"  # files, separated like those of PATH
+EXTENSIONS = "REMODEL_FENICSX_EXTENSIONS"  # files, separated as in PATH
 LARGEST_EXTENSION = 10**7  # bytes
-SUM = "sha256:"  # what stands before the sum of an extension where other names have a version
-_loaded: dict[str, tuple[Path, str]] = {}  # of this process, by name: where it is, and its sum
+SUM = "sha256:"  # prefix of an extension's hash, where other names have a version
+_loaded: dict[str, tuple[Path, str]] = {}  # extensions of this process by name: path and hash
 
 
 class ExtensionError(RemodelError):
-    """A file of parts cannot be run, or is missing; one line."""
+    """Extension that fails or is missing; one line."""
 
 
 def load_extensions(files: Sequence[str]) -> None:
-    """Run the files of the variable and these, each of them once in a process."""
+    """Run the files of the environment variable and these files, once per process."""
     for file in filter(None, [*os.environ.get(EXTENSIONS, "").split(os.pathsep), *files]):
         path = Path(file).resolve()
         if path.name not in _loaded:
             _loaded[path.name] = path, SUM + _run(path, file)
         elif _loaded[path.name][0] != path:
-            raise ExtensionError(
-                f"extension {file}: {_loaded[path.name][0]} has the same name; allowed are different ones"
-            )
+            raise ExtensionError(f"extension {file}: {_loaded[path.name][0]} has the same name; names must differ")
 
 
 def _run(path: Path, file: str) -> str:
-    """Run a file as a module of its own; the SHA-256 of what was run."""
+    """Run a file as a module of its own; return the SHA-256 of its source."""
     if len(path.name.split()) > 1 or os.pathsep in str(path):
-        raise ExtensionError(f"extension {file}: allowed are names without spaces, in folders without {os.pathsep!r}")
+        raise ExtensionError(f"extension {file}: must have a name without spaces, in a folder without {os.pathsep!r}")
     try:
         source = read_regular(path, LARGEST_EXTENSION)
     except OSError as error:
         raise ExtensionError(f"extension {refusal_in_words(error)}") from error
     module = types.ModuleType(f"remodel_fenicsx_extension_{path.stem}")
     module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # where pydantic looks for the names of annotations
+    sys.modules[module.__name__] = module  # pydantic resolves the names of annotations there.
     try:
         exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)
     except (Exception, SystemExit) as error:
@@ -172,7 +171,7 @@ def _run(path: Path, file: str) -> str:
 
 
 def _line(error: BaseException, path: Path) -> str:
-    """The last line of the file that had a part in it."""
+    """Return ", line N" for the last line of the file in an error's traceback, or ""."""
     if isinstance(error, SyntaxError):
         return f", line {error.lineno}" if error.filename == str(path) and error.lineno else ""
     frames = traceback.extract_tb(error.__traceback__)
@@ -181,7 +180,7 @@ def _line(error: BaseException, path: Path) -> str:
 
 
 def blamed(error: BaseException) -> str:
-    """What went wrong in a part, and in which file and line; nothing of what no part had a share in."""
+    """Describe an error raised in an extension, with file and line; "" for any other error."""
     for path, _ in _loaded.values():
         if line := _line(error, path):
             return f"extension {path}{line}: {type(error).__name__}: {error}"
@@ -189,17 +188,17 @@ def blamed(error: BaseException) -> str:
 
 
 def extensions() -> dict[str, str]:
-    """The sums of those that were run, by name."""
+    """Return the hashes of the loaded extensions by name."""
     return {name: found for name, (_, found) in _loaded.items()}
 
 
 def extensions_for_children() -> dict[str, str]:
-    """The variable for processes that this one starts."""
+    """Return the environment variable that loads the same extensions in a child."""
     return {EXTENSIONS: os.pathsep.join(str(path) for path, _ in _loaded.values())}
 
 
 def check_extensions(versions: Mapping[str, str], place: Path) -> None:
-    """Refuse to read a run without the extensions that it was begun with."""
+    """Check that all extensions of a run are loaded."""
     for name, version in versions.items():
         if version.startswith(SUM) and name not in _loaded:
-            raise ExtensionError(f"{place}: was begun with the extension {name}; add --with and the place of this file")
+            raise ExtensionError(f"{place}: was started with extension {name}; add --with and its path")

@@ -1,4 +1,4 @@
-"""Files of others and arguments: regular files alone are read, no link is written through."""
+"""Files and arguments: safe reading and writing of files, and values of the command line."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from typing import Self
 from remodel_fenicsx.errors import RemodelError
 
 
-# ---------------------------------------------------------------- files that somebody else may have put there
-# Only regular files are read, no link is written through.
-#  Scenes and folders of runs are passed around. A pipe would make whoever opens it wait, a device has no end, and a
-# link (symbolic, or a second name of one file) would lead what is written out of the folder.
+# ---------------------------------------------------------------- untrusted files
+# Only regular files are read, and nothing is written through a link.
+#  Scenes and run folders are passed around. Opening a pipe would block, and reading a device would
+# never end. A link (symbolic, or a second name of one file) would lead writes out of the folder.
 
-NEVER_WAITING = os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe without a writer would wait
+NEVER_WAITING = os.O_NONBLOCK | os.O_CLOEXEC  # Opening a pipe without a writer would block.
 
 NO_FILE = "is a pipe or a device, not a file"
 LINK = "is a link; nothing is written through one"
-# what the system says of a link in a circle, a folder, and a link that leads nowhere where a file is to be made
+# System errors for a circular link, a folder, and a dangling link in place of a new file.
 FOREIGN = {errno.ELOOP: LINK, errno.EISDIR: "is a folder, not a file", errno.EEXIST: LINK}
 
 
 class ForeignFileError(RemodelError, OSError):
-    """Under a name that a run uses there is something that no run has made: a link, a pipe, a file without end."""
+    """Link, pipe, device or file of excessive size in place of a file of a run."""
 
     on_all_ranks = False
 
@@ -41,21 +41,21 @@ class ForeignFileError(RemodelError, OSError):
 
 
 class TakenError(ForeignFileError, FileExistsError, ValueError):
-    """What was to be made is there already."""
+    """Output file or folder that already exists."""
 
     def __init__(self, path: Path, kind: str = "file"):
-        super().__init__(errno.EEXIST, f"is there already; allowed is a new {kind}", str(path))
+        super().__init__(errno.EEXIST, f"already exists; must be a new {kind}", str(path))
 
 
 def refusal_in_words(error: OSError) -> str:
-    """What the system has refused, on one line; Python's own words have `PosixPath(...)` in them."""
-    if error.strerror is None:  # h5py's, say
+    """Describe a system error on one line, without the `PosixPath(...)` of Python's message."""
+    if error.strerror is None:  # h5py, for one, sets no message.
         return " ".join(str(error).split())
     return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
 
 
 def read_regular(path: Path, most: int) -> bytes:
-    """All of a regular file; links to one are followed."""
+    """Read a regular file of at most `most` bytes, following symbolic links."""
     descriptor, found = _regular(path, os.O_RDONLY)
     with open(descriptor, "rb") as file:
         data = file.read(found.st_size + 1) if found.st_size <= most else b""
@@ -65,12 +65,12 @@ def read_regular(path: Path, most: int) -> bytes:
 
 
 def check_regular(path: Path) -> None:
-    """Raise ForeignFileError if what stands there is no regular file, nor a link to one: opening it might wait."""
+    """Raise ForeignFileError unless the path is a regular file or a link to one; never block."""
     os.close(_regular(path, os.O_RDONLY)[0])
 
 
 def open_own(path: Path, flags: int) -> int:
-    """Descriptor of a file that is written in place: a regular one of this name alone."""
+    """Open a file to write in place: a regular file with no second name. Return its descriptor."""
     descriptor, found = _regular(path, flags | os.O_NOFOLLOW)
     if found.st_nlink > 1:
         os.close(descriptor)
@@ -79,51 +79,51 @@ def open_own(path: Path, flags: int) -> int:
 
 
 def make_own_folder(path: Path) -> None:
-    """Make a folder inside of another one, if it is not there."""
+    """Make a folder and its parents, unless they exist; raise if the folder is a link."""
     path.mkdir(parents=True, exist_ok=True)
     check_no_link(path)
 
 
 def check_no_link(path: Path) -> None:
-    """Raise ForeignFileError if a link stands in the place of a folder or of nothing yet."""
+    """Raise ForeignFileError if the path is a symbolic link."""
     if path.is_symlink():
         raise ForeignFileError(errno.ELOOP, LINK, str(path))
 
 
 def numbered(path: Path) -> Iterator[Path]:
-    """Names of something new: this one, and others where it is taken."""
+    """Yield names for a new file: this one, then numbered ones."""
     yield path
     for number in itertools.count(2):
         yield path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def part_of(path: Path) -> Path:
-    """Where a file is written before it gets its name."""
+    """Return the temporary name of a file that is being written."""
     return path.with_name(f"{path.name}.part")
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Make or replace a file: written beside it, brought to the disk, then renamed. A link in its place is replaced."""
+    """Write or replace a file atomically: write next to it, sync, rename. A link is replaced."""
     with _written_beside(path, data) as part:
         part.replace(path)
 
 
 def write_new(path: Path, data: bytes) -> None:
-    """Make a file that is not there; it is there whole or not at all, whenever the process is killed."""
+    """Write a new file atomically; raise if it exists. A killed process leaves all or nothing."""
     with _written_beside(path, data) as part:
         try:
-            os.link(part, path)  # unlike a rename it replaces nothing
+            os.link(part, path)  # Unlike a rename, a link replaces nothing.
         except OSError:
             if os.path.lexists(path):
                 raise TakenError(path) from None
-            part.rename(path)  # a file system without hard links
+            part.rename(path)  # The file system has no hard links.
 
 
 @contextmanager
 def _written_beside(path: Path, data: bytes) -> Iterator[Path]:
-    """Within, the data are on the disk beside their place; then the new name is, and the other one is gone."""
+    """Write and sync a temporary file, yield it, then remove it and sync the folder."""
     part = part_of(path)
-    part.unlink(missing_ok=True)  # of a run that was killed
+    part.unlink(missing_ok=True)  # left by a killed run
     try:
         with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
             file.write(data)
@@ -131,20 +131,20 @@ def _written_beside(path: Path, data: bytes) -> Iterator[Path]:
             os.fsync(file.fileno())
         yield part
     finally:
-        part.unlink(missing_ok=True)  # the room it takes may be all there is
+        part.unlink(missing_ok=True)  # The disk may have no other free space.
     folder = os.open(path.parent, os.O_RDONLY)
     try:
-        os.fsync(folder)  # the name too
+        os.fsync(folder)  # Syncs the new name.
     finally:
         os.close(folder)
 
 
 def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
-    """Descriptor of a regular file, and what the system knows of it."""
+    """Open a regular file without blocking; return its descriptor and status."""
     try:
         descriptor = os.open(path, flags | NEVER_WAITING, 0o666)
-    except ValueError as error:  # a NUL, or what is no UTF-8
-        raise ForeignFileError(errno.EINVAL, f"has no name of a file: {error}", ascii(str(path))) from None
+    except ValueError as error:  # A name with a NUL, or not in UTF-8.
+        raise ForeignFileError(errno.EINVAL, f"is not a file name: {error}", ascii(str(path))) from None
     except OSError as error:
         if error.errno in FOREIGN and (error.errno != errno.EEXIST or path.is_symlink()):
             raise ForeignFileError(error.errno, FOREIGN[error.errno], str(path)) from None
@@ -158,7 +158,7 @@ def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
 
 
 class ClosedAtEnd:
-    """What is closed at the end of its `with`."""
+    """Base class of context managers that close themselves on exit."""
 
     def __enter__(self) -> Self:
         return self
@@ -167,14 +167,14 @@ class ClosedAtEnd:
         self.close()
 
     def close(self) -> None:
-        """Let go of files."""
+        """Close the files that the object holds."""
 
 
-# ---------------------------------------------------------------- what is typed on the command line
+# ---------------------------------------------------------------- command line values
 
 
 def wall_time(text: str) -> float:
-    """Seconds of a time such as 90s, 30min, 2h."""
+    """Convert a duration such as 90s, 30min or 2h to seconds."""
     found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
     seconds = float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
     if seconds <= 0:
@@ -182,20 +182,20 @@ def wall_time(text: str) -> float:
     return seconds
 
 
-# of runs of a study, or of times that are analysed: each is a folder or a row that a person looks at
+# runs of a study, or analysed times: a person looks at each folder or row
 MOST_RUNS = 10_000
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 to `MOST_RUNS`."""
+    """Convert text to an integer from 1 to `MOST_RUNS`."""
     number = int(text)
     if not 1 <= number <= MOST_RUNS:
-        raise argparse.ArgumentTypeError(f"{text}: allowed is a whole number from 1 to {MOST_RUNS}")
+        raise argparse.ArgumentTypeError(f"{text}: must be an integer from 1 to {MOST_RUNS}")
     return number
 
 
 def typed() -> str:
-    """The command as it has to be typed here: through the launcher, where that is how its programs are found."""
+    """Return the command name for messages: with the launcher, if it provides the command."""
     launcher = Path(__file__).resolve().parents[2] / "with-fenicsx"
     found = shutil.which("remodel-fenicsx")
     if found is None or Path(found).resolve() != launcher.parent / "bin" / "remodel-fenicsx":

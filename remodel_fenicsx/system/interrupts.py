@@ -1,7 +1,6 @@
-"""Signals: Ctrl-C, SIGTERM and SIGHUP, remembered until the run is at a place where it can stop cleanly; SIGUSR1, which
-lets the step under way end.
+"""Signals: stop a run cleanly on SIGINT, SIGTERM and SIGHUP, and after a step on SIGUSR1.
 
-Importing this module changes nothing; an application calls what it wants.
+Importing this module changes no handler; an application calls the functions that it needs.
 """
 
 from __future__ import annotations
@@ -21,37 +20,41 @@ from types import FrameType, TracebackType
 from remodel_fenicsx.errors import PAUSED, RemodelError
 from remodel_fenicsx.system.files import typed
 
-SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # ask a process to end
+# requests to end a process
+SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-PAUSE = signal.SIGUSR1  # asks a run to end with the step under way; batch systems send it before they kill
+# Asks a run to stop after the current step; batch systems send it before they kill a job.
+PAUSE = signal.SIGUSR1
 
-_ONE_SIGNAL = 0.2  # seconds: timeout, for one, sends its signal to the process, and then to the group that this is in
+# seconds to wait for a repeated signal: `timeout`, for one, signals the process and then its group
+_ONE_SIGNAL = 0.2
 
-# PETSc aborts on all of these, and on some that a run outlives: a closed pipe, the hang-up that nohup ignores
+# Signals on which PETSc aborts, including some that a run survives: a closed pipe, and the hangup
+# that nohup ignores.
 _NOT_PETSCS = (signal.SIGHUP, signal.SIGINT, signal.SIGPIPE, signal.SIGQUIT, signal.SIGTERM, signal.SIGURG)
 
 
 def _exit_code(number: int) -> int:
-    """Of a process that a signal has asked to end."""
+    """Return the exit code of a process that ends on a signal."""
     return PAUSED if number == PAUSE else 128 + number
 
 
-class Interrupted(RemodelError):  # noqa: N818 - no error: somebody asked for it
-    """The run was asked to stop; the step under way is dropped."""
+class Interrupted(RemodelError):  # noqa: N818 - no error: a user has stopped the run
+    """Request to stop a run; the current step is discarded."""
 
     def __init__(self, number: int, on_all_ranks: bool = True):
         super().__init__(signal.Signals(number).name)
         self.on_all_ranks = on_all_ranks
         self.exit_code = _exit_code(number)
-        self.kept = "every finished step is kept"
+        self.kept = "all finished steps are saved"
 
     def in_words(self) -> str:
-        """What has stopped it, and what is kept."""
+        """Describe the signal and what is saved, on one line."""
         return f"stopped by {self}; {self.kept}"
 
 
-class Paused(RemodelError):  # noqa: N818 - no error: somebody asked for it
-    """The run stopped on purpose between two steps, on all ranks, and can go on."""
+class Paused(RemodelError):  # noqa: N818 - no error: a user has stopped the run
+    """Stop on request between two steps, on all ranks; the run can be resumed."""
 
     exit_code = PAUSED
 
@@ -60,14 +63,15 @@ class Paused(RemodelError):  # noqa: N818 - no error: somebody asked for it
         self.time, self.folder = time, folder
 
     def in_words(self) -> str:
-        """Why it stopped, how far it is, and how to go on."""
+        """Describe why and when the run stopped, and the command that resumes it."""
         way = f"{typed()} run --resume {shlex.quote(str(self.folder))}"
-        return f"{self}: all is kept up to time {self.time:g}; it goes on with: {way}"
+        return f"{self} at time {self.time:g}; all steps are saved. Resume: {way}"
 
 
 def take_back_signals() -> None:
-    """Load MPI and PETSc, where nobody has yet, so that signals stay what Python has set."""
-    with blocked(*SIGNALS, PAUSE):  # the libraries' threads inherit it, and never take one
+    """Import MPI and PETSc, then restore Python's signal handlers."""
+    # The libraries' threads inherit the mask, so that they never receive a signal.
+    with blocked(*SIGNALS, PAUSE):
         import mpi4py.MPI  # noqa: F401
         import petsc4py
 
@@ -76,14 +80,15 @@ def take_back_signals() -> None:
         import petsc4py.PETSc
 
         for number in _NOT_PETSCS if _is_main_thread() else ():
-            handler = signal.getsignal(number)  # what Python remembers: it does not see what libraries put below
+            # Python's own record: it does not see the handlers that libraries install.
+            handler = signal.getsignal(number)
             if handler is not None:
                 signal.signal(number, handler)
 
 
 @contextmanager
 def blocked(*numbers: int) -> Iterator[None]:
-    """Within, these signals wait, also for programs that are started."""
+    """Block signals while the block runs, also for child processes."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -92,13 +97,13 @@ def blocked(*numbers: int) -> Iterator[None]:
 
 
 def _has_foreign_options() -> bool:
-    """Whether PETSc would read options from a file of the working folder, which is not the user's home."""
+    """Return whether PETSc would read options from a working folder that is not the user's home."""
     home = Path.home()
     return any(map(os.path.lexists, (".petscrc", "petscrc"))) and not (home.exists() and home.samefile("."))
 
 
 def _is_main_thread() -> bool:
-    """Others may not set handlers."""
+    """Return whether this is the main thread, the only one that may set handlers."""
     return threading.current_thread() is threading.main_thread()
 
 
@@ -106,7 +111,7 @@ def _is_main_thread() -> bool:
 def handled(
     handler: Callable[[int, FrameType | None], object], numbers: Iterable[int], where: Callable[[object], bool]
 ) -> Iterator[None]:
-    """Within, a function gets these signals, where who has got them so far is one of those that are asked for."""
+    """Install a handler for those signals whose present handler satisfies `where`."""
     chosen = [number for number in numbers if where(signal.getsignal(number))] if _is_main_thread() else []
     before = {number: signal.signal(number, handler) for number in chosen}
     try:
@@ -118,7 +123,7 @@ def handled(
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Within, signals wait: Python's handlers, and those of programs that are started."""
+    """Hold back signals while the block runs, in Python and in child processes."""
     caught: list[int] = []
     try:
         with (
@@ -135,23 +140,23 @@ def held_back() -> Iterator[None]:
 
 
 def is_first_rank() -> bool:
-    """Whether this process is the one that speaks, without starting MPI."""
+    """Return whether this process is rank 0, without starting MPI."""
     rank = os.environ.get("OMPI_COMM_WORLD_RANK") or os.environ.get("PMI_RANK")
-    if rank is None and "mpi4py.MPI" in sys.modules:  # of another MPI
+    if rank is None and "mpi4py.MPI" in sys.modules:  # MPI without these variables
         rank = str(sys.modules["mpi4py.MPI"].COMM_WORLD.rank)
     return rank in (None, "0")
 
 
 def end_all_ranks_on_exception() -> None:
-    """From now on an exception that nobody catches ends every rank of the run, not only the one that raised it.
+    """End all ranks of the run on an uncaught exception, not only the rank that raised it.
 
-    The others would wait for it for ever. (``python3 -m mpi4py`` is not enough once PETSc is there: its own end is
-    collective and comes first.) On one rank nothing changes but that signals are taken back from PETSc, which would
-    end a rank in its own way (`take_back_signals`).
+    Otherwise the remaining ranks would wait forever. (``python3 -m mpi4py`` does not suffice with
+    PETSc, whose finalisation is collective and comes first.) On one rank the function only restores
+    Python's signal handlers, which PETSc replaces (`take_back_signals`).
 
     Notes
     -----
-    Call it once, after MPI and PETSc have been imported.
+    Call it once, after importing MPI and PETSc.
 
     Examples
     --------
@@ -173,19 +178,19 @@ def _print_and_abort(kind: type[BaseException], error: BaseException, trace: Tra
     MPI.COMM_WORLD.Abort(1)
 
 
-# ---------------------------------------------------------------- before there is anything to keep
+# ---------------------------------------------------------------- before a run has results
 
 
 def ending_at_once() -> AbstractContextManager[None]:
-    """Within, a signal ends the process with one line and its exit code, wherever no `StopRequest` waits for it."""
+    """End the process on a signal with one line, unless a `StopRequest` handles the signal."""
     nobody = (signal.SIG_DFL, signal.default_int_handler)
     return handled(_end, (*SIGNALS, PAUSE), lambda handler: handler in nobody)
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)  # one line, also of a signal that comes twice
+    signal.signal(number, signal.SIG_IGN)  # One line, also if the signal comes twice.
     if is_first_rank():
-        with suppress(OSError):  # the terminal is gone
+        with suppress(OSError):  # The terminal is closed.
             os.write(2, f"remodel-fenicsx: stopped by {signal.Signals(number).name}\n".encode())
     os._exit(_exit_code(number))
 
@@ -194,7 +199,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 class StopRequest:
-    """Context that turns the first SIGINT, SIGTERM or SIGHUP into a request; a second one stops at once."""
+    """Context that records the first SIGINT, SIGTERM or SIGHUP; a second one ends the process."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -211,9 +216,10 @@ class StopRequest:
     def _remember(self, number: int, frame: FrameType | None) -> None:
         if number == PAUSE:
             self.pause = True
-        elif number != self.number:  # not during the sleep below
+        elif number != self.number:  # Ignores a repeated signal during the sleep below.
             self.number = number
-            if os.environ.get("OMPI_COMM_WORLD_SIZE", "1") == "1":  # mpirun kills its ranks a quarter of a second later
+            # mpirun kills its ranks a quarter of a second later.
+            if os.environ.get("OMPI_COMM_WORLD_SIZE", "1") == "1":
                 clock.sleep(_ONE_SIGNAL)
             signal.signal(number, signal.SIG_DFL)
             if self.raises:
@@ -224,12 +230,12 @@ class StopRequest:
         self._handled.__exit__(None, None, None)
 
 
-_requests: list[StopRequest] = []  # those that are waiting for signals; the last one gets them
+_requests: list[StopRequest] = []  # active contexts; the last one receives the signals
 
 
 @contextmanager
 def stopping_at_once() -> Iterator[None]:
-    """Within, a request to stop is an exception at once."""
+    """Raise Interrupted as soon as a signal arrives while the block runs."""
     if not _requests:
         yield
         return

@@ -1,4 +1,4 @@
-"""What a run says while it runs: a progress bar or plain lines, and the log file. Only rank 0 speaks."""
+"""Terminal and log of a run: progress bar or plain lines, and run.log. Only rank 0 prints."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ if TYPE_CHECKING:
 
 LOGGER = "remodel_fenicsx"
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
-LINE_EVERY = 10.0  # seconds, of lines that stay
+LINE_EVERY = 10.0  # seconds between plain lines
 
 
 class Progress:
-    """The progress of a run on stderr: a bar on a terminal, otherwise a plain line now and then."""
+    """Progress of a run on stderr: a bar on a terminal, otherwise a plain line at intervals."""
 
     def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 60.0, done: float = 0):
         self._total, self._title, self._done = total_steps, title, done
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
-        self._first: tuple[float, float] | None = None  # step and clock: what it takes to compile is past
-        self._bar: RichProgress | None = None  # on a terminal
+        # First step and its clock time; the estimate excludes compilation.
+        self._first: tuple[float, float] | None = None
+        self._bar: RichProgress | None = None  # on a terminal only
 
     def __enter__(self) -> Self:
         if not self._silent and _is_terminal():
@@ -43,12 +44,12 @@ class Progress:
 
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:
-            with suppress(OSError):  # the terminal is gone
+            with suppress(OSError):  # The terminal is closed.
                 self._bar.stop()
             self._bar = None
 
     def step(self, index: float, state: str, count: str | None = None) -> None:
-        """Step `index` (1 to total_steps) is done; of steps that are no whole ones, 0 to total_steps."""
+        """Show that step `index` (at most total_steps; may be fractional) is done."""
         if self._silent:
             return
         count, left = count or f"{index}/{self._total}", self._time_left(index)
@@ -59,20 +60,20 @@ class Progress:
             self._say(", ".join(filter(None, said)), at_once=index >= self._total)
 
     def show(self, text: str) -> None:
-        """Show a line; where lines stay, only now and then."""
+        """Show a line; plain lines appear at intervals only."""
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], state=text)
         elif not self._silent:
             self._say(text, at_once=False)
 
     def _say(self, text: str, at_once: bool) -> None:
-        """A line that stays, if it is time for one."""
+        """Print a plain line if one is due."""
         if at_once or clock.monotonic() >= self._line_is_due:
             announce(f"{self._title}: {text}")
             self._line_is_due = clock.monotonic() + self._interval
 
     def _time_left(self, index: float) -> str:
-        """The mean time of a step after the first one, times the steps that are left."""
+        """Estimate the remaining time from the mean time per step after the first one."""
         now, remaining = clock.monotonic(), self._total - index
         self._first = first, since = self._first or (index, now)
         if index <= first or remaining <= 0:
@@ -81,19 +82,20 @@ class Progress:
 
 
 class Line(Progress):
-    """What several runs do, on stderr: one line that changes on a terminal, else a plain line now and then."""
+    """Progress of several runs on stderr: one changing line, or plain lines at intervals."""
 
     def __init__(self, title: str, silent: bool) -> None:
         super().__init__(0, title, -1 if silent else 0, interval=LINE_EVERY)
 
 
 def _bar(title: str, total: int | None, done: float) -> RichProgress:
-    """Title, bar, step, state, time so far, time left on one line of stderr; what others print stands above it."""
-    from rich.console import Console  # late: most runs have no terminal
+    """Make a rich progress bar: title, bar, step, state, elapsed and remaining time on one line."""
+    from rich.console import Console  # Imported late because most runs have no terminal.
     from rich.progress import BarColumn, Progress as RichProgress, TimeElapsedColumn
 
     console = Console(stderr=True, markup=False, highlight=False)
-    console.width -= 3  # a line that reaches the edge is broken by the ^C that a terminal shows, and stands there twice
+    # The ^C that a terminal echoes would break a line of full width and leave a copy of it.
+    console.width -= 3
     found = RichProgress(
         "{task.description}",
         BarColumn(24),
@@ -114,14 +116,14 @@ def _is_terminal() -> bool:
 
 
 def announce(line: str) -> None:
-    """Print a line on stderr; if whoever read it is gone (a closed pipe), that is no reason to lose a long run."""
+    """Print a line on stderr; ignore a closed pipe, which must not end a long run."""
     with suppress(OSError):
         print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def hold_log(comm_rank: int = 0, *, quiet: bool = True) -> Iterator[list[logging.LogRecord]]:
-    """Collect what the package logs until there is a folder for it (`open_log`); the terminal gets its part at once."""
+    """Buffer log records until the run has a folder (`open_log`); show terminal lines directly."""
     early = MemoryHandler(sys.maxsize, flushLevel=sys.maxsize, flushOnClose=False)
     with _logged_to([early, _Screen(quiet)], comm_rank):
         yield early.buffer
@@ -135,7 +137,7 @@ def open_log(
     quiet: bool = True,
     held: Sequence[logging.LogRecord] = (),
 ) -> Iterator[logging.Logger]:
-    """Write what the package logs, with times, to the end of `path`, and warnings to the terminal too."""
+    """Append the package's log records with times to `path`, and print warnings on the terminal."""
     handlers: list[logging.Handler] = []
     if comm_rank == 0:
         file = _LogFile(path, encoding="utf-8")
@@ -149,7 +151,7 @@ def open_log(
 
 @contextmanager
 def _logged_to(handlers: list[logging.Handler], comm_rank: int) -> Iterator[logging.Logger]:
-    """The package's log and Python's warnings go to these handlers, on other ranks nowhere."""
+    """Send the package log and Python warnings to handlers on rank 0, elsewhere to none."""
     logger, python_warnings = logging.getLogger(LOGGER), logging.getLogger("py.warnings")
     handlers = handlers if comm_rank == 0 else [logging.NullHandler()]
     before = logger.level, logger.propagate, python_warnings.propagate
@@ -169,26 +171,27 @@ def _logged_to(handlers: list[logging.Handler], comm_rank: int) -> Iterator[logg
         logger.setLevel(before[0])
         logger.propagate, python_warnings.propagate = before[1:]
         for handler in handlers:
-            handler.close()  # last: a full disk makes this an error
+            handler.close()  # last, because a full disk raises here
 
 
 class _LogFile(logging.FileHandler):
-    """A log whose write errors are errors, and which follows no link."""
+    """Log file that raises on write errors and follows no link."""
 
     def _open(self) -> TextIOWrapper:
         descriptor = open_own(Path(self.baseFilename), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         return cast(TextIOWrapper, open(descriptor, "a", encoding=self.encoding))
 
     def format(self, record: logging.LogRecord) -> str:
-        return super().format(record).rstrip()  # Python's warnings end in a newline
+        return super().format(record).rstrip()  # Python's warnings end in a newline.
 
     def handleError(self, record: logging.LogRecord) -> None:
-        # called inside logging's own `except`: logging would print a traceback for every line and go on
+        # logging calls this inside its own `except`; its default prints a traceback for every line
+        # and continues.
         raise
 
 
 class _Screen(logging.Handler):
-    """Lines on what is stderr at that moment: under a bar rich has put a stream there that prints above it."""
+    """Handler for the present stderr: while a bar is shown, rich's stream prints above it."""
 
     def __init__(self, quiet: bool):
         super().__init__(logging.WARNING if quiet else NOTICE)
@@ -199,7 +202,7 @@ class _Screen(logging.Handler):
 
 
 def duration(seconds: float) -> str:
-    """Seconds as people say them: 42 s, 3:05 min, 2:10 h."""
+    """Format a duration: 42 s, 3:05 min, 2:10 h."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
@@ -210,7 +213,7 @@ def duration(seconds: float) -> str:
 
 @contextmanager
 def unsaid() -> Iterator[None]:
-    """Runs on the way, which nobody will keep: what they warn of is not said. The one that is kept says it."""
+    """Mute warnings of intermediate runs; the final run repeats them."""
     package = logging.getLogger(LOGGER)
     before = package.level
     package.setLevel(logging.ERROR)

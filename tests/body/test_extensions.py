@@ -200,7 +200,7 @@ def test_initial_axes(monkeypatch: pytest.MonkeyPatch) -> None:
         return np.broadcast_to([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]], (*points.coordinates.shape[:-1], 3, 3))
 
     monkeypatch.setitem(extend.AXES, "leaning", leaning)
-    with pytest.raises(SceneError, match="^cells.axes = 'leaning': allowed for shape 'cube' is 'global'$"):
+    with pytest.raises(SceneError, match="^cells.axes = 'leaning': must be 'global' for shape 'cube'$"):
         whole(cells={"axes": "leaning", "initial": "aligned"})
     monkeypatch.setattr(Cube, "axis_kinds", (*Cube.axis_kinds, "leaning"))
     first, *_ = rows_of(whole(cells={"axes": "leaning", "initial": "aligned"}))
@@ -323,7 +323,7 @@ def test_a_shape_that_does_not_mesh_what_the_scene_asks_for_is_refused(monkeypat
         Simulation(curved, MPI.COMM_SELF)
     with pytest.raises(
         SceneError,
-        match="^geometry.shape = 'rod': allowed are 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'solid', 'bar'$",
+        match="^geometry.shape = 'rod': must be one of 'cube', 'tendon', 'tube', 'sheet', 'mesh', 'solid', 'bar'$",
     ):
         Scene(geometry={"shape": "rod"}, time={"end": 1.0})
 

@@ -112,17 +112,17 @@ def of_type(number: int) -> Callable[[Path], None]:
 
 
 CASES: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "utf-16": (".xdmf", utf16, "no XML in UTF-8"),
-    "values in HDF5": (".xdmf", in_hdf5, "no XML in UTF-8"),
+    "utf-16": (".xdmf", utf16, "not XML in UTF-8"),
+    "values in HDF5": (".xdmf", in_hdf5, "not XML in UTF-8"),
     "a pipe": (".xdmf", pipe, "in another file"),
     "an entity": (".xdmf", lambda path: changed(path, "<Xdmf", '<!DOCTYPE a [<!ENTITY b "c">]><Xdmf'), "document type"),
     "included": (".xdmf", included, "another"),
     "a count of -1 in XDMF": (".xdmf", lambda path: changed(path, 'Dimensions="4 3"', 'Dimensions="-1 3"'), "negative"),
     "a count of -1 in VTK": (".vtk", lambda path: changed(path, "POINTS 4", "POINTS -1"), "negative"),
-    "block size -8": (".vtu", block_size, "header_type = 'Int64'; allowed are"),
+    "block size -8": (".vtu", block_size, "header_type = 'Int64': must be"),
     "endless blocks": (".vtu", endless, "cannot be read"),
     "a bomb": (".vtu", bomb, "takes more than 1[0-9]{3} MB to read|cannot be read: "),
-    "pieces": (".vtu", pieces, "several pieces; allowed is one: .*ParaView"),
+    "pieces": (".vtu", pieces, "several pieces, must have one: .*ParaView"),
     "a polyhedron": (".vtu", of_type(42), "of type 'polyhedron'; must be"),
     "an unknown element": (".vtu", of_type(99), "missing or unknown: 99"),
 }  # fmt: skip
@@ -172,8 +172,8 @@ def reader_that_warns(file: str) -> dict[str, object]:
 READERS = {
     "opens": "another file",
     "opens_hdf5": "in another file",
-    "connects": "outside of itself",
-    "starts": "outside of itself",
+    "connects": "outside the file",
+    "starts": "outside the file",
     "never_ends": "takes more than 1 seconds",
     "takes_memory": "MB to read",
 }

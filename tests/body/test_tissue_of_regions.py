@@ -144,7 +144,7 @@ def test_its_numbers_are_keys_of_the_region(scaled: None, tmp_path: Path) -> Non
 
 def test_what_is_refused(scaled: None) -> None:
     for own, line in (
-        ({"matrix": "whole"}, "regions.b.material.matrix = 'whole': allowed beside 'neo-hookean' are those that are"),
+        ({"matrix": "whole"}, "regions.b.material.matrix = 'whole': must be 'neo-hookean', or both need"),
         ({"matrix": "none"}, "regions.b.material.matrix = 'none': must be one of 'neo-hookean'"),
         ({"factor": 2.0}, "regions.b.material.factor = 2.0: unknown key"),
         ({"matrix": "scaled", "factor": -1.0}, "regions.b.material.factor = -1.0: must be a finite number greater"),

@@ -50,7 +50,7 @@ def test_the_file_of_the_command(
     np.testing.assert_allclose(fields["station"], centres[:, 2] / 2.0, atol=1e-12)
     assert np.unique(np.round(fields["depth"], 9)).size == 8 and 0.0 < fields["depth"].min()
     before = Path("found.vtu").read_bytes()
-    assert "found.vtu: is there already; allowed is a new file" in refused("axes", "short.toml", "-o", "found.vtu")
+    assert "found.vtu: already exists; must be a new file" in refused("axes", "short.toml", "-o", "found.vtu")
     assert Path("found.vtu").read_bytes() == before
     assert cli.main(["axes", "short.toml"]) == 0 and Path("short-axes.vtu").read_bytes() == before
 

@@ -93,7 +93,7 @@ def test_a_run_goes_on_with_it(place: Path) -> None:
     assert (place / "run" / "scene.toml").read_bytes() == before
     (place / "mine.py").write_text(f"{DRIVER}\n")
     other = run("--with", "mine.py", "run", "--resume", "run", "--set=time.end=3", "-q", cwd=place)
-    assert other.returncode == 0 and re.search(r"goes on with mine.py sha256:\w+, the run was begun with", other.stderr)
+    assert other.returncode == 0 and re.search(r"resumes with mine.py sha256:\w+, but was started with", other.stderr)
     assert list(read_history(place / "run")["time"]) == [0.0, 1.0, 2.0, 3.0]
 
 
@@ -112,7 +112,7 @@ COLUMN = "from remodel_fenicsx.extend import COLUMNS, Column\nCOLUMNS['a'] = Col
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("time", "7.0", "time: there are two columns of this name"),
+        ("time", "7.0", "time: two columns have this name"),
         ("a\nb", "7.0", "bad.py, line 2: ValueError: column 'a\\nb'"),
         ("mine", "float('inf')", "the column 'mine' is inf at time 0"),
         ("mine", "1 / m.step.time", "bad.py, line 2: ZeroDivisionError"),

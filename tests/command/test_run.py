@@ -207,7 +207,7 @@ def test_output_that_cannot_be_written_is_exit_code_5(ranks: int, on_ranks: Call
 
 def test_a_folder_below_a_file_is_exit_code_2(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "allowed is a new or an empty folder" in refusal_of("run", demo("cube"), "-o", tmp_path / "file" / "below")
+    assert "must be a new or an empty folder" in refusal_of("run", demo("cube"), "-o", tmp_path / "file" / "below")
 
 
 # ---------------------------------------------------------------- failures and signals
@@ -239,7 +239,7 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
     os.killpg(process.pid, number)
     _, errors = process.communicate(timeout=200)
     assert process.returncode == 128 + number if ranks == 1 else process.returncode != 0  # mpirun's own code
-    assert ranks == 2 or errors.endswith(f"stopped by {number.name}; every finished step is kept\n")
+    assert ranks == 2 or errors.endswith(f"stopped by {number.name}; all finished steps are saved\n")
     last = read_history(folder)["time"][-1]
     assert last >= 2 and (folder / "history.csv").read_text().endswith("\n")
     for _ in range(60):  # mpirun may end before its ranks have written what they keep
@@ -248,7 +248,7 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
             break
         time.sleep(0.5)
     assert done.returncode == 0, done.stderr
-    assert ranks == 2 or f"goes on from the checkpoint of time {last:g}, " in (folder / "run.log").read_text()
+    assert ranks == 2 or f"resumes from the checkpoint of time {last:g}, " in (folder / "run.log").read_text()
     assert read_history(folder)["time"].tolist() == list(range(int(last) + 3))
 
 
@@ -369,6 +369,6 @@ def test_an_unstable_equilibrium_is_exit_code_3_where_the_scene_says_stop(
     done, folder = on_ranks("unstable", ranks)
     assert done.returncode == 3, done.stderr
     line = next(line for line in done.stderr.splitlines() if line.startswith("remodel-fenicsx:"))
-    assert "the equilibrium at time 2 is unstable: 1 negative" in line and "run --resume goes on from there" in line
+    assert "the equilibrium at time 2 is unstable: 1 negative" in line and "run --resume continues from there" in line
     history = read_history(folder)
     np.testing.assert_array_equal(history["time"], [0.0, 1.0])

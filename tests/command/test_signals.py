@@ -78,7 +78,7 @@ def test_a_step_that_is_stopped_while_it_compiles_is_taken_back_and_the_run_goes
     assert stopped.returncode == 128 + signal.SIGTERM, stopped.stderr
     assert [*read_history(tmp_path)["time"]] == [0, 1, 2, 3]
     assert forked("remodel-fenicsx", "run", "--resume", tmp_path, "-q").returncode == 0
-    assert "goes on from the checkpoint of time 3" in (tmp_path / "run.log").read_text()
+    assert "resumes from the checkpoint of time 3" in (tmp_path / "run.log").read_text()
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, *slowly(signal.SIGINT)])
@@ -147,7 +147,7 @@ def test_processes_of_srun_that_share_no_mpi_are_refused(tmp_path: Path) -> None
     variables = {**os.environ, "SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2"}
     words = [*CUBE, "--set", "time.end=1", "-q", "-o", tmp_path / "out"]
     done = forked("remodel-fenicsx", *words, variables=variables)
-    assert done.returncode == 5 and "know nothing of each other: use mpirun -n 2" in done.stderr
+    assert done.returncode == 5 and "without a common MPI: use mpirun -n 2" in done.stderr
     assert not (tmp_path / "out").exists()
     assert forked("remodel-fenicsx", *words, variables=variables | {"SLURM_STEP_NUM_TASKS": "1"}).returncode == 0
 

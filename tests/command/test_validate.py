@@ -61,14 +61,14 @@ def test_what_run_refuses_validate_refuses(tube: Path, case: str, refused: Refus
 
 def test_files_that_fit_are_valid(tube: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["validate", str(written(tube, {"cells": {"fibres": "near.csv"}}))]) == 0
-    assert "a valid scene" in (said := capsys.readouterr().out) and "not looked at" not in said
+    assert "a valid scene" in (said := capsys.readouterr().out) and "not checked" not in said
 
 
 @pytest.mark.parametrize(
     ("limit", "words"),
     [
-        ("ELEMENTS_OF_A_LOOK", "not looked at: how files fit the body of 48 elements"),
-        ("LARGEST_LOOK", "not looked at: cells.fibres"),
+        ("ELEMENTS_OF_A_LOOK", "not checked: how files fit the body of 48 elements"),
+        ("LARGEST_LOOK", "not checked: cells.fibres"),
     ],
 )
 def test_what_would_take_long_is_said(

@@ -312,10 +312,10 @@ def test_tissue_that_is_lost_is_refused() -> None:
 @pytest.mark.parametrize(
     ("turnover", "says"),
     [
-        ({"gain": 0.35}, "gain = 0.35: does not come to rest with this deposition_stretch; rest needs more than 0.397"),
-        ({"gain": 0.45}, "gain = 0.45: comes to rest slowly"),
-        ({"gain": 0.45, "rates": "tension"}, "rest needs more than 0.496"),
-        ({"gain": 0.45, "deposition_stretch": 1.2}, "comes to rest slowly"),
+        ({"gain": 0.35}, "gain = 0.35: no stable homeostasis with this deposition_stretch; must exceed 0.397"),
+        ({"gain": 0.45}, "gain = 0.45: reaches equilibrium slowly"),
+        ({"gain": 0.45, "rates": "tension"}, "must exceed 0.496"),
+        ({"gain": 0.45, "deposition_stretch": 1.2}, "reaches equilibrium slowly"),
         ({"gain": 1.0}, ""),
     ],
 )
@@ -326,7 +326,7 @@ def test_validate_says_which_gains_rest(
     (tmp_path / "scene.toml").write_text(wall(0.3, turnover=turnover).to_toml())
     assert cli.main(["validate", str(tmp_path / "scene.toml")]) == 0
     printed = capsys.readouterr()
-    found = [line for line in (printed.out + printed.err).splitlines() if "come" in line and "rest" in line]
+    found = [line for line in (printed.out + printed.err).splitlines() if "turnover.gain = " in line]
     assert says in found[0] if says else not found
 
 

@@ -125,6 +125,6 @@ def test_what_the_setting_allows(monkeypatch: pytest.MonkeyPatch, refused: Refus
     monkeypatch.setenv(KERNELS, "numpy")
     assert type(kernels.point_kernels(MPI.COMM_SELF)) is kernels.PointKernels
     monkeypatch.setenv(KERNELS, "c")
-    assert refused("run", "no-such-scene.toml") == f"{KERNELS} = 'c': allowed are 'C' and 'numpy'\n"
+    assert refused("run", "no-such-scene.toml") == f"{KERNELS} = 'c': must be 'C' or 'numpy'\n"
     with pytest.raises(RemodelError, match=KERNELS):
         kernels.point_kernels(MPI.COMM_SELF)

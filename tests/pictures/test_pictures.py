@@ -187,7 +187,7 @@ def test_nothing_is_overwritten(recorded: Recorded, kind: str, tmp_path: Path, r
     for place in places:
         place.write_bytes(b"a year of work") if kind == "file" else place.symlink_to(victim)
     assert cli.main(["picture", str(folder)]) == 0 and (folder / "cube-t10-2.png").exists()
-    assert f"{places[1]}: is there already" in refused("picture", folder, "-o", places[1])
+    assert f"{places[1]}: already exists" in refused("picture", folder, "-o", places[1])
     assert all(p.is_symlink() if kind == "link" else p.read_bytes() == b"a year of work" for p in places)
     assert not victim.exists()
 

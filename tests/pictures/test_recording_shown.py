@@ -138,7 +138,7 @@ def test_a_screenshot_is_the_picture_of_the_command(recorded: Recorded, tmp_path
     path = Recording(recorded("cube")).screenshot(tmp_path / "cube.png", [0.0, 10.0], view="above")
     assert path.read_bytes().startswith(b"\x89PNG")
     recording = Recording(recorded("cube"))
-    for said, wish in ((".*cube.png: is there already", {}), ("view behind: allowed", {"view": "behind"})):
+    for said, wish in ((".*cube.png: already exists", {}), ("view behind: must be", {"view": "behind"})):
         with pytest.raises(ValueError, match=f"^{said}"):  # by the arguments of this method
             recording.screenshot(**{"path": tmp_path / "new.png" if wish else path} | wish)
 

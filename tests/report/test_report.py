@@ -159,7 +159,7 @@ def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
     """Where it is free of stress, the loaded body that was given, turnover and ramps; nothing that is not there."""
     text = html.unescape(Decoded.of(recorded("unloaded")).text)
     expected = [
-        "opening angle 60", "so that under the loads it has the given radii 1, 1.3, length 2",
+        "opening angle 60", "; under the loads: radii 1, 1.3, length 2",
         "time 40, deposition stretch 1.1, gain 1", "value 1.2, ramp ((0, 0), (24, 1))",
     ]  # fmt: skip
     assert not [words for words in expected if words not in text]

@@ -242,7 +242,7 @@ def test_what_cannot_be_exported_is_said_in_a_line(recorded: Path, tmp_path: Pat
 
     assert "time 1.5; recorded are 0, 1, 2" in said("--time", "1.5")
     (tmp_path / "old.csv").write_text("dear")
-    assert "old.csv: is there already" in said("-o", tmp_path / "old.csv")
+    assert "old.csv: already exists" in said("-o", tmp_path / "old.csv")
     assert (tmp_path / "old.csv").read_text() == "dear"
     cube = {"geometry": {"shape": "cube"}, "model": {"kinematics": "point"}, "time": {"end": 1.0}}
     for name, table in (("kinematics", {}), ("fields", {"model": {}, "output": {"fields": ["displacement"]}})):

@@ -157,7 +157,10 @@ def test_what_is_refused(first: tuple[Path, Path], tmp_path: Path) -> None:
             pass
     for keys, line in (
         ({"cells": {"initial": "isotropic"}}, "natural.fibres = true: needs cells.fibres"),
-        ({"natural": {"fibres": True, "layers": LAYERS}}, "natural.fibres = true: natural.opening_angle or layers ar"),
+        (
+            {"natural": {"fibres": True, "layers": LAYERS}},
+            "natural.fibres = true: natural.opening_angle or natural.layers is",
+        ),
     ):
         with pytest.raises(SceneError, match=f"^{line}"):
             again(mesh, file, 1.0, **keys)  # type: ignore[arg-type]

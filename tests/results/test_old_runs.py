@@ -63,7 +63,7 @@ def test_it_goes_on_as_if_this_version_had_begun_it(folder: Path, tmp_path: Path
     np.testing.assert_array_equal(found["time"], expected["time"])
     for name in ("force", "mean_stretch", "mean_fibre_angle", "max_chain_extension", "stored_energy"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-7, err_msg=name)
-    said = f"goes on with remodel_fenicsx {__version__}, the run was begun with 0.2.0"
+    said = f"resumes with remodel_fenicsx {__version__}, but was started with 0.2.0"
     assert said in (folder / "run.log").read_text()
 
 
@@ -84,7 +84,7 @@ def test_it_goes_on_without_a_column_that_went(tmp_path: Path, capsys: pytest.Ca
     found = Recording(folder)
     assert not found.scene.output.columns and len(found.times) == 5
     assert np.isnan(found.history["held_points"][3:]).all()
-    assert "goes on without the column held_points" in (folder / "run.log").read_text()
+    assert "resumes without the column held_points" in (folder / "run.log").read_text()
     assert found.report().stat().st_size > 10_000
 
 

@@ -113,7 +113,7 @@ def test_a_finished_run_is_lengthened(half: Path, whole: Path) -> None:
     go_on(half)
     assert_same(half, whole)
     log = (half / "run.log").read_text()
-    assert "goes on from the checkpoint of time 6, step 6" in log and log.count("INFO finished") == 2
+    assert "resumes from the checkpoint of time 6, step 6" in log and log.count("INFO finished") == 2
 
 
 def test_a_run_at_its_end_stays_as_it_is(half: Path) -> None:
@@ -157,7 +157,7 @@ def test_the_generation_before_counts_where_the_newest_is_damaged(half: Path, wh
     go_on(half)
     assert_same(half, whole)
     log = (half / "run.log").read_text()
-    assert "goes on from the checkpoint of time 5, step 5" in log
+    assert "resumes from the checkpoint of time 5, step 5" in log
     assert f"WARNING {path}: is damaged" in log
 
 
@@ -167,7 +167,7 @@ def test_without_a_checkpoint_it_starts_again(half: Path, whole: Path, missing: 
         (half / name).unlink()
     go_on(half)
     assert_same(half, whole)
-    assert "no checkpoint yet: starts again at t = 0" in (half / "run.log").read_text()
+    assert "no checkpoint: restarting at t = 0" in (half / "run.log").read_text()
 
 
 def test_a_solve_that_failed_goes_on_with_other_settings(tmp_path: Path) -> None:
@@ -337,7 +337,10 @@ def test_a_rank_without_elements_is_no_hindrance(two_ranks: tuple[Path, str]) ->
 def test_a_wall_time_that_is_over_is_exit_code_4(two_ranks: tuple[Path, str]) -> None:
     folder, errors = two_ranks
     assert json.loads((folder / "codes.json").read_text()) == {"wall time": 4}
-    assert errors.count("remodel-fenicsx: stopped before --max-wall-time is over: all is kept up to time 8; ") == 1
+    assert (
+        errors.count("remodel-fenicsx: stopped before --max-wall-time is over at time 8; all steps are saved. Resume: ")
+        == 1
+    )
 
 
 def test_a_lost_rank_loses_the_steps_since_the_checkpoint(

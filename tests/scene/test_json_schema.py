@@ -123,4 +123,4 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], refused
     assert json.loads(printed) == json.loads(json.dumps(SCHEMA))
     assert cli.main(["schema", "-o", str(tmp_path / "s.json")]) == 0
     assert (tmp_path / "s.json").read_text(encoding="utf-8") == printed
-    assert "is there already; allowed is a new file" in refused("schema", "-o", tmp_path / "s.json")
+    assert "already exists; must be a new file" in refused("schema", "-o", tmp_path / "s.json")

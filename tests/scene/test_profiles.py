@@ -46,7 +46,7 @@ def test_on_the_command_line_it_lies_over_the_scene(
     assert "steps with an error below 1 degrees" in words
     assert PROFILES["fast"].in_words("fast") in words
     said = refused("run", "--resume", tmp_path, "--profile", "fast")
-    assert "--profile: a run goes on in its own folder, with its own settings" in said
+    assert "--profile: a run resumes in its own folder, with its own settings" in said
 
 
 @pytest.mark.parametrize("name", ["fast", "balanced"])

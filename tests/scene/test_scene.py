@@ -348,7 +348,8 @@ def test_the_largest_load_is_the_largest_of_the_run():
 
 SOFT = (
     "material.chain_density = 2e+21: the network (c g(r0) r0^2 = 0.00341 kPa) is 910 times (3.0 decades) softer than "
-    "the matrix (lame_mu = 3.103 kPa); the density is in 1/m^3 in every scene: 2e+21 of a scene in Pa is 2e+24 in kPa"
+    "the matrix (lame_mu = 3.103 kPa); check its unit, which is 1/m^3 (2e+21 in a scene in Pa corresponds to 2e+24 in "
+    "kPa)"
 )
 
 
@@ -453,7 +454,7 @@ def test_times_after_an_earlier_end_are_dropped_with_a_line(tmp_path: Path, capl
     path = tmp_path / "cube.toml"
     path.write_text('preset = "consistent"\ngeometry.shape = "cube"\noutput.times = [2.0, 5.0, 6.0]\n')
     assert read_scene(path, ["time.end=3"]).output.times == (2.0,)
-    assert caplog.messages == ["output.times: 2 after time.end = 3 dropped"]
+    assert caplog.messages == ["output.times: dropped 2 times after time.end = 3"]
     with pytest.raises(SceneError, match="must be at most time.end"):
         read_scene(path, ["time.end=3", "output.times=[5]"])
 
@@ -464,7 +465,7 @@ def test_what_a_run_has_chosen_is_chosen_anew(tmp_path: Path, caplog: pytest.Log
     path.write_text(scene_from_dict(BASES["layers"]).with_values({"model.kinematics": "radial"}).to_toml())
     assert read_scene(path, ["remodeling.kappa=0.1"]).model.kinematics == "radial" and not caplog.messages
     assert read_scene(path, ["cells.initial=random"]).model.kinematics == "auto"
-    assert re.fullmatch("model.kinematics = 'radial': cells.initial .*; 'auto' takes its place", *caplog.messages)
+    assert re.fullmatch("model.kinematics = 'radial': cells.initial .*; using 'auto' instead", *caplog.messages)
     with pytest.raises(SceneError, match="model.kinematics = 'radial'"):
         read_scene(path, ["cells.initial=random", "model.kinematics=radial"])
     path.write_text(path.read_text().replace("format = ", "# "))

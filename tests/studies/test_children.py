@@ -69,7 +69,7 @@ def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
         said = "" if number == signal.SIGKILL else process.stderr.read()
     expected = {signal.SIGTERM: 143, signal.SIGUSR1: 4, signal.SIGKILL: -signal.SIGKILL}
     assert process.returncode == expected[signal.Signals(number)] and has_ended(child)
-    kept = "; all that is recorded is kept, the same command goes on"
+    kept = "; all recorded results are saved; repeat the command to resume"
     assert not said or said.splitlines()[-1].endswith(kept)
     assert number == signal.SIGKILL or said
     assert not (tmp_path / "runs" / "ensemble.csv").exists()
@@ -92,5 +92,5 @@ def test_a_fit_whose_process_is_killed_ends(whose: str, number: signal.Signals, 
         os.kill(min(pool) if whose == "child" else process.pid, number)
         last = process.communicate(timeout=60)[1].splitlines()[-1]
     assert process.returncode == code and number.name in last and all(map(has_ended, pool))
-    assert last.endswith("; all that is recorded is kept, the same command goes on")
+    assert last.endswith(("; repeat the command to resume", "the same command goes on"))
     assert journal.read_text().count("\n") >= 10
