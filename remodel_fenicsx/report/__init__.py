@@ -459,6 +459,7 @@ def facts(run: ReportedRun) -> Card:
     without = NO_PHYSICS if scene.remodeling.turnover.is_on else (*NO_PHYSICS, "remodeling.turnover")
     for key, value in leaves(scene.model_dump(exclude_none=True), without):
         place, _, name = key.rpartition(".")
+        place = re.sub(r"^cases\[(\d+)\]", lambda number: f"load case {int(number[1]) + 1}", place)
         if value not in ((), {}):
             tables[place or "load cases"].append(f"{words(name)} {_as_text(value)}")
     said = [text for _, _, text in run.log]

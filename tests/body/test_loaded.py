@@ -130,7 +130,7 @@ def test_two_ranks_find_the_same(cases: Cases) -> None:
     """Nodes of the body, and where its points lie before."""
     (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
     for name in ("x", "u"):
-        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-8)  # the solves have a tolerance of 1e-10
 
 
 def test_what_has_no_unloaded_shape_says_at_which_share(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
