@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx import Scene, preset_scene
-from remodel_fenicsx.studies.fit import ROUGHLY, Fit, Measured, Problem, Unknown, minimised, result_of
+from remodel_fenicsx.studies.fit import PROFILE_TOLERANCE, Fit, Measured, Problem, Unknown, minimised, result_of
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ def tables(scene: Scene) -> list[Measured]:
 def filled(scene: Scene, empty: list[Measured]) -> list[Measured]:
     """The tables with what the model says, and standard deviations."""
     problem = Problem(scene, unknowns(np.ones(len(TRUTH))), empty)
-    said = problem.models(np.log(list(TRUTH.values())))
+    said = problem.predictions(np.log(list(TRUTH.values())))
     return [
         replace(one, columns=one.columns | modelled, sd={name: _sd(name, modelled[name]) for name in one.sd})
         for one, modelled in zip(empty, said, strict=True)
@@ -103,7 +103,9 @@ def fitted(scene: Scene, data: list[Measured], factors: Array) -> tuple[Fit, flo
     """One fit from one start, and its seconds of one processor."""
     began = clock.process_time()
     problem = Problem(scene, unknowns(factors), data)
-    rough = minimised(problem, np.log([unknown.start for unknown in problem.unknowns.values()]), enough=ROUGHLY)
+    rough = minimised(
+        problem, np.log([unknown.start for unknown in problem.unknowns.values()]), enough=PROFILE_TOLERANCE
+    )
     return result_of(problem, [minimised(problem, rough.x)]), clock.process_time() - began
 
 

@@ -8,11 +8,15 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from remodel_fenicsx._renamed import OLD_NAMES, new_name
+
 
 def on_demand(module: str, places: Mapping[str, str]) -> Callable[[str], Any]:
     """Return a module's `__getattr__` (PEP 562) that imports names on first access."""
 
     def imported(name: str) -> Any:
+        if name in OLD_NAMES.get(module, {}):
+            name = new_name(module, name)
         if name not in places:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         return getattr(importlib.import_module(f"remodel_fenicsx.{places[name]}"), name)

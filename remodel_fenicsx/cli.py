@@ -27,14 +27,14 @@ from remodel_fenicsx.system.environment import (
     check_usable,
     kernels,
     load_extensions,
-    reason_undrawable,
-    reason_unusable,
+    drawing_problem,
+    environment_problem,
     versions,
 )
 from remodel_fenicsx.system.files import positive, refusal_in_words, wall_time, write_new
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.studies.study import Answer
+    from remodel_fenicsx.studies.study import StudyResult
     from remodel_fenicsx.scene.scene import Scene
 
 # No help text needs these modules.
@@ -63,7 +63,7 @@ MAIN_EPILOG = (
 # ---------------------------------------------------------------- definition and end of a command
 Do = Callable[[argparse.Namespace], int | None]
 Needs = Sequence[Callable[[], str | None]]
-KINDS: dict[str, Callable[[str], object]] = {
+TYPE_OF_METAVAR: dict[str, Callable[[str], object]] = {
     **dict.fromkeys(("DATA", "DIR", "FILE", "FOLDER", "SCENE"), Path),
     **{"K": int, "LENGTH": float, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
 }
@@ -79,7 +79,7 @@ MARKS: dict[str, dict[str, Any]] = {
 class Command(NamedTuple):
     """A command: function, example arguments, option blocks and requirements."""
 
-    do: Do
+    function: Do
     example: str
     usage: Sequence[str]
     needs: Needs
@@ -118,7 +118,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--version", action="version", version=__version__, help="Print the version and exit.")
     commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, each in COMMANDS.items():
-        text, epilog = each.do.__doc__ or "", f"example:\n  remodel-fenicsx {each.example}"
+        text, epilog = each.function.__doc__ or "", f"example:\n  remodel-fenicsx {each.example}"
         about: dict[str, Any] = {"description": text, "epilog": epilog, "formatter_class": raw}
         if text:  # Commands without help text are for the processes of a study.
             about["help"] = text.replace("%", "%%")
@@ -140,7 +140,7 @@ def _add(found: argparse.ArgumentParser, *usage: str) -> None:
                 settings |= {"action": "store_false", "dest": value[5:].replace("-", "_")}
         else:
             kind = value.rstrip("!?+*")
-            settings |= {"default": default or None, "type": KINDS.get(kind, str)} | MARKS[value[len(kind) :]]
+            settings |= {"default": default or None, "type": TYPE_OF_METAVAR.get(kind, str)} | MARKS[value[len(kind) :]]
             settings["choices" if "|" in kind else "metavar"] = kind.split("|") if "|" in kind else kind
         found.add_argument(*names, **settings)
 
@@ -154,11 +154,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         os.open(os.devnull, os.O_RDWR)
     sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
-    with interrupts.ending_at_once():
-        return _done(list(sys.argv[1:] if arguments is None else arguments))
+    with interrupts.exit_on_signal():
+        return _run_command(list(sys.argv[1:] if arguments is None else arguments))
 
 
-def _done(arguments: list[str]) -> int:
+def _run_command(arguments: list[str]) -> int:
     """Run a command and return its exit code; print errors on one line."""
     options = argparse.Namespace()
     try:
@@ -171,9 +171,9 @@ def _done(arguments: list[str]) -> int:
             options.scene = scenes.read_scene(options.file, options.set, options.profile)
         for reason in chosen.needs:
             check_usable(reason())
-        return chosen.do(options) or 0
+        return chosen.function(options) or 0
     except RemodelError as error:
-        _complain_of(getattr(error, "failed", {}))
+        _print_failures(getattr(error, "failed", {}))
         return _fail(error.in_words(), error.exit_code, error.on_all_ranks)
     except OSError as error:
         text, code = f"cannot write the results: {refusal_in_words(error)}", BAD_ENVIRONMENT
@@ -217,7 +217,7 @@ class OutputError(RemodelError):
     exit_code = BAD_ENVIRONMENT
 
 
-def _say(*lines: object) -> None:
+def _print(*lines: object) -> None:
     if not interrupts.is_first_rank():
         return
     try:
@@ -229,20 +229,20 @@ def _say(*lines: object) -> None:
             raise OutputError(f"cannot write to the standard output: {error.strerror}") from error
 
 
-def _complain(message: str) -> None:
+def _print_error(message: str) -> None:
     with contextlib.suppress(OSError):  # stderr is closed
         print(f"remodel-fenicsx: {shortened(printable(message))}", file=sys.stderr, flush=True)
 
 
-def _complain_of(failed: Mapping[str, str]) -> None:
+def _print_failures(failed: Mapping[str, str]) -> None:
     for name, last_words in failed.items():
-        _complain(f"{name} has failed: {last_words}")
+        _print_error(f"{name} has failed: {last_words}")
 
 
 def _fail(message: str, code: int, on_all_ranks: bool) -> int:
     """Print the error and return its code; an error on one of several ranks aborts the others."""
     if interrupts.is_first_rank() or not on_all_ranks:
-        _complain(message)
+        _print_error(message)
     mpi = sys.modules.get("mpi4py.MPI")
     if not on_all_ranks and mpi is not None and mpi.COMM_WORLD.size > 1:
         mpi.COMM_WORLD.Abort(code)
@@ -253,7 +253,7 @@ def _fail(message: str, code: int, on_all_ranks: bool) -> int:
 def _stopping(kept: str) -> Iterator[None]:
     """End the command with a line on what is saved if a signal arrives while the block runs."""
     try:
-        with interrupts.StopRequest(), interrupts.stopping_at_once():
+        with interrupts.StopRequest(), interrupts.raise_on_signal():
             yield
     except interrupts.Interrupted as interruption:
         interruption.kept = kept
@@ -261,7 +261,7 @@ def _stopping(kept: str) -> Iterator[None]:
 
 
 # ---------------------------------------------------------------- options of several commands
-def _study(name: str) -> str:
+def _study_options(name: str) -> str:
     """Return the options of commands that run a scene several times."""
     return f"""
     -o --output DIR  Write the results to this folder (default: results/NAME-{name}). Repeat the
@@ -289,7 +289,7 @@ VIEWING = """
         (default: %(default)s).
     -o --output FILE  Output file; its suffix selects the format. Must not exist (default: {} in
         DIR, numbered if it exists)."""
-COMPUTES, DRAWS = (reason_unusable,), (reason_undrawable,)
+COMPUTES, DRAWS = (environment_problem,), (drawing_problem,)
 
 
 # ---------------------------------------------------------------- the commands
@@ -314,7 +314,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.resume and (options.output or options.profile):
         key = "-o" if options.output else "--profile"
         raise RemodelError(f"{key}: a run resumes in its own folder, with its own settings")
-    check_usable(reason_unusable())
+    check_usable(environment_problem())
     from remodel_fenicsx.running import resume, run
 
     wishes: Any = {"quiet": options.quiet, "deadline": deadline, "report": options.report}
@@ -322,7 +322,7 @@ def _run(options: argparse.Namespace) -> None:
         folder = resume(options.resume, options.set, **wishes)
     else:
         folder = run(options.scene, options.output, **wishes)
-    _say(f"results in {folder}")
+    _print(f"results in {folder}")
 
 
 @command("status artery", RUN_FOLDER)
@@ -330,7 +330,7 @@ def _status(options: argparse.Namespace) -> None:
     """Print the progress of the run in DIR, its speed, and whether its process is alive."""
     from remodel_fenicsx.results.status import status
 
-    _say(*map(printable, status(options.folder)))
+    _print(*map(printable, status(options.folder)))
 
 
 @command(
@@ -347,12 +347,12 @@ def _report(options: argparse.Namespace) -> None:
     from remodel_fenicsx.report import write_report
 
     written = write_report(options.folder, options.output)
-    _say(written)
+    _print(written)
     if options.open:
         import webbrowser  # slow to import and seldom needed
 
         if not webbrowser.open(written.resolve().as_uri()):
-            _complain(f"warning: no browser found; open {written} yourself")
+            _print_error(f"warning: no browser found; open {written} yourself")
 
 
 @command(
@@ -368,10 +368,10 @@ def _report(options: argparse.Namespace) -> None:
 )
 def _picture(options: argparse.Namespace) -> None:
     """Draw the body of the run in DIR as PNG or PDF."""
-    from remodel_fenicsx.pictures import Viewing, draw_picture
+    from remodel_fenicsx.pictures import ViewOptions, draw_picture
 
-    viewing = Viewing(options.layers, options.cut, options.view)
-    _say(draw_picture(options.folder, options.time, viewing, options.output))
+    viewing = ViewOptions(options.layers, options.cut, options.view)
+    _print(draw_picture(options.folder, options.time, viewing, options.output))
 
 
 @command(
@@ -386,10 +386,10 @@ def _picture(options: argparse.Namespace) -> None:
 )
 def _animate(options: argparse.Namespace) -> None:
     """Animate the body of the run in DIR as GIF or WebP."""
-    from remodel_fenicsx.pictures import Viewing, draw_animation
+    from remodel_fenicsx.pictures import ViewOptions, draw_animation
 
-    viewing = Viewing(options.layers, options.cut, options.view)
-    _say(draw_animation(options.folder, options.frames, viewing, options.output))
+    viewing = ViewOptions(options.layers, options.cut, options.view)
+    _print(draw_animation(options.folder, options.frames, viewing, options.output))
 
 
 @command("revolve artery", RUN_FOLDER, alone=True)
@@ -397,7 +397,7 @@ def _revolve(options: argparse.Namespace) -> None:
     """Write the fields of a reduced run in DIR on the whole body, for ParaView."""
     from remodel_fenicsx.results.whole_body import revolve
 
-    _say(*revolve(options.folder))
+    _print(*revolve(options.folder))
 
 
 @command(
@@ -416,7 +416,7 @@ def _export(options: argparse.Namespace) -> None:
     """Export the fibres of the run in DIR for FEBio, Abaqus or ParaView, or as a table."""
     from remodel_fenicsx.results.export import export
 
-    _say(export(options.folder, options.format, options.output, options.time))
+    _print(export(options.folder, options.format, options.output, options.time))
 
 
 @command(
@@ -429,7 +429,7 @@ def _export(options: argparse.Namespace) -> None:
 def _new(options: argparse.Namespace) -> None:
     """Print a scene of a published model, with every key."""
     scene: Scene = scenes.preset_scene(options.preset, options.shape)
-    _say(scene.to_toml(f"a scene of the preset {options.preset}").rstrip("\n"))
+    _print(scene.to_toml(f"a scene of the preset {options.preset}").rstrip("\n"))
 
 
 @command(
@@ -455,32 +455,32 @@ def _wall(options: argparse.Namespace) -> None:
         lines = write_wall(
             options.surface, path, options.thickness, options.layers or (), options.size, options.through
         )
-    _say(*lines)
+    _print(*lines)
 
 
 @command("validate artery.toml", SCENE_AND_CHANGES)
 def _validate(options: argparse.Namespace) -> None:
     """Check a scene without running it, and show the settings that a run would use."""
-    from remodel_fenicsx.body.reductions import explained
+    from remodel_fenicsx.body.reductions import describe_choice
 
     scene, unseen, warnings = options.scene, "", []
     if interrupts.is_first_rank():
         unseen, warnings = _unseen_files(scene), scene.warnings()
-    _say(f"{options.file}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
-    _say(scene.summary(), *explained(scene), scene.formulation_in_words())
+    _print(f"{options.file}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
+    _print(scene.summary(), *describe_choice(scene), scene.describe_formulation())
     if scene.profile is not None:
-        _say(presets.profile_for(scene.profile, scene).in_words(scene.profile))
+        _print(presets.profile_for(scene.profile, scene).in_words(scene.profile))
     for warning in warnings:
-        _complain(f"warning: {warning}")
+        _print_error(f"warning: {warning}")
     if unseen:
-        _say(f"not checked: {unseen}")
+        _print(f"not checked: {unseen}")
 
 
 def _unseen_files(scene: Scene) -> str:
     """Check a scene's files as a run would; describe those that were not checked."""
     if not scene.measured_cells and not scene.geometry.kept_files()[1]:
         return ""
-    if (reason := reason_unusable()) is not None:
+    if (reason := environment_problem()) is not None:
         return f"the scene's files; {reason}"
     from remodel_fenicsx.initial import check_files
 
@@ -499,7 +499,7 @@ def _axes(options: argparse.Namespace) -> None:
 
     path = options.output or Path(f"{options.scene.name}-axes.vtu")
     with _stopping("nothing is written"):
-        _say(f"{write_axes(options.scene, path)}\nlocal axes in {path}")
+        _print(f"{write_axes(options.scene, path)}\nlocal axes in {path}")
 
 
 @command(
@@ -517,7 +517,7 @@ def _unload(options: argparse.Namespace) -> None:
     place = options.output or Path(f"{options.scene.name}-unloaded")
     with _stopping("nothing is written"):
         write_unloaded(options.scene, place)
-    _say(f"scene of the unloaded body in {place / 'scene.toml'}")
+    _print(f"scene of the unloaded body in {place / 'scene.toml'}")
 
 
 @command(
@@ -533,15 +533,15 @@ def _schema(options: argparse.Namespace) -> None:
     if options.output is not None:
         write_new(options.output, f"{text}\n".encode())
         text = f"JSON Schema in {options.output}"
-    _say(text)
+    _print(text)
 
 
-def _answer(study: Callable[..., tuple[Path, Answer]], *wishes: object) -> int:
+def _run_study(study: Callable[..., tuple[Path, StudyResult]], *wishes: object) -> int:
     """Run a study; print its result, its folder and its failed runs."""
     with _stopping("all recorded results are saved; repeat the command to resume"):
         folder, found = study(*wishes)
-    _say(f"{found.in_words()}\nresults in {folder}")
-    _complain_of(found.failed)
+    _print(f"{found.in_words()}\nresults in {folder}")
+    _print_failures(found.failed)
     return SOLVE_FAILED if found.failed else 0
 
 
@@ -555,7 +555,7 @@ def _answer(study: Callable[..., tuple[Path, Answer]], *wishes: object) -> int:
         KEY=a:b.
     --seed SEED = 1  Seed of the Latin hypercube (default: %(default)s).
     """,
-    _study("sweep"),
+    _study_options("sweep"),
     needs=COMPUTES + DRAWS,
 )
 def _sweep(options: argparse.Namespace) -> int:
@@ -566,21 +566,21 @@ def _sweep(options: argparse.Namespace) -> int:
     axes = study.read_axes(options.axes, is_sampled)
     points = study.latin_hypercube(axes, options.latin, options.seed) if is_sampled else study.grid(axes)
     wishes = options.output, options.jobs, options.quiet, is_sampled
-    return _answer(study.sweep, options.scene, points, *wishes)
+    return _run_study(study.sweep, options.scene, points, *wishes)
 
 
 @command(
     "ensemble artery.toml --seeds 32 -o seeds",
     SCENE_AND_CHANGES,
     "--seeds N = 32  Number of seeds, at least 2 (default: %(default)s).",
-    _study("ensemble"),
+    _study_options("ensemble"),
     needs=COMPUTES + DRAWS,
 )
 def _ensemble(options: argparse.Namespace) -> int:
     """Run a scene of random cells with many seeds."""
     from remodel_fenicsx.studies.sweep import ensemble
 
-    return _answer(ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet)
+    return _run_study(ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet)
 
 
 @command(
@@ -590,14 +590,14 @@ def _ensemble(options: argparse.Namespace) -> int:
     --budget TIME = 10min  Stop after this wall time (default: %(default)s). Cheap runs come first;
         repeat the command with a larger budget to resume.
     """,
-    _study("trade"),
+    _study_options("trade"),
     needs=COMPUTES + DRAWS,
 )
 def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings, and show the cost and error of each."""
     from remodel_fenicsx.studies.trade import trade
 
-    return _answer(trade, options.scene, options.output, options.budget, options.jobs, options.quiet)
+    return _run_study(trade, options.scene, options.output, options.budget, options.jobs, options.quiet)
 
 
 @command(
@@ -610,7 +610,7 @@ def _trade(options: argparse.Namespace) -> int:
     --starts N = 3  Start from N points: the point of DATA, and others within a factor of two
         (default: %(default)s).
     """,
-    _study("fit"),
+    _study_options("fit"),
     needs=COMPUTES + DRAWS,
 )
 def _fit(options: argparse.Namespace) -> int:
@@ -618,7 +618,7 @@ def _fit(options: argparse.Namespace) -> int:
     from remodel_fenicsx.studies.fit import fit
 
     wishes = options.starts, options.quiet, options.likelihood_profiles, options.jobs
-    return _answer(fit, options.scene, options.data, options.output, *wishes)
+    return _run_study(fit, options.scene, options.data, options.output, *wishes)
 
 
 @command(
@@ -637,21 +637,21 @@ def _stability(options: argparse.Namespace) -> None:
     from remodel_fenicsx.studies.stability import stability
 
     place, found = stability(options.scene, options.output, options.times, quiet=options.quiet)
-    _say(f"{found.in_words()}\nresults in {place}")
+    _print(f"{found.in_words()}\nresults in {place}")
 
 
 @command("info", needs=COMPUTES)
 def _info(options: argparse.Namespace) -> None:
     """Print the versions of the program and its libraries, the solvers and the BLAS."""
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
-    from remodel_fenicsx.kernels import is_available
+    from remodel_fenicsx.kernels import has_single_precision
 
     found = versions() | {
-        "factorisations": f"lagged, in {'single' if is_available() else 'double'} precision",
+        "factorisations": f"lagged, in {'single' if has_single_precision() else 'double'} precision",
         "solver methods": ", ".join(SOLVER_METHODS),
     }
     for name, version in found.items():
-        _say(f"{name:16} {version}")
+        _print(f"{name:16} {version}")
 
 
 @command(PART, "file_of_part FILE  The task; the answer replaces it.", needs=COMPUTES)

@@ -131,12 +131,12 @@ if TYPE_CHECKING:
     from remodel_fenicsx.evolution.life_cycle import Remodels as Remodels
     from remodel_fenicsx.fem.jit import form as form
     from remodel_fenicsx.results.columns import Measurement as Measurement
-    from remodel_fenicsx.solver.linear import EveryTangent as EveryTangent
+    from remodel_fenicsx.solver.linear import FullNewton as FullNewton
     from remodel_fenicsx.evolution.stepper import WarnsOnce as WarnsOnce
 
 _LATE = {
     **dict.fromkeys(("Coupling", "Staggered", "Traits"), "evolution.coupling"),
-    "EveryTangent": "solver.linear",
+    "FullNewton": "solver.linear",
     "Measurement": "results.columns",
     "Remodels": "evolution.life_cycle",
     "WarnsOnce": "evolution.stepper",

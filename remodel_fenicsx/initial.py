@@ -12,10 +12,10 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import Loading
-from remodel_fenicsx.body.reductions import AUTO, choice, explained, only_for_means
+from remodel_fenicsx.body.reductions import AUTO, choice, describe_choice, only_for_means
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.errors import UnreadableFile
-from remodel_fenicsx.fem.assembly import agreed
+from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -25,23 +25,28 @@ from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Cells, Turnover, in_region
 from remodel_fenicsx.state import State, UnitCells
-from remodel_fenicsx.system.files import typed
+from remodel_fenicsx.system.files import command_name
 
 if TYPE_CHECKING:
     from dolfinx.fem import Function
     from numpy.typing import ArrayLike
 
     from remodel_fenicsx.body.fibres import FibreFile
-    from remodel_fenicsx.model.residual_stress import Closing
+    from remodel_fenicsx.model.residual_stress import ClosedRing
 
 log = logging.getLogger(__name__)
 
 # measured fibres by region and name, with a row for each element of the mesh
 Fibres = Mapping[str, Mapping[str, Array]]
 # Fields of a fibre file that continue an earlier run, with their values at the start of a new run.
-UNCHANGED: Mapping[str, ArrayLike] = {NATURAL_GRADIENT: np.eye(3), "content": 1.0, "natural_length": 1.0, GROWTH: 1.0}
+INITIAL_VALUES: Mapping[str, ArrayLike] = {
+    NATURAL_GRADIENT: np.eye(3),
+    "content": 1.0,
+    "natural_length": 1.0,
+    GROWTH: 1.0,
+}
 NO_FIBRES: Fibres = {}
-BEYOND = 0.5
+MAX_EXTRAPOLATION = 0.5
 """Largest extrapolation of the closing's polynomials, in widths of the innermost layer.
 
 At points farther inside a thin wall the stretches are rounding errors: polynomials of degree 24
@@ -54,27 +59,27 @@ ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
 def meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Scene, Domain]:
     """Resolve and log the scene's choices; return the resolved scene and its mesh. Collective."""
     if scene.geometry.is_loaded:
-        raise SceneError(f"geometry.is = 'loaded': needs the unloaded body, from {typed()} unload SCENE")
+        raise SceneError(f"geometry.is = 'loaded': needs the unloaded body, from {command_name()} unload SCENE")
     if domain is None and comm.rank == 0:
-        for line in explained(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
+        for line in describe_choice(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
             log.info("%s", line)
     if scene.mesh.formulation == AUTO and comm.rank == 0:
-        log.info("%s", scene.formulation_in_words())
-    scene = with_choices(scene, domain)
+        log.info("%s", scene.describe_formulation())
+    scene = resolve_auto_settings(scene, domain)
     return scene, checked_domain(mesh_of(scene, comm) if domain is None else domain, scene)
 
 
 def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
     """Make the unloaded state of each load case, all with the same compiled kernels."""
-    made = [on_mesh_alone(scene, domain) for _ in scene.each_case()]
+    made = [make_kinematics(scene, domain) for _ in scene.each_case()]
     unknowns = [one.unknown(domain.mesh, scene.mesh.degree) for one in made]
     quadrature = Quadrature(domain.mesh, scene.mesh.degree, made[0].weight(domain.mesh))
     properties, local_axes = scene.properties(), scene.geometry.local_axes(domain, quadrature)
     own = {name: properties[name].cells for name in scene.regions}
     grows = scene.remodeling.turnover.grows
-    if grows or not scene.natural.is_of_the_mesh:
+    if grows or not scene.natural.is_trivial:
         values, closed = np.eye(3), None
-        if not scene.natural.is_of_the_mesh:
+        if not scene.natural.is_trivial:
             values, closed = natural_gradient(scene, quadrature, domain, local_axes, fibres)
         present, initial = (quadrature.function(f"{name}_gradient", (3, 3)) for name in ("natural", "initial"))
         for function in (present, initial):
@@ -92,16 +97,16 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
                 "variations inside elements; at nodes the means differ by up to %.1f %% of tr A",
                 100 * unevenness(elements, tensors),
             )
-    return [unloaded_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
+    return [make_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 
 
-def on_mesh_alone(scene: Scene, domain: Domain) -> Any:
+def make_kinematics(scene: Scene, domain: Domain) -> Any:
     """Return the scene's kinematics on a stress-free mesh."""
-    kinematics = KINEMATICS[scene.model.kinematics].on(domain.mesh, scene.geometry)
+    kinematics = KINEMATICS[scene.model.kinematics].for_mesh(domain.mesh, scene.geometry)
     return FreeLength(kinematics, scene.geometry) if scene.has_free_length else kinematics
 
 
-def unloaded_state(
+def make_state(
     scene: Scene,
     unknown: Function,
     kinematics: Any,
@@ -119,14 +124,14 @@ def unloaded_state(
 
 def natural_gradient(
     scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes, fibres: Fibres = NO_FIBRES
-) -> tuple[Array, Closing | None]:
+) -> tuple[Array, ClosedRing | None]:
     """Return G of the natural configuration (elements, points, 3, 3); the closed ring or None."""
     from remodel_fenicsx.body.wall import gradient, prestretch
-    from remodel_fenicsx.model.residual_stress import closing
+    from remodel_fenicsx.model.residual_stress import close_ring
 
     natural, shape, found = scene.natural, scene.geometry, None
     if natural.fibres:
-        present, ratio = (in_files(fibres, name, quadrature, domain) for name in (NATURAL_GRADIENT, GROWTH))
+        present, ratio = (field_from_files(fibres, name, quadrature, domain) for name in (NATURAL_GRADIENT, GROWTH))
         across = np.einsum("...j,...k->...jk", *(2 * [local_axes.axes[..., 2, :]]))
         # G_0 of `evolution.turnover`
         return present @ (np.eye(3) + (ratio - 1.0)[..., None, None] * across), None
@@ -137,14 +142,14 @@ def natural_gradient(
     if isinstance(shape, RoundWall):
         tissues = {name: properties.tissue for name, properties in scene.properties().items()}
         try:
-            found = closing(shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle)
+            found = close_ring(shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle)
         except ArithmeticError as error:
             asked = f"natural.opening_angle = {natural.opening_angle:g}"
             raise SceneError(f"{asked}: must be smaller, or natural.layers nearer to 1: {error}") from error
         radii, (inner, next_one, *_) = np.linalg.norm(local_axes.coordinates[..., :2], axis=-1), found.panels.edges
         stretches = found.stretches(radii)
         beyond = quadrature.maximum(((inner - radii) / (next_one - inner)).reshape(quadrature.shape))
-        if beyond > BEYOND or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:
+        if beyond > MAX_EXTRAPOLATION or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:
             rule = "must be smaller, or mesh.refinement larger: straight element sides leave the wall"
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
@@ -164,14 +169,14 @@ def check_files(scene: Scene) -> str:
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if large or number > ELEMENTS_OF_A_LOOK:
         return f"{', '.join([*large, f'how files fit the body of {number} elements'])}; a run does"
-    scene = with_choices(scene)
+    scene = resolve_auto_settings(scene)
     domain = checked_domain(mesh_of(scene, MPI.COMM_SELF), scene)
     scene.geometry.check_faces(domain, scene.supports.faces, scene.loads)
     measured_fibres(scene, domain)
     return ""
 
 
-def with_choices(scene: Scene, domain: Domain | None = None) -> Scene:
+def resolve_auto_settings(scene: Scene, domain: Domain | None = None) -> Scene:
     """Replace "auto" in a scene by its kinematics and formulation. A user-supplied mesh is full."""
     if AUTO not in (scene.model.kinematics, scene.mesh.formulation):
         return scene
@@ -241,13 +246,13 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Array]]
             found[name] = _with_prestretch(measured, f"{in_region(name)}cells.fibres = {cells.fibres!r}", scene)
         return found
 
-    return domain.comm.bcast(agreed(domain.comm, read)) or {}
+    return domain.comm.bcast(raise_on_all_ranks(domain.comm, read)) or {}
 
 
 def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict[str, Array]:
     """Select the fields of a fibre file that the scene starts with (natural.fibres)."""
-    wanted, held = scene.natural.fibres, [name for name in UNCHANGED if name in measured]
-    changed = [name for name in held if not np.allclose(measured[name], np.reshape(UNCHANGED[name], -1))]
+    wanted, held = scene.natural.fibres, [name for name in INITIAL_VALUES if name in measured]
+    changed = [name for name in held if not np.allclose(measured[name], np.reshape(INITIAL_VALUES[name], -1))]
     if changed and wanted is None:
         rule = "set natural.fibres = true to start with them, or false to ignore them"
         raise SceneError(f"{key}: has {', '.join(changed)} of an earlier run; {rule}")
@@ -292,9 +297,9 @@ def _fibres_of(cells: Cells, region: str, corners: Array, chosen: Flags) -> dict
     return {name: values[rows] for name, values in file.measured.items()}
 
 
-def in_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Array:
-    """Return a fibre field at the points (elements, points, ...); `UNCHANGED` if absent."""
-    plain = np.asarray(UNCHANGED[name])
+def field_from_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Array:
+    """Return a fibre field at the points (elements, points, ...); `INITIAL_VALUES` if absent."""
+    plain = np.asarray(INITIAL_VALUES[name])
     found = np.tile(plain, (*quadrature.shape, *(1 for _ in plain.shape)))
     for region, measured in fibres.items():
         if name in measured:

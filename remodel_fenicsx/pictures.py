@@ -50,7 +50,7 @@ ANGLES = ("fibre_angle", ANGLE)  # fields in degrees, from 0 to 90
 # fields from which chains are drawn
 OF_TUBES = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)
 SHOWN_FIELDS = ("displacement", ANGLE, *OF_TUBES)
-NOTHING_KNOWN = "#999ea6"  # colour of points without a fibre angle
+NAN_COLOUR = "#999ea6"  # colour of points without a fibre angle
 LIFT = 0.03  # distance of chains above a face, which may be curved, over the width of the face
 LIGHT: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular": 0.0}
 
@@ -103,7 +103,7 @@ def add_body(
     """Add a grid to a plotter, with its chains if they were recorded."""
     looks: dict[str, Any] = {"scalars": name, "show_edges": True, "edge_color": "#777777", **LIGHT}
     if name in ANGLES:
-        looks |= {"cmap": list(ANGLE_COLOURS), "clim": (0, 90), "nan_color": NOTHING_KNOWN}
+        looks |= {"cmap": list(ANGLE_COLOURS), "clim": (0, 90), "nan_color": NAN_COLOUR}
     actor = plotter.add_mesh(body, **{**looks, **options})
     if with_chains and set(OF_TUBES) <= set(body.cell_data):
         plotter.add_mesh(chains(body), color=CHAIN_LOOK["colour"], **LIGHT)
@@ -222,7 +222,7 @@ def _drawn(job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], boun
 # ---------------------------------------------------------------- visible elements and view
 
 
-class Viewing(NamedTuple):
+class ViewOptions(NamedTuple):
     """View options of a picture: visible layers, cut and view direction."""
 
     layers: int | None = None
@@ -244,11 +244,11 @@ class Viewing(NamedTuple):
         return x, y, z
 
 
-def shown_elements(whole: WholeBody, viewing: Viewing) -> NDArray[np.bool_]:
+def visible_elements(whole: WholeBody, viewing: ViewOptions) -> NDArray[np.bool_]:
     """Return which elements are visible: neither peeled nor cut off, (elements,)."""
     layers, count = viewing.layers, len(whole.depth)
     if layers is not None and not 1 <= layers <= count:
-        start = whole.recording.scene.geometry.depth_in_words[1]
+        start = whole.recording.scene.geometry.depth_labels[1]
         rule = f"must be an integer from 1 to {count}, from the {start}"
         raise FigureError(f"layers {layers}: {rule}")
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
@@ -279,7 +279,7 @@ FRAME_TIME, LAST_TIME = 80, 1600  # ms per frame; multiples of 10, the unit of G
 def draw_picture(
     folder: str | os.PathLike[str],
     times: Sequence[float] | None,
-    viewing: Viewing,
+    viewing: ViewOptions,
     path: Path | None,
 ) -> Path:
     """Draw the body of a run at recorded times, next to each other."""
@@ -295,7 +295,7 @@ def draw_picture(
     return _draw(whole, [[*shown]], viewing, path, ".png")
 
 
-def draw_animation(folder: str | os.PathLike[str], frames: int, viewing: Viewing, path: Path | None) -> Path:
+def draw_animation(folder: str | os.PathLike[str], frames: int, viewing: ViewOptions, path: Path | None) -> Path:
     """Draw the body of a run over time."""
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
         rule = f"must be an integer from {FEWEST_FRAMES} to {MOST_FRAMES}"
@@ -321,10 +321,10 @@ def _body_for(folder: str | os.PathLike[str], path: Path | None, endings: Sequen
 
 
 def _draw(
-    whole: WholeBody, sheets: Sequence[Sequence[float]], viewing: Viewing, path: Path | None, ending: str
+    whole: WholeBody, sheets: Sequence[Sequence[float]], viewing: ViewOptions, path: Path | None, ending: str
 ) -> Path:
     """Draw sheets, each with some times, and write them to a new file."""
-    recording, scene, shown = whole.recording, whole.recording.scene, shown_elements(whole, viewing)
+    recording, scene, shown = whole.recording, whole.recording.scene, visible_elements(whole, viewing)
     if ANGLE not in recording.fields(sheets[0][0], {ANGLE}):
         raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)")
     drawn = [[(f"t = {t:g}", deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times] for times in sheets]

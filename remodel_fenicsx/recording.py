@@ -170,7 +170,7 @@ class Recording(RecordedRun):
         from remodel_fenicsx import pictures
 
         whole = pictures.WholeBody(self)
-        shown = pictures.shown_elements(whole, pictures.Viewing(layers, cut))
+        shown = pictures.visible_elements(whole, pictures.ViewOptions(layers, cut))
         if elements is not None:
             if np.shape(elements) != shown.shape:
                 rule = f"must be a mask of all {len(shown)}"
@@ -219,9 +219,9 @@ class Recording(RecordedRun):
         OSError
             If the file cannot be written.
         """
-        from remodel_fenicsx.pictures import Viewing, draw_picture
+        from remodel_fenicsx.pictures import ViewOptions, draw_picture
 
-        return draw_picture(self.path, times, Viewing(layers, cut, view), None if path is None else Path(path))
+        return draw_picture(self.path, times, ViewOptions(layers, cut, view), None if path is None else Path(path))
 
     def _time(self, time: float | None) -> float:
         """Return this time, or the last one by default."""

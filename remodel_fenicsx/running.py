@@ -20,8 +20,8 @@ from petsc4py import PETSc
 from remodel_fenicsx.evolution.stepper import Pause, Step, Watcher
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.fem.solver_methods import WORTH_RANKS
-from remodel_fenicsx.fem.assembly import agreed
+from remodel_fenicsx.fem.solver_methods import MIN_PARALLEL_UNKNOWNS
+from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.export import write_vtu
@@ -32,24 +32,24 @@ from remodel_fenicsx.results.run_folder import (
     RunFolder,
     check_before_resuming,
     chosen_folder,
-    forget_steps,
+    remove_partial_results,
     locked,
 )
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
-from remodel_fenicsx.scene.scene import COLUMNS_THAT_WENT, check_continuation, leaves
+from remodel_fenicsx.scene.scene import REMOVED_COLUMNS, check_continuation, leaves
 from remodel_fenicsx.schema.settings import in_region
-from remodel_fenicsx.schema.tables import shown
+from remodel_fenicsx.schema.tables import format_value
 from remodel_fenicsx.schema.text import read_toml
-from remodel_fenicsx.initial import checked_domain, mesh_of, with_choices
+from remodel_fenicsx.initial import checked_domain, mesh_of, resolve_auto_settings
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import NOTICE, interrupts
 from remodel_fenicsx.system.environment import check_extensions, versions
-from remodel_fenicsx.system.files import TakenError, part_of, read_regular
+from remodel_fenicsx.system.files import TakenError, partial_path, read_regular
 from remodel_fenicsx.system.children import LARGEST_FILE
-from remodel_fenicsx.system.terminal import Progress, announce, hold_log, open_log
+from remodel_fenicsx.system.terminal import Progress, announce, buffer_log, open_log
 from remodel_fenicsx.unloading import as_unloaded, unloaded
 
 log = logging.getLogger(__name__)
@@ -120,14 +120,14 @@ def run(
     # The simulation is built before anything is written.
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
     with interrupts.StopRequest() as stop, ExitStack() as body:
-        with hold_log(comm.rank, quiet=quiet) as held:
+        with buffer_log(comm.rank, quiet=quiet) as held:
             scene = body.enter_context(as_unloaded(scene, comm, quiet))
-            found = comm.bcast(agreed(comm, lambda: _kept_files(scene)[0] if comm.rank == 0 else {}))
+            found = comm.bcast(raise_on_all_ranks(comm, lambda: _files_to_store(scene)[0] if comm.rank == 0 else {}))
             # A file that is replaced after this point is refused, so the stored files are those
             # that are read.
             if sums := {key: value for key, value in found.items() if key.endswith("sha256")}:
                 scene = scene.with_values(sums)
-            simulation = body.enter_context(_built(scene, comm))
+            simulation = body.enter_context(_open_simulation(scene, comm))
             place = place or chosen_folder(None, scene.name, comm)
         with locked(place, comm, new=True):
             followers = [one if isinstance(one, Watcher) else one(simulation) for one in watchers]
@@ -147,16 +147,16 @@ def resume(
     interrupts.end_all_ranks_on_exception()
     place = Path(folder)
     with interrupts.StopRequest() as stop, locked(place, comm, new=False), ExitStack() as body:
-        with hold_log(comm.rank, quiet=quiet) as held:
-            scene, checkpoint = _kept(place, overrides, comm)
-            simulation = body.enter_context(_built(scene, comm))
+        with buffer_log(comm.rank, quiet=quiet) as held:
+            scene, checkpoint = _read_run(place, overrides, comm)
+            simulation = body.enter_context(_open_simulation(scene, comm))
             if comm.bcast(checkpoint is not None):
                 restore_state(simulation.state, checkpoint)
         _record(simulation, place, stop, held, quiet, deadline, report, resumes=True)
     return place
 
 
-def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
+def _read_run(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
     """Return scene, and checkpoint on rank 0, of a run to resume; raise errors on all ranks."""
 
     def read() -> tuple[Scene, Checkpoint | None]:
@@ -169,7 +169,7 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
             scene_as_run(place)
             raise
         checkpoint, values = read_checkpoint(place), read_toml(place / SCENE)
-        for name in set(values.get("output", {}).get("columns", ())) & set(COLUMNS_THAT_WENT):
+        for name in set(values.get("output", {}).get("columns", ())) & set(REMOVED_COLUMNS):
             log.warning("resumes without the column %s, which this version does not have", name)
         if checkpoint is None:
             log.info("no checkpoint: restarting at t = 0")
@@ -179,7 +179,7 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
             except (tomllib.TOMLDecodeError, RecursionError) as error:
                 raise CheckpointError(f"the checkpoint's scene is not TOML: {error}") from error
             check_continuation(scene_from_dict(before), scene, checkpoint.time)
-            _check_whole(values, before, place)
+            _check_complete(values, before, place)
             log.info("resumes from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
             begun = checkpoint.versions
         now = versions()
@@ -188,11 +188,11 @@ def _kept(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[S
                 log.warning("resumes with %s %s, but was started with %s", name, now.get(name), version)
         return scene, checkpoint
 
-    scene, checkpoint = agreed(comm, lambda: read() if comm.rank == 0 else (None, None))
+    scene, checkpoint = raise_on_all_ranks(comm, lambda: read() if comm.rank == 0 else (None, None))
     return comm.bcast(scene), checkpoint
 
 
-def _check_whole(values: dict[str, Any], before: dict[str, Any], place: Path) -> None:
+def _check_complete(values: dict[str, Any], before: dict[str, Any], place: Path) -> None:
     """Check that a recorded scene has all values: a truncated file could be valid with defaults."""
     had, has = (dict(leaves(scene, ("loads",))) for scene in (before, values))
     if lost := had.keys() - has.keys():
@@ -201,10 +201,10 @@ def _check_whole(values: dict[str, Any], before: dict[str, Any], place: Path) ->
 
 
 @contextmanager
-def _built(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
+def _open_simulation(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
     """Open a simulation and close it on exit, unless only some ranks have raised. Collective."""
     try:
-        with interrupts.stopping_at_once(), _options_blamed(scene):
+        with interrupts.raise_on_signal(), _petsc_errors_as_scene_errors(scene):
             simulation = Simulation(scene, comm)
     except interrupts.Interrupted as interruption:
         interruption.kept = "nothing was computed"
@@ -212,19 +212,19 @@ def _built(scene: Scene, comm: MPI.Intracomm) -> Iterator[Simulation]:
     try:
         yield simulation
     except BaseException as error:
-        if _is_everywhere(error, comm):
+        if _is_on_all_ranks(error, comm):
             simulation.close()
         raise
     simulation.close()
 
 
-def _is_everywhere(error: BaseException, comm: MPI.Intracomm) -> bool:
+def _is_on_all_ranks(error: BaseException, comm: MPI.Intracomm) -> bool:
     """Return whether all ranks have raised the error and may call collective functions."""
     return comm.size == 1 or getattr(error, "on_all_ranks", False)
 
 
 @contextmanager
-def _options_blamed(scene: Scene) -> Iterator[None]:
+def _petsc_errors_as_scene_errors(scene: Scene) -> Iterator[None]:
     """Raise PETSc errors as a SceneError on solver.petsc_options, if the scene sets any."""
     try:
         yield
@@ -232,7 +232,7 @@ def _options_blamed(scene: Scene) -> Iterator[None]:
         if not (given := scene.solver.petsc_options):
             raise
         rule = f"PETSc rejects them (error {error.ierr}); must be options of its manual pages"
-        raise SceneError(f"solver.petsc_options = {shown(given)}: {rule}") from error
+        raise SceneError(f"solver.petsc_options = {format_value(given)}: {rule}") from error
 
 
 def _record(
@@ -251,29 +251,29 @@ def _record(
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
-    scene, files = agreed(comm, lambda: with_files_kept(scene) if comm.rank == 0 else (scene, {}))
+    scene, files = raise_on_all_ranks(comm, lambda: with_stored_files(scene) if comm.rank == 0 else (scene, {}))
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     wants_report = report and scene.output.report and comm.rank == 0
-    after = LastStep(columns, state.number, state.time, COLUMNS_THAT_WENT) if state.number else None
+    after = LastStep(columns, state.number, state.time, REMOVED_COLUMNS) if state.number else None
     if resumes:
         wanted = bool(scene.output.fields)
-        agreed(comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None)
+        raise_on_all_ranks(comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None)
         if after is None and comm.rank == 0:
-            forget_steps(place)
+            remove_partial_results(place)
     with ExitStack() as stack:
         record = stack.enter_context(
-            agreed(comm, lambda: RunFolder(place, text, comm.rank, after, {} if resumes else files))
+            raise_on_all_ranks(comm, lambda: RunFolder(place, text, comm.rank, after, {} if resumes else files))
         )
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
-        steps = scene.time.number_of_steps if scene.time.chooses else state.number + len(simulation.way.remaining())
+        steps = scene.time.number_of_steps if scene.time.is_adaptive else state.number + len(simulation.way.remaining())
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
         ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"
         log.info(BEGUN + "%s on %s, results in %s", scene.name, ranks, place)
         log.info("%s", scene.summary())
         unknowns = simulation.unknown.x.petsc_vec.getSize()
-        if comm.size > 1 and unknowns < WORTH_RANKS:
+        if comm.size > 1 and unknowns < MIN_PARALLEL_UNKNOWNS:
             log.info("%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)", unknowns, comm.size)
         # This scene has the paths of its files; `scene` has their names in the run's folder.
         for warning in simulation.scene.warnings(simulation.domain):
@@ -283,16 +283,16 @@ def _record(
             names = field_names(scene.output.fields, scene.lacking_fields, scene.geometry.constant_fields)
             parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
             times = scene.output.times
-            fields = stack.enter_context(agreed(comm, lambda: Fields(*parts, times)))
+            fields = stack.enter_context(raise_on_all_ranks(comm, lambda: Fields(*parts, times)))
             followers, kept = [*followers, fields], [*kept, fields.close]
         checkpoints = Checkpoints(place, state, text, scene.output.checkpoint, kept)
         pause = Pause(comm, place, lambda: stop.pause, deadline)
-        followers += [record, _Report(scene, progress), checkpoints, pause]
-        leave_report = partial(_leave_report, place) if wants_report else lambda: None
+        followers += [record, _StepLog(scene, progress), checkpoints, pause]
+        leave_report = partial(_try_report, place) if wants_report else lambda: None
         simulation.state.tell = progress.show
         simulation.state.stop_signal = lambda: stop.number
         try:
-            with _options_blamed(scene):
+            with _petsc_errors_as_scene_errors(scene):
                 for _ in simulation.steps(followers):
                     pass
         except (StepFailure, interrupts.Interrupted, interrupts.Paused) as reason:
@@ -301,7 +301,7 @@ def _record(
                 reason.kept += ", and run --resume continues from there"
             else:
                 log.info(STOPPED + "%s", reason)
-            if _is_everywhere(reason, comm):
+            if _is_on_all_ranks(reason, comm):
                 checkpoints.write()
             # Interrupted and paused runs must end soon, without a report.
             if not isinstance(reason, (interrupts.Interrupted, interrupts.Paused)):
@@ -315,13 +315,13 @@ def _record(
         leave_report()
 
 
-def with_files_kept(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
+def with_stored_files(scene: Scene) -> tuple[Scene, dict[str, bytes]]:
     """Return the scene with file names relative to the run folder and SHA-256, and these files."""
-    changes, files = _kept_files(scene)
+    changes, files = _files_to_store(scene)
     return scene.with_values(changes) if changes else scene, files
 
 
-def _kept_files(scene: Scene) -> tuple[dict[str, object], dict[str, bytes]]:
+def _files_to_store(scene: Scene) -> tuple[dict[str, object], dict[str, bytes]]:
     changes, files = scene.geometry.kept_files()
     for region, cells in scene.measured_cells.items():
         key, path = f"{in_region(region)}cells.fibres", Path(cells.fibres or "")
@@ -337,7 +337,7 @@ def _kept_files(scene: Scene) -> tuple[dict[str, object], dict[str, bytes]]:
     return changes, files
 
 
-def _leave_report(place: Path) -> None:
+def _try_report(place: Path) -> None:
     """Write the page of the run. Log a warning if that fails: the results are complete."""
     from remodel_fenicsx.report import REPORT, write_report
 
@@ -351,7 +351,7 @@ def _leave_report(place: Path) -> None:
             announce(f"WARNING: {words}")
 
 
-class _Report(Watcher):
+class _StepLog(Watcher):
     """Watcher that writes each accepted step to the log and the terminal."""
 
     def __init__(self, scene: Scene, progress: Progress):
@@ -365,7 +365,7 @@ class _Report(Watcher):
             log.log(NOTICE, "time %g solved in %d substeps", step.time, parts)
         loads = [f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row]
         state = ", ".join([f"t = {step.time:g}", *loads, f"{step.work.newton_iterations} Newton"])
-        count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.chooses else None
+        count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.is_adaptive else None
         self.progress.step(self.time.progress(step.number, step.time), state, count)
 
 
@@ -375,13 +375,13 @@ class _Report(Watcher):
 
 def write_unloaded(scene: Scene, folder: Path) -> None:
     """Write scene.toml of the unloaded body, and its mesh if it has one, into a new folder."""
-    part = part_of(folder)
-    with RunLock(part), hold_log(quiet=False):
+    part = partial_path(folder)
+    with RunLock(part), buffer_log(quiet=False):
         try:
             if folder.exists():
                 raise TakenError(folder, "folder")
             with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
-                kept, files = with_files_kept(unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False))
+                kept, files = with_stored_files(unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False))
             for name, data in files.items():
                 (part / name).write_bytes(data)
             (part / SCENE).write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
@@ -393,10 +393,10 @@ def write_unloaded(scene: Scene, folder: Path) -> None:
 
 def write_axes(scene: Scene, path: Path) -> str:
     """Write local axes, depth, station and thickness by element; describe them. Collective."""
-    scene = with_choices(scene)
+    scene = resolve_auto_settings(scene)
     domain, shape = checked_domain(mesh_of(scene, MPI.COMM_WORLD), scene), scene.geometry
     mesh = domain.mesh
-    weight = KINEMATICS[scene.model.kinematics].on(mesh, shape).weight(mesh)
+    weight = KINEMATICS[scene.model.kinematics].for_mesh(mesh, shape).weight(mesh)
     quadrature = Quadrature(mesh, scene.mesh.degree, weight)
     local_axes = shape.local_axes(domain, quadrature)
     fields = local_fields(local_axes, quadrature) | {"region": domain.element_region.astype(np.int64)}

@@ -12,15 +12,15 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import LoadValues, values_of_loads
-from remodel_fenicsx.evolution.coupling import Maker
+from remodel_fenicsx.evolution.coupling import CouplingFactory
 from remodel_fenicsx.evolution.stepper import FixedSteps, Step, Stepper, Watcher, Way
 from remodel_fenicsx.fem.kinematics import NaturalConfiguration
-from remodel_fenicsx.initial import in_files, initial_states, measured_fibres, meshed, natural_gradient
+from remodel_fenicsx.initial import field_from_files, initial_states, measured_fibres, meshed, natural_gradient
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Remodeling, Solver
 from remodel_fenicsx.state import Snapshot, parameters_of
-from remodel_fenicsx.system.interrupts import take_back_signals
+from remodel_fenicsx.system.interrupts import restore_signal_handlers
 from remodel_fenicsx.watch import WATCHERS
 from remodel_fenicsx.watch.stability import EquilibriumStability
 
@@ -80,13 +80,13 @@ class Simulation:
         scene: Scene,
         comm: MPI.Intracomm = MPI.COMM_WORLD,
         domain: Domain | None = None,
-        coupling: Maker | None = None,
+        coupling: CouplingFactory | None = None,
     ):
         if not isinstance(scene, Scene):
             raise TypeError(
                 f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
             )
-        take_back_signals()
+        restore_signal_handlers()
         parts = build(scene, comm, domain, coupling)
         self.scene, self.domain = parts.scene, parts.domain
         self.stepper, self.observer = parts.stepper, parts.observer
@@ -139,7 +139,7 @@ class Simulation:
 
 
 @dataclass(frozen=True)
-class Parts:
+class SimulationParts:
     """Components of a simulation: resolved scene, mesh, stepper, observer and time stepping."""
 
     scene: Scene
@@ -149,7 +149,9 @@ class Parts:
     way: Way  # `FixedSteps`, `StepControl` or `Homeostasis`
 
 
-def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: Maker | None = None) -> Parts:
+def build(
+    scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: CouplingFactory | None = None
+) -> SimulationParts:
     """Build the components of a scene in their order. Collective."""
     scene, domain = meshed(scene, comm, domain)
     fibres = measured_fibres(scene, domain)
@@ -160,14 +162,14 @@ def build(scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupl
     solver, (first, *more) = _solver(scene), (partial(values_of_loads, case.loads) for case in scene.each_case())
     stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, first, coupling, kappa)
     for process in stepper.remodels:
-        process.begin_with(partial(in_files, fibres, quadrature=state.cells.quadrature, domain=domain))
+        process.set_initial(partial(field_from_files, fibres, quadrature=state.cells.quadrature, domain=domain))
     if others:
         from remodel_fenicsx.evolution import load_cases
 
         load_cases.join(stepper, others, more, [case.weight for case in scene.cases], solver, kappa)
     way = _way(scene, stepper)
-    estimated = [TIME_ERROR] if scene.time.chooses and TIME_ERROR not in scene.output.columns else []
-    return Parts(scene, domain, stepper, Observer(scene.geometry, stepper, scene.columns(estimated)), way)
+    estimated = [TIME_ERROR] if scene.time.is_adaptive and TIME_ERROR not in scene.output.columns else []
+    return SimulationParts(scene, domain, stepper, Observer(scene.geometry, stepper, scene.columns(estimated)), way)
 
 
 def _solver(scene: Scene) -> Solver:
@@ -182,7 +184,7 @@ def _solver(scene: Scene) -> Solver:
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
     """Return the remodeling settings; the path to a steady state with random cells is relaxed."""
     # No step is small enough to resolve changes of order of random cells, and passes oscillate.
-    if not (scene.time.is_equilibrium and scene.has_random_cells and scene.jumps_by_rank):
+    if not (scene.time.is_equilibrium and scene.has_random_cells and scene.has_order_jumps):
         return scene.remodeling
     if comm.rank == 0:
         log.info("the path to the equilibrium takes the coupling 'relaxed': random cells oscillate")
@@ -192,26 +194,26 @@ def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
 def _way(scene: Scene, stepper: Stepper) -> Way:
     """Return the time stepping: constant steps, adaptive steps, or steps to the steady state."""
     time, stops = scene.time, scene.stops()
-    if not (time.is_equilibrium or time.chooses or TIME_ERROR in scene.output.columns):
+    if not (time.is_equilibrium or time.is_adaptive or TIME_ERROR in scene.output.columns):
         return FixedSteps(stepper, time.end, time.step)
     from remodel_fenicsx.evolution.time_steps import StepControl, TimeError
 
-    if time.chooses and time.tolerance is not None:
+    if time.is_adaptive and time.tolerance is not None:
         return StepControl(stepper, time.tolerance, time.step, stops)
     if not time.is_equilibrium:
         return FixedSteps(stepper, time.end, time.step, TimeError(stepper).measure)
     from remodel_fenicsx.evolution import homeostasis
 
-    falls = any(load.falls for load in scene.loads.values())
+    falls = any(load.decreases for load in scene.loads.values())
     tolerance = time.tolerance or (homeostasis.UNLOADING if falls else homeostasis.PATH_TOLERANCE)
-    if scene.has_random_cells and scene.jumps_by_rank:
-        tolerance = homeostasis.UNCHECKED
+    if scene.has_random_cells and scene.has_order_jumps:
+        tolerance = homeostasis.NO_ERROR_CONTROL
     held_from, before = max(stops[:-1], default=0.0), scene.hold_before_change
     plan = homeostasis.PathToRest(scene.last_time, stops, time.step, tolerance, held_from, before)
     return homeostasis.Homeostasis(stepper, plan)
 
 
-def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
+def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
     """Return the watchers in order: eigenvalues before the row, warnings after the row."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
@@ -225,7 +227,7 @@ def watchers(scene: Scene, parts: Parts) -> list[Watcher]:
     return [watcher for watcher in candidates if watcher is not None]
 
 
-def begin_again(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
+def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
     """Reset a simulation with new numbers of its scene; return False if it must be rebuilt."""
     # The numbers are those of tissue, kappa, loads and opening angle.
     tissue, kappa = parameters_of(scene.properties(), simulation.domain)

@@ -13,17 +13,18 @@ import dolfinx.fem
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body.domain import Domain, dof_of_node
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.fem import assembly, jit
-from remodel_fenicsx.fem.assembly import Remembered
+from remodel_fenicsx.fem.assembly import CachedValue
 from remodel_fenicsx.fem.formulations import FORMULATIONS, Formulation
 from remodel_fenicsx.fem.kinematics import Kinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels import PointKernels, point_kernels, with_kernels
-from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_of, structure_tensors
+from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_from_tensors, structure_tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import MATRICES, TURNED_OVER, Tissue, mixed
+from remodel_fenicsx.model.energy import MATRICES, TURNED_OVER, Tissue, mixture_matrix
 from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS, Properties
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ Array = NDArray[np.float64]
 # ---------------------------------------------------------------- unit cells at quadrature points
 
 
+@with_old_names
 class CellField:
     """Cell dimensions and axes as quadrature functions.
 
@@ -58,7 +60,7 @@ class CellField:
         self.point_cells = UnitCell(self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3))
 
     @property
-    def ufl_cell(self) -> UnitCell:
+    def symbolic_cell(self) -> UnitCell:
         """Unit cell of the functions, for UFL forms."""
         return UnitCell(self.dimensions, self.axes)
 
@@ -164,7 +166,7 @@ class UnitCells(CellField):
         """Set cells of chosen elements from measured fibres; `axes` replace undetermined axes."""
         at_points = {name: values[:, None, :] for name, values in measured.items()}
         tensors = np.broadcast_to(structure_tensors(at_points, self.local_axes.axes[chosen]), axes.shape)
-        self.dimension_values[chosen], self.axis_values[chosen] = cells_of(tensors, length, axes)
+        self.dimension_values[chosen], self.axis_values[chosen] = cells_from_tensors(tensors, length, axes)
 
     def initial_axes(self) -> Array:
         """Return the initial axes n_I as rows, (elements, points, 3, 3)."""
@@ -186,6 +188,7 @@ class Snapshot:
     others: tuple[Snapshot, ...] = ()
 
 
+@with_old_names
 class State:
     """State of a simulation: unknowns, unit cells, loads and time.
 
@@ -246,24 +249,24 @@ class State:
     ):
         self.unknown, self.kinematics = unknown, kinematics
         self.cells, self.loading = cells, loading
-        self.dilatation = formulation.on(kinematics, unknown, cells.quadrature)
+        self.dilatation = formulation.discretise(kinematics, unknown, cells.quadrature)
         F = kinematics.deformation_gradient(unknown)
         # G, if the mesh is not stress-free, and its initial value, if the body grows.
         self._natural = getattr(kinematics, "gradient", None)
         self._initial = getattr(kinematics, "initial", None)
         self._deformation_gradient = jit.expression(F, cells.quadrature.points)
-        self._cached_gradient: Remembered[Array] = Remembered(None, F)
+        self._cached_gradient: CachedValue[Array] = CachedValue(None, F)
         F_e = kinematics.elastic_gradient(unknown)
-        self._cached_elastic_gradient: Remembered[Array] = Remembered(None, F_e)
+        self._cached_elastic_gradient: CachedValue[Array] = CachedValue(None, F_e)
         self.equilibrium_cells = CellField(cells.quadrature, "equilibrium_cell")
-        self.others: Sequence[State] = ()
+        self.other_cases: Sequence[State] = ()
         self.weights: Sequence[float] = (1.0,)
         self.label = ""  # prefix of log lines with several load cases
         # Called on each rank in every solve: returns the signal (SIGINT, SIGTERM) that should end
         # it, or 0.
         self.stop_signal: Callable[[], int] = lambda: 0
         self.tell: Callable[[str], object] = lambda words: None  # shows the progress of substeps
-        self.settle_cells()
+        self.mark_cells_in_equilibrium()
         solved = self.equilibrium_cells
         self._functions: dict[str, dolfinx.fem.Function] = {}
         self._arrays: dict[str, NDArray[np.float64]] = {}  # the functions' own memory
@@ -403,13 +406,13 @@ class State:
         weights
             Weights of all load cases, this state's first.
         """
-        self.others, self.weights = list(others), tuple(weights)
+        self.other_cases, self.weights = list(others), tuple(weights)
 
     def each_case(self) -> dict[str, State]:
         """Return the states of all load cases by suffix: "" for this state, then "@2", ..."""
-        return {"": self} | {f"@{number}": case for number, case in enumerate(self.others, start=2)}
+        return {"": self} | {f"@{number}": case for number, case in enumerate(self.other_cases, start=2)}
 
-    def reach(self, time: float, number: int) -> None:
+    def complete_step(self, time: float, number: int) -> None:
         """Set time and number of a completed step in all load cases.
 
         Parameters
@@ -450,14 +453,14 @@ class State:
         if count is not None:
             self.counts[function.name] = count
 
-    def settle_cells(self) -> None:
+    def mark_cells_in_equilibrium(self) -> None:
         """Mark the present cells as those with which the unknowns are in equilibrium."""
         self.equilibrium_cells.set(self.cells.dimension_values, self.cells.axis_values)
 
     def snapshot(self) -> Snapshot:
         """Return a copy of all values."""
         arrays = {name: array.copy() for name, array in self._arrays.items()}
-        others = tuple(case.snapshot() for case in self.others)
+        others = tuple(case.snapshot() for case in self.other_cases)
         return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers), others)
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -473,7 +476,7 @@ class State:
         self.loading.set(snapshot.loads)
         self.time, self.number = snapshot.time, snapshot.number
         self.numbers = dict(snapshot.numbers)
-        for case, values in zip(self.others, snapshot.others, strict=True):
+        for case, values in zip(self.other_cases, snapshot.others, strict=True):
             case.restore(values)
 
     @contextmanager
@@ -500,7 +503,7 @@ class State:
 # They are functions and numbers of the state, so that resumed runs have them too.
 
 
-class Numbers:
+class StateNumbers:
     """Numbers of the state with a prefix; transactions restore them, checkpoints contain them."""
 
     def __init__(self, state: State, name: str, initial: Mapping[str, float]):
@@ -522,7 +525,7 @@ class Numbers:
             self[key] = value
 
 
-class Earlier:
+class FieldHistory:
     """Last values of a field, stored as functions of the state."""
 
     def __init__(
@@ -539,7 +542,7 @@ class Earlier:
             state.remember(function, f"{name}_known")
             self._functions.append(function)
         self._arrays: list[Array] = [function.x.array for function in self._functions]
-        self._numbers = Numbers(state, name, {"known": 0})
+        self._numbers = StateNumbers(state, name, {"known": 0})
 
     @property
     def known(self) -> int:
@@ -574,7 +577,7 @@ class Earlier:
 # Numbers and arrays are recomputed only if a parameter has changed.
 
 
-def at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
+def tissue_at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
     """Return a tissue with parameters as arrays over the points, (elements * points,)."""
     return tissue.map(lambda name, value: assembly.point_values(value, quadrature).reshape(-1))
 
@@ -587,7 +590,7 @@ def stress_rounding(numbers: Tissue, max_chain_extension: float) -> float:
     return float(np.finfo(np.float64).eps * numbers.stiffness(length))
 
 
-def by_region(domain: Domain, values: Mapping[str, float]) -> dolfinx.fem.Function:
+def region_function(domain: Domain, values: Mapping[str, float]) -> dolfinx.fem.Function:
     """Return a DG0 Function with values by region name; "" is the value of all other regions."""
     function = dolfinx.fem.Function(dolfinx.fem.functionspace(domain.mesh, ("DG", 0)))
     dofmap = function.function_space.dofmap
@@ -617,8 +620,8 @@ class Parameters:
         )
         self.compiled = with_kernels(self.tissue, mesh.comm)
         values = list(self.tissue.parameters.values())
-        self._largest: Remembered[Tissue] = Remembered(quadrature.mesh.comm, *values)
-        self._at_points: Remembered[Tissue] = Remembered(None, *values)
+        self._largest: CachedValue[Tissue] = CachedValue(quadrature.mesh.comm, *values)
+        self._at_points: CachedValue[Tissue] = CachedValue(None, *values)
 
     def largest(self) -> Tissue:
         """Return the tissue with the largest value of each parameter in the body. Collective."""
@@ -637,7 +640,7 @@ class Parameters:
 
     def at_points(self) -> Tissue:
         """Return the tissue with parameters at points, (elements * points,), cached; read-only."""
-        return self._at_points(lambda: at_points(self.compiled, self.quadrature))
+        return self._at_points(lambda: tissue_at_points(self.compiled, self.quadrature))
 
     def locking_length(self) -> Array:
         """Return the length at which chains lock, (elements, points); infinite without locking."""
@@ -650,7 +653,7 @@ class Parameters:
         """Return whether points have chains, (elements, points)."""
         return np.asarray(self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
 
-    def where_chains(self, values: Array) -> Array:
+    def nan_without_chains(self, values: Array) -> Array:
         """Return values (elements, points) with NaN at points without chains."""
         return np.where(self.has_chains(), values, np.nan)
 
@@ -658,7 +661,7 @@ class Parameters:
 # ---------------------------------------------------------------- the tissue of regions
 # Contour length at points without chains, in link lengths; infinity would give NaN as a factor of
 # zero.
-NEVER_LOCKED = 1e12
+CONTOUR_LENGTH_WITHOUT_CHAINS = 1e12
 
 
 def parameters_of(
@@ -669,8 +672,10 @@ def parameters_of(
     tissues, kappas = _tissues(properties), {name: region.kappa for name, region in properties.items()}
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
     if any(region_tissue != tissue for region_tissue in tissues.values()):
-        tissue = tissue.map(lambda key, _: by_region(domain, {name: t.parameters[key] for name, t in tissues.items()}))
-    return tissue, kappa if len(set(kappas.values())) == 1 else by_region(domain, kappas)
+        tissue = tissue.map(
+            lambda key, _: region_function(domain, {name: t.parameters[key] for name, t in tissues.items()})
+        )
+    return tissue, kappa if len(set(kappas.values())) == 1 else region_function(domain, kappas)
 
 
 def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
@@ -681,7 +686,7 @@ def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
     matrices = list(dict.fromkeys(region.material.matrix for region in properties.values()))
     for name, tissue in tissues.items():
         if chain is not None and tissue.chain is None:
-            length = NEVER_LOCKED if chain.locks else tissue.contour_length
+            length = CONTOUR_LENGTH_WITHOUT_CHAINS if chain.locks else tissue.contour_length
             tissues[name] = replace(tissue, chain=chain, contour_length=length)
     return tissues if len(matrices) == 1 else _with_one_matrix(tissues, properties, matrices)
 
@@ -689,11 +694,11 @@ def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
 def _with_one_matrix(
     tissues: Mapping[str, Tissue], properties: Mapping[str, Properties], matrices: Sequence[str]
 ) -> dict[str, Tissue]:
-    mixture = mixed([MATRICES[name] for name in matrices])  # type: ignore[misc]  # see rules.tissue_of_regions
+    mixture = mixture_matrix([MATRICES[name] for name in matrices])  # type: ignore[misc]  # see rules.tissue_of_regions
     defaults = {name: number.default for name, number in mixture.parameters.items()}
     mixtures = {}
     for name, tissue in tissues.items():
         weight = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
         own = getattr(tissue.matrix, "values", {})
-        mixtures[name] = replace(tissue, matrix=mixture.of({**defaults, **own, **weight}))
+        mixtures[name] = replace(tissue, matrix=mixture.with_parameters({**defaults, **own, **weight}))
     return mixtures

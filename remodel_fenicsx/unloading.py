@@ -20,14 +20,14 @@ from remodel_fenicsx.body.mesh_faces import FaceError, jacobian_determinants
 from remodel_fenicsx.body.mesh_file import MeshFile, gmsh_text
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.body.wall import RoundWall
-from remodel_fenicsx.model.residual_stress import Loads, closing
-from remodel_fenicsx.fem.assembly import agreed
+from remodel_fenicsx.model.residual_stress import Loads, close_ring
+from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.scene.scene import Scene, SceneError, too_soft
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.system import NOTICE
-from remodel_fenicsx.system.terminal import Line, unsaid
+from remodel_fenicsx.system.terminal import Line, muted_warnings
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ def as_unloaded(scene: Scene, comm: MPI.Intracomm, quiet: bool = True) -> Iterat
     if not scene.geometry.is_loaded:
         yield scene
         return
-    for line in scene.turned_away() if comm.rank == 0 else ():
+    for line in scene.loaded_shape_warnings() if comm.rank == 0 else ():
         log.warning("%s", line)
     with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
         yield unloaded(scene, comm, comm.bcast(Path(folder)), quiet)
@@ -105,7 +105,7 @@ Array = NDArray[np.float64]
 Said = Callable[[str], object]
 
 LEAST_SHARE = 1 / 16  # smallest load increment, as a fraction of the loads
-MOST_LOADINGS = 30  # forward runs per load increment
+MAX_FORWARD_RUNS = 30  # forward runs per load increment
 ON_THE_WAY = 0.01  # relative tolerance of dimensions at intermediate load factors
 REFUSALS = (ArithmeticError, FaceError, StepFailure, SceneError)
 
@@ -140,7 +140,7 @@ def found_unloaded(
         words = f", last error {np.abs(found).max():.0e}"
         return found
 
-    how: dict[str, Any] = {"alpha": scale, "line_search": None, "maxiter": MOST_LOADINGS}
+    how: dict[str, Any] = {"alpha": scale, "line_search": None, "maxiter": MAX_FORWARD_RUNS}
     done, step = 0.0, 1.0
     change: Any = 0.0  # correction of `start` per unit of the load factor
     while done < 1.0:
@@ -150,7 +150,7 @@ def found_unloaded(
             change = (broyden1(error, first + share * change, f_tol=nearly, **how) - first) / share
             done = share
         except (*REFUSALS, NoConvergence) as refusal:
-            reason = f"no convergence in {MOST_LOADINGS} iterations{words}"
+            reason = f"no convergence in {MAX_FORWARD_RUNS} iterations{words}"
             if not isinstance(refusal, NoConvergence):
                 reason = " ".join(str(refusal).split())
             log.info("unloading at %g %% of the loads failed (%s); using smaller load increments", 100 * share, reason)
@@ -171,7 +171,7 @@ def found_unloaded(
 # elastostatics of one radius (`model.residual_stress.closing`), where loaded dimensions change
 # about as the unloaded ones do.
 
-LOADED_AGAIN = 1e-9  # relative tolerance of the loaded dimensions
+GEOMETRY_TOLERANCE = 1e-9  # relative tolerance of the loaded dimensions
 LOAD_STEPS = 10  # steps of a forward run to the end of the ramps
 # Settings without remodeling. Keys that belong to a law get their defaults.
 PASSIVE: dict[str, object] = {
@@ -187,13 +187,15 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
     given = np.array([shape.inner_radius, *inside, shape.outer_radius, shape.length])
 
     def missed(numbers: Array, share: float) -> Array:
-        return np.log(given / _loaded(scene, comm, np.exp(numbers), share))
+        return np.log(given / _load_forward(scene, comm, np.exp(numbers), share))
 
-    numbers, runs = found_unloaded(lambda share: np.log(_inverse(scene, given, share)), missed, LOADED_AGAIN, said)
+    numbers, runs = found_unloaded(
+        lambda share: np.log(_inverse_elastostatics(scene, given, share)), missed, GEOMETRY_TOLERANCE, said
+    )
     found = np.exp(numbers)
     unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
     log.log(NOTICE, "unloaded: %s; under the loads: %s (%d runs)", unloaded, loaded, runs)
-    return _with_numbers(scene, found)
+    return _with_dimensions(scene, found)
 
 
 def _outer_radii(scene: Scene) -> dict[str, float]:
@@ -202,18 +204,18 @@ def _outer_radii(scene: Scene) -> dict[str, float]:
     return dict(sorted(said.items(), key=lambda item: item[1]))
 
 
-def _inverse(scene: Scene, given: Array, share: float) -> Array:
+def _inverse_elastostatics(scene: Scene, given: Array, share: float) -> Array:
     """Return unloaded radii and length of a stress-free tube by inverse elastostatics."""
     tissues = {name: properties.tissue for name, properties in scene.properties().items()}
     layers = scene.geometry.layers_of_tissue(Natural(), scene.regions, tissues)
     end = scene.end_of_ramps
     loads = {name: load.value * load.factor(end) * share for name, load in scene.loads.items()}
     axial = 1.0 + loads.get("elongation", 0.0)
-    radii = closing(layers, 0.0, Loads(loads.get("pressure", 0.0), None, axial)).natural_radius(given[:-1])
+    radii = close_ring(layers, 0.0, Loads(loads.get("pressure", 0.0), None, axial)).natural_radius(given[:-1])
     return np.append(radii, given[-1] / axial)
 
 
-def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
+def _load_forward(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
     """Return radii and length of a forward run at a load factor. Collective."""
     end = scene.end_of_ramps or 1.0
     changes: dict[str, object] = {"output.columns": [], "output.times": [], "output.fields": False}
@@ -221,13 +223,13 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
         changes |= PASSIVE | {"time.end": end, "time.step": end / LOAD_STEPS}
     else:
         changes |= {"time.end": EQUILIBRIUM}
-    changes |= {"solver.relative_tolerance": min(scene.solver.relative_tolerance, LOADED_AGAIN / 10)}
+    changes |= {"solver.relative_tolerance": min(scene.solver.relative_tolerance, GEOMETRY_TOLERANCE / 10)}
     for name, load in scene.loads.items():
         changes |= {f"loads.{name}.value": load.value * load.factor(end) * share}
         changes |= {f"loads.{name}.ramp": [[0.0, 0.0], [end, 1.0]]}
     with (
-        unsaid(),
-        contextlib.closing(Simulation(_with_numbers(scene, numbers).with_values(changes), comm)) as simulation,
+        muted_warnings(),
+        contextlib.closing(Simulation(_with_dimensions(scene, numbers).with_values(changes), comm)) as simulation,
     ):
         simulation.watchers = [simulation.observer]
         row = [step.row for step in simulation.steps()][-1]
@@ -241,7 +243,7 @@ def _loaded(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> 
     return np.append(found, numbers[-1] * (1 + row["axial_elongation"]))
 
 
-def _with_numbers(scene: Scene, numbers: Array) -> Scene:
+def _with_dimensions(scene: Scene, numbers: Array) -> Scene:
     """Return the scene of an unloaded tube with these radii (inner to outer) and length."""
     changes: dict[str, object] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
     changes |= {"geometry.inner_radius": float(numbers[0]), "geometry.outer_radius": float(numbers[-2])}
@@ -257,25 +259,25 @@ def _with_numbers(scene: Scene, numbers: Array) -> Scene:
 # step of that body.
 
 UNLOADED_MESH = "unloaded.msh"
-LEAST_MOVE = 1e-10  # largest distance of a node from its measured position, over the body's extent
+UPDATE_TOLERANCE = 1e-10  # largest distance of a node from its measured position, over the body's extent
 
 
 def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -> Scene:
     """Return the scene of the unloaded body and write its mesh into the folder. Collective."""
     shape: Any = scene.geometry
-    file, regions = agreed(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
+    file, regions = raise_on_all_ranks(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
     given: Array = comm.bcast(None if file is None else file.points)
     extent, as_unloaded = float(np.ptp(given, axis=0).max()), scene.with_values({"geometry.is": "unloaded"})
 
     def missed(places: Array, share: float) -> Array:
         moved: Any = file and replace(file, points=places)
-        if not comm.bcast(moved is None or _is_whole(moved)):
+        if not comm.bcast(moved is None or _has_valid_elements(moved)):
             raise ArithmeticError("inverted elements")
         domain = shared(lambda: (moved, shape.boundary(moved), regions or {}), comm)
-        with unsaid(), contextlib.closing(Simulation(as_unloaded, comm, domain)) as simulation:
+        with muted_warnings(), contextlib.closing(Simulation(as_unloaded, comm, domain)) as simulation:
             return np.divide(_missed(simulation, given, share), extent, dtype=np.float64)
 
-    places, runs = found_unloaded(lambda _: given, missed, LEAST_MOVE, said, extent)
+    places, runs = found_unloaded(lambda _: given, missed, UPDATE_TOLERANCE, said, extent)
     path = folder / UNLOADED_MESH
     if file is not None:
         path.write_text(gmsh_text(places, file.blocks, file.names), encoding="ascii")
@@ -302,7 +304,7 @@ def _read(scene: Scene) -> tuple[MeshFile, dict[str, int]]:
     return file, regions
 
 
-def _is_whole(file: MeshFile) -> bool:
+def _has_valid_elements(file: MeshFile) -> bool:
     """Return whether no element is inverted."""
     determinants = jacobian_determinants(file)
     return bool((determinants * np.sign(determinants.mean()) > 0).all())

@@ -33,7 +33,7 @@ def write_tube(
 ) -> Path:
     """A tube about z as a file with named faces, perhaps turned and shifted, or its places (n, 3) moved at will."""
     around, through, along = counts
-    wall = Wall.of(*RADII, through, {})
+    wall = Wall.from_regions(*RADII, through, {})
     with gmsh_model("tube") as gmsh:
         draw_tube(wall, length, (around, along), element, degree)
         for dimension, tag in gmsh.model.getPhysicalGroups(2):

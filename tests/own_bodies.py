@@ -12,7 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import Domain, build_domain, symbolic_mesh
-from remodel_fenicsx.body.axes import found_axes
+from remodel_fenicsx.body.axes import compute_local_axes
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import LocalAxes
 
@@ -174,7 +174,7 @@ def fork(half_angle: float, size: float, radius: float = 1.0, wall: float = 0.4,
 def found(domain: Domain, degree: int = 1) -> tuple[LocalAxes, Quadrature]:
     """Local axes of a mesh, and the points."""
     quadrature = Quadrature(domain.mesh, degree)
-    return found_axes(domain, quadrature), quadrature
+    return compute_local_axes(domain, quadrature), quadrature
 
 
 def apart(one: Array, other: Array) -> Array:

@@ -40,8 +40,8 @@ MATRICES["gasser-ogden-holzapfel"] = Matrix(
     *neo_hookean.others,
     families,
     parameters={
-        "fibre_stiffness": Parameter(5.0, "k1, in the unit of stress.", above=0),
-        "fibre_exponent": Parameter(15.0, "k2.", above=0),
+        "fibre_stiffness": Parameter(5.0, "k1, in the unit of stress.", exclusive_minimum=0),
+        "fibre_exponent": Parameter(15.0, "k2.", exclusive_minimum=0),
         "family_angle": Parameter(40.0, "Of each family to the circumference, in degrees."),
         "dispersion": Parameter(0.1, "kappa: 0 for one direction, 1/3 for all."),
     },

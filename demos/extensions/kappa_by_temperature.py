@@ -28,6 +28,8 @@ LAWS["arrhenius"] = replace(
     speed=arrhenius,
     parameters={
         "activation_energy": Parameter(50e3, "E, in J/mol."),
-        "reference_temperature": Parameter(310.0, "Temperature theta_0 at which kappa is as given, in K.", above=0),
+        "reference_temperature": Parameter(
+            310.0, "Temperature theta_0 at which kappa is as given, in K.", exclusive_minimum=0
+        ),
     },
 )

@@ -29,12 +29,12 @@ class ShearWarning(WarnsOnce):
 
     name = "largest_shear"
 
-    def look(self, step):
+    def check(self, step):
         """Look at a solved state: when loads change, and now and then without."""
         found = largest_shear(self.state.deformation_gradient()).reshape(self.quadrature.shape)
         if (most := self.quadrature.maximum(found)) <= LIMIT:
             return ""
-        place = ", ".join(f"{coordinate:.3g}" for coordinate in self.quadrature.place_of_largest(found))
+        place = ", ".join(f"{coordinate:.3g}" for coordinate in self.quadrature.argmax_position(found))
         return f"right angles change by up to {most:.3g} degrees, most at ({place}); the limit is {LIMIT:g}"
 
 
@@ -46,7 +46,7 @@ def shear_of_row(measurement) -> float:
     )
 
 
-WATCHERS["largest-shear"] = WatcherKind(ShearWarning.of, each_case=True)
+WATCHERS["largest-shear"] = WatcherKind(ShearWarning.for_scene, each_case=True)
 COLUMNS_ON_REQUEST["largest_shear"] = Column(
     "largest_shear", "degrees", "largest change of a right angle", shear_of_row
 )

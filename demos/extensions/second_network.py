@@ -38,9 +38,11 @@ MATRICES["with-second-network"] = Matrix(
     *neo_hookean.others,
     network,
     parameters={
-        "second_modulus": Parameter(10.0, "c, in the unit of stress.", above=0),
-        "second_contour_length": Parameter(2.0, "Over the length without load: the stretch that locks.", above=1),
-        "second_share_2": Parameter(1 / 3, "Of squared dimensions along the second axis, a_2.", above=0),
-        "second_share_3": Parameter(1 / 3, "Along the third, a_3; a_1 is what is left.", above=0),
+        "second_modulus": Parameter(10.0, "c, in the unit of stress.", exclusive_minimum=0),
+        "second_contour_length": Parameter(
+            2.0, "Over the length without load: the stretch that locks.", exclusive_minimum=1
+        ),
+        "second_share_2": Parameter(1 / 3, "Of squared dimensions along the second axis, a_2.", exclusive_minimum=0),
+        "second_share_3": Parameter(1 / 3, "Along the third, a_3; a_1 is what is left.", exclusive_minimum=0),
     },
 )

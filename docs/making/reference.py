@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from remodel_fenicsx.schema.tables import allowed, choices, description, meaning, sections, shown
+from remodel_fenicsx.schema.tables import allowed, choices, description, meaning, sections, format_value
 
 PAGE_WIDTH = 98  # characters of a line of a page
 
@@ -65,4 +65,4 @@ def _cell(text: str) -> str:
 def _default(field: FieldInfo) -> str:
     if field.default is PydanticUndefined:
         return "required" if field.default_factory is None else "empty"
-    return "none" if field.default is None else f"`{shown(field.default)}`"
+    return "none" if field.default is None else f"`{format_value(field.default)}`"

@@ -11,7 +11,7 @@ from docs.making.reference import markdown_reference, paragraphs
 from remodel_fenicsx.extend import SHAPES, Dimension
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS, PROFILES, RANDOM_CELLS
-from remodel_fenicsx.schema.tables import sections, shown
+from remodel_fenicsx.schema.tables import sections, format_value
 from remodel_fenicsx.schema.units import dimension_of
 
 
@@ -69,7 +69,7 @@ def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str
         if isinstance(value, Mapping):
             yield from flat(value, f"{before}{name}.")
         else:
-            yield f"{before}{name}", shown(value)
+            yield f"{before}{name}", format_value(value)
 
 
 def _presets() -> Iterator[str]:

@@ -26,7 +26,7 @@ from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.domain import Domain, cells_of, dof_of_node
 from remodel_fenicsx.body.mesh_faces import ROLES, area_vectors
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import Positive, SolveStopped, of_all_ranks, over_ranks
+from remodel_fenicsx.fem.assembly import SpdSolver, LinearSolveFailure, allgather, allreduce
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.kinematics import lagrange
 from remodel_fenicsx.fem.quadrature import Quadrature
@@ -61,7 +61,7 @@ def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     radial = _radial(harmonic(stiffness, inner, outer), degree, dx, thickness)
     axial = _axial(radial, dx, starts, ends, thickness)
     (trial, test), r, a = _arguments(stiffness.space), _unit(radial), _unit(axial)
-    along_r = Positive(ufl.inner(r, ufl.grad(trial)) * ufl.inner(r, ufl.grad(test)) * dx)
+    along_r = SpdSolver(ufl.inner(r, ufl.grad(trial)) * ufl.inner(r, ufl.grad(test)) * dx)
     through = [_length(along_r, r, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))]
     # Unlike lengths through the wall, these are not along single lines, which would differ over the
     # section of a bend.
@@ -69,13 +69,13 @@ def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     return [radial, axial, *through, *along]
 
 
-def slopes(mesh: Mesh, degree: int, dx: ufl.Measure) -> Positive:
+def slopes(mesh: Mesh, degree: int, dx: ufl.Measure) -> SpdSolver:
     """Assemble the form of harmonic functions. Collective."""
     trial, test = _arguments(lagrange(mesh, degree, ()).function_space)
-    return Positive(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
+    return SpdSolver(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
 
 
-def harmonic(stiffness: Positive, low: Facets, high: Facets) -> Function:
+def harmonic(stiffness: SpdSolver, low: Facets, high: Facets) -> Function:
     """Compute the harmonic function that is 0 on some facets and 1 on others. Collective."""
     return stiffness.solve(None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)])
 
@@ -85,7 +85,7 @@ def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Fu
     mesh, slope, (trial, test) = phi.function_space.mesh, ufl.grad(phi), _arguments(phi.function_space)
     least, way = (dolfinx.fem.Constant(mesh, number) for number in (np.float64(LEAST_SLOPE / thickness), np.zeros(3)))
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
-    mass, found = Positive(trial * test * dx), lagrange(mesh, degree, (3,))
+    mass, found = SpdSolver(trial * test * dx), lagrange(mesh, degree, (3,))
     for component in range(3):
         way.value[:] = np.eye(3)[component]
         found.x.array[component::3] = mass.solve(ufl.inner(direction, way) * test * dx).x.array
@@ -98,12 +98,12 @@ def _axial(radial: Function, dx: ufl.Measure, starts: Facets, ends: Facets, thic
     weight = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2))
     trial, test = _arguments(space)
     across = weight * ufl.inner(trial, normal) * ufl.inner(test, normal)
-    smooth = Positive((ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx)
+    smooth = SpdSolver((ufl.inner(ufl.grad(trial), ufl.grad(test)) + across) * dx)
     return smooth.solve(None, [_normal_to_ends(radial, starts, ends)], multigrid=True)
 
 
 def _length(
-    form: Positive, direction: Expr, dx: ufl.Measure, facets: Facets, sign: float, multigrid: bool = False
+    form: SpdSolver, direction: Expr, dx: ufl.Measure, facets: Facets, sign: float, multigrid: bool = False
 ) -> Function:
     """Compute the function, 0 on facets, whose gradient fits a direction in the form's norm."""
     test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(form.space.mesh, np.float64(sign))
@@ -159,7 +159,7 @@ def outward_areas(mesh: Mesh, facets: Facets) -> Array:
 def area(mesh: Mesh, facets: Facets) -> float:
     """Return the area of facets, from their corners, over all ranks. Collective."""
     local = float(np.linalg.norm(outward_areas(mesh, facets), axis=1).sum())
-    return float(over_ranks(mesh.comm, local, MPI.SUM))
+    return float(allreduce(mesh.comm, local, MPI.SUM))
 
 
 # ---------------------------------------------------------------- local axes, depth and station
@@ -179,13 +179,13 @@ class UndefinedAxes(SceneError):
     """Error: the local axes are undefined in more of the body than a few points."""
 
 
-def found_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
+def compute_local_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
     """Compute the local axes of a mesh with the faces `ROLES`. Collective."""
     if missing := [face for face in ROLES if face not in domain.faces]:
         raise UndefinedAxes(f"geometry.faces: the local axes need a face {', '.join(map(repr, missing))}")
     try:
         radial, axial, *lengths = _fields(domain, quadrature)
-    except SolveStopped as stopped:
+    except LinearSolveFailure as stopped:
         raise UndefinedAxes(f"geometry.faces: cannot compute local axes: {stopped}") from stopped
     PETSc.garbage_cleanup(domain.mesh.comm)  # on several ranks unused matrices are only freed here
     fields = ufl.as_vector([*radial, *axial, *lengths])
@@ -232,7 +232,7 @@ def _share(first: Array, second: Array) -> Array:
 def _first_place(quadrature: Quadrature, there: Flags) -> Array:
     """Return the first marked position, independent of the number of ranks. Collective."""
     marked = quadrature.owned(quadrature.coordinates)[quadrature.owned(there)]
-    places = [place for part in of_all_ranks(quadrature.mesh.comm, marked) for place in part]
+    places = [place for part in allgather(quadrature.mesh.comm, marked) for place in part]
     return min(places, key=lambda place: np.round(place, 9).tolist())
 
 
@@ -240,5 +240,5 @@ def _fill(axes: Array, known: Flags, quadrature: Quadrature) -> None:
     """Copy the axes of the nearest point with axes to each point without. Collective."""
     good = quadrature.owned(known)
     own = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
-    places, candidates = map(np.concatenate, zip(*of_all_ranks(quadrature.mesh.comm, own), strict=True))
+    places, candidates = map(np.concatenate, zip(*allgather(quadrature.mesh.comm, own), strict=True))
     axes[~known] = candidates[spatial.cKDTree(places).query(quadrature.coordinates[~known])[1]]

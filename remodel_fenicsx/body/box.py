@@ -133,7 +133,7 @@ def _nominal(row: int, column: int) -> Callable[[Any], float]:
             stress = np.linalg.det(m.F)[..., None, None] * m.stress @ np.swapaxes(np.linalg.inv(m.F), -1, -2)
             return np.array([[m.quadrature.mean(stress[..., i, j]) for j in range(3)] for i in range(3)])
 
-        return float(m.tool_of_step("nominal stress", mean)[row, column])
+        return float(m.cached_for_step("nominal stress", mean)[row, column])
 
     return value
 
@@ -152,7 +152,7 @@ def _force(side: int) -> LoadKind:
         value=lambda m: nominal(m) * area(m.observer.shape),
         reductions=("point",),
         area=area,
-        instead_of=f"elongation_{axis}",
+        replaces=f"elongation_{axis}",
     )
 
 
@@ -166,7 +166,7 @@ def _elongation(side: int) -> LoadKind:
         value=lambda m: stretch(m) - 1.0,
         above=-1.0,
         reductions=("point",),
-        instead_of=f"force_{axis}",
+        replaces=f"force_{axis}",
     )
 
 
@@ -209,7 +209,7 @@ class Sheet(Box):
             "fibre_angle",
             "degrees",
             "angle between chains and x in the reference configuration, volume mean",
-            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
+            lambda m: m.quadrature.nanmean(m.fibre_angle),
             by_case=False,
         ),
         Column("thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)),
@@ -227,7 +227,7 @@ class Sheet(Box):
     )
     number_of_elements = 16
     _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
-    depth_in_words = ("through the sheet", "lower face", "upper face")
+    depth_labels = ("through the sheet", "lower face", "upper face")
     angle_in_words = ("along x", "across x")
     buckles = False  # the face z = 0 stays in its plane
 

@@ -22,7 +22,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.gmsh_model import GeometryError, gmsh_model, named_groups
 from remodel_fenicsx.fem import compat
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import allreduce
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ class Domain:
         return (None, None) if points is None or elements is None else (points, elements)
 
     def _gather(self, values: npt.NDArray[Any], number: Integers) -> npt.NDArray[Any] | None:
-        if over_ranks(self.comm, len(values) < len(number), MPI.LOR):
+        if allreduce(self.comm, len(values) < len(number), MPI.LOR):
             raise ValueError(f"{len(values)} rows for {len(number)} owned entities on rank {self.comm.rank}")
         own = number, values[: len(number)]
         parts = [own] if self.comm.size == 1 else self.comm.gather(own, root=0)

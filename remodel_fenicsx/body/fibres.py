@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from remodel_fenicsx.body.mesh_file import in_place, read_exchange_file
+from remodel_fenicsx.body.mesh_file import format_position, read_exchange_file
 from remodel_fenicsx.errors import UnreadableFile
-from remodel_fenicsx.model.axes import MEASURED, SOURCES, fault_of_fibres
+from remodel_fenicsx.model.axes import MEASURED, FIBRE_INPUTS, fibres_problem
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.text import read_columns
@@ -70,7 +70,7 @@ class FibreFile:
         far, rows[chosen] = cKDTree(self.places).query(centres[chosen])
         if (far > sizes[chosen]).any():
             worst = (far / sizes[chosen]).argmax()
-            place, size = in_place(centres[chosen][worst]), sizes[chosen][worst]
+            place, size = format_position(centres[chosen][worst]), sizes[chosen][worst]
             rule = f"has no measurement within one element ({size:.3g}) of {place}; "
             raise UnreadableFile(rule + f"the nearest is {far[worst]:.3g} away")
         return rows, float(far.max())
@@ -89,7 +89,7 @@ def read_fibre_file(path: Path) -> FibreFile:
             measured, places, data = _of_mesh(path)
     except OSError as error:
         raise UnreadableFile(f"cannot be read: {error.strerror or error}") from error
-    if (found := fault_of_fibres(measured)) is not None:
+    if (found := fibres_problem(measured)) is not None:
         raise UnreadableFile(found)
     if places is not None and not np.isfinite(places).all():
         raise UnreadableFile("has positions that are not finite")
@@ -115,7 +115,7 @@ def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     if left := [name for name in columns if name not in used]:
         raise UnreadableFile(f"has {', '.join(left)} without the other columns of x, y, z or of the tensor")
     places, elements = measured.pop("places", None), measured.pop("element", None)
-    if not set(measured) & set(SOURCES):
+    if not set(measured) & set(FIBRE_INPUTS):
         raise UnreadableFile(f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z")
     if elements is None:
         return measured, places
@@ -125,7 +125,7 @@ def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     return {name: values[order] for name, values in measured.items()}, None if places is None else places[order]
 
 
-_NEEDED = f"must have one of {', '.join(SOURCES)}"
+_NEEDED = f"must have one of {', '.join(FIBRE_INPUTS)}"
 
 
 def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
@@ -143,9 +143,9 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
         centres = [points[rows].mean(axis=1) for rows in solid]
     except (ValueError, TypeError, IndexError) as error:
         raise UnreadableFile(f"has arrays that do not fit its elements: {' '.join(str(error).split())}") from error
-    if set(of_cells) & set(SOURCES):
+    if set(of_cells) & set(FIBRE_INPUTS):
         return of_cells, np.concatenate(centres), mesh.data
-    if set(of_points) & set(SOURCES):
+    if set(of_points) & set(FIBRE_INPUTS):
         return of_points, points, mesh.data
     known = ", ".join([*mesh.cell_data, *mesh.point_data]) or "none"
     raise UnreadableFile(f"has arrays {known}; {_NEEDED}")

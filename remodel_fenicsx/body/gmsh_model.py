@@ -35,7 +35,7 @@ class GeometryError(RemodelError, RuntimeError):
     """
 
 
-def length_fault(lengths: Mapping[str, float]) -> tuple[str, str] | None:
+def mesh_length_problem(lengths: Mapping[str, float]) -> tuple[str, str] | None:
     """Return the name of a length that prevents meshing, and the rule that it breaks, or None."""
     for name, length in lengths.items():
         if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import dolfinx.fem
@@ -12,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from remodel_fenicsx._renamed import with_old_arguments, with_old_names
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
@@ -33,6 +35,7 @@ def values_of_loads(loads: Mapping[str, Load], time: float) -> LoadValues:
     return {name: load.value * load.factor(time) for name, load in loads.items()}
 
 
+@with_old_names
 class Loading:
     """Supports and loads of a body: boundary conditions, external forces, and their magnitudes.
 
@@ -127,7 +130,7 @@ class Loading:
         ValueError
             If the mesh has no node at `point`.
         """
-        if not self.kinematics.moves_rigidly:
+        if not self.kinematics.has_rigid_modes:
             return
         tolerance = 1e-9 * self.domain.size
         subspace = self.kinematics.subspace(self.space, component)
@@ -142,8 +145,9 @@ class Loading:
         # With the dofs of the subspace only, the value is a Constant, as for faces.
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace))
 
-    def hold_facets(self, facets: NDArray[np.int32], name: str | None = None, way: Array | float = 0.0) -> None:
-        """Prescribe u = magnitude times `way` on local facets, for the full displacement.
+    @partial(with_old_arguments, "hold_facets")
+    def hold_facets(self, facets: NDArray[np.int32], name: str | None = None, direction: Array | float = 0.0) -> None:
+        """Prescribe u = magnitude times `direction` on local facets, for the full displacement.
 
         Parameters
         ----------
@@ -151,7 +155,7 @@ class Loading:
             Local numbers of the facets.
         name
             Name of the load that sets the magnitude; None: u = 0.
-        way
+        direction
             Displacement at magnitude 1, (3,).
 
         Raises
@@ -164,7 +168,7 @@ class Loading:
         dofs = dolfinx.fem.locate_dofs_topological(self.space, self.domain.mesh.topology.dim - 1, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
         if name is not None:
-            self._take(name, value, way)
+            self._take(name, value, direction)
 
     # ------------------------------------------------------------ loads
     def add_dead_force(self, name: str, face: str, component: int, length: float | None = None) -> None:
@@ -364,7 +368,7 @@ class Loading:
         degree = field_degree(self.space)
         return measure(self.domain.faces[face], metadata={"quadrature_degree": 2 * degree})
 
-    def measure_alone(self, face: str) -> ufl.Measure:
+    def separate_measure(self, face: str) -> ufl.Measure:
         """Return `surface_measure` for forms of one face, which share their kernels."""
         mesh, facets = self.domain.mesh, self.domain.facets(face)
         ones = np.ones(len(facets), dtype=np.int32)
@@ -408,7 +412,7 @@ class Loading:
 
     def area(self, face: str) -> float:
         """Return the reference area of a named face. Collective."""
-        return self._integral(self.measure_alone(face))
+        return self._integral(self.separate_measure(face))
 
     # ------------------------------------------------------------ inside
     def _integral(self, measure: ufl.Measure) -> float:

@@ -21,7 +21,7 @@ from remodel_fenicsx.body.mesh_file import (
     Block,
     Surface,
     gmsh_text,
-    in_place,
+    format_position,
     of_gmsh,
     split_quads,
     split_wedges,
@@ -47,7 +47,7 @@ MOST_THROUGH = 100  # elements through the wall
 MOST_RADII, LEAST_RADII = 3.0, 2e-3
 # Smallest distance of the outer face from the lumen, over the thickness. A closer face lies in
 # another part of the wall.
-LEAST_ROOM = 0.5
+MIN_CLEARANCE = 0.5
 # Edges of a tetrahedron, in the order of its mid-edge nodes.
 EDGES = ([0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3])
 
@@ -71,7 +71,7 @@ def oriented(surface: Surface, name: str) -> Surface:
     mesh = polygons(surface.points, surface.triangles)
     kinds = {"boundary_edges": False, "feature_edges": False, "manifold_edges": False}
     if (odd := mesh.extract_feature_edges(non_manifold_edges=True, **kinds)).n_cells:
-        place = in_place(odd.cell_centers().points[0])
+        place = format_position(odd.cell_centers().points[0])
         raise SceneError(f"{name}: three or more triangles share an edge at {place}; must be two")
     if not mesh.n_open_edges:
         raise SceneError(f"{name}: the surface is closed; cut the ends of the vessel open")
@@ -167,7 +167,7 @@ def polygons(points: Array, simplices: Integers) -> Any:
 # ---------------------------------------------------------------- the wall
 
 
-class GrownWall(NamedTuple):
+class ExtrudedWall(NamedTuple):
     """Tetrahedra of degree 2 with layer numbers, and the triangles of degree 2 of each face."""
 
     points: Array
@@ -177,7 +177,9 @@ class GrownWall(NamedTuple):
     straight: int
 
 
-def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[str, float], through: int) -> GrownWall:
+def extrude_wall(
+    surface: Surface, given: Surface, thickness: Array, layers: Mapping[str, float], through: int
+) -> ExtrudedWall:
     """Extrude prisms from a surface outwards, curved as the given one, by a thickness (points,).
 
     Each layer has its fraction of the thickness.
@@ -197,8 +199,10 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
         normals = _around(surface, normals[surface.triangles].sum(axis=1), openings)
     else:
         place = points[tetrahedra[folded][0]].mean(axis=0)
-        raise SceneError(f"--thickness: too thick: the wall folds at {in_place(place)}, " "where the lumen is concave")
-    _check_room(surface.points, points[-size:], thickness)
+        raise SceneError(
+            f"--thickness: too thick: the wall folds at {format_position(place)}, " "where the lumen is concave"
+        )
+    _check_self_intersection(surface.points, points[-size:], thickness)
     of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(surface.triangles))
     faces = {"inner": surface.triangles, "outer": surface.triangles + size * (len(levels) - 1)}
     quads = [np.concatenate([rim, rim[:, ::-1] + size], axis=1) + size * layer for rim in openings]
@@ -223,7 +227,7 @@ def grown(surface: Surface, given: Surface, thickness: Array, layers: Mapping[st
 
     elements = with_middles(tetrahedra, EDGES)
     faces = {name: with_middles(face, EDGES[:3]) for name, face in faces.items()}
-    return GrownWall(points, elements, of_layer, faces, _straightened(points, elements))
+    return ExtrudedWall(points, elements, of_layer, faces, _straightened(points, elements))
 
 
 def _straightened(points: Array, tetrahedra: Integers) -> int:
@@ -255,14 +259,14 @@ def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
     return _around(surface, area_vectors(surface.points[surface.triangles]), openings)
 
 
-def _check_room(inner: Array, outer: Array, thickness: Array) -> None:
+def _check_self_intersection(inner: Array, outer: Array, thickness: Array) -> None:
     """Check that the wall does not reach into another part of itself or of the lumen."""
     from scipy.spatial import cKDTree
 
     distance, _ = cKDTree(inner).query(outer)
-    if (crossed := distance < LEAST_ROOM * thickness).any():
+    if (crossed := distance < MIN_CLEARANCE * thickness).any():
         place = outer[int(np.argmax(crossed))]
-        raise SceneError(f"--thickness: too thick: the wall intersects the vessel at {in_place(place)}")
+        raise SceneError(f"--thickness: too thick: the wall intersects the vessel at {format_position(place)}")
 
 
 # ---------------------------------------------------------------- the command
@@ -290,7 +294,7 @@ def write_wall(
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: remeshing {len(read.triangles)} triangles takes minutes")
     found, near = remeshed(read, size)
-    wall = grown(found, read, depth[near], shares or {"wall": 1.0}, through)
+    wall = extrude_wall(found, read, depth[near], shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; rename the layer")
     names = list(shares) or ["wall"]

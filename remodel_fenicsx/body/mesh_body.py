@@ -22,7 +22,7 @@ from remodel_fenicsx.body.mesh_file import (
     TAGS,
     MeshFile,
     assembled,
-    distinct,
+    unique_in_order,
     of_gmsh,
     read_mesh,
 )
@@ -43,7 +43,7 @@ from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Mesh, OnFace, Support, faces_of
-from remodel_fenicsx.schema.tables import SceneError, fault, shown
+from remodel_fenicsx.schema.tables import SceneError, validation_error, format_value
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
 
 if TYPE_CHECKING:
@@ -77,13 +77,13 @@ def _by_hold_faces(shape: Any, loading: Any, name: str) -> None:
 def _faces(value: Any) -> Any:
     """Validate names or numbers, one or a list, as tuples."""
     if not isinstance(value, Mapping):
-        raise fault("must be a table: names or numbers of the file's faces or volumes, as in inner = 3")
+        raise validation_error("must be a table: names or numbers of the file's faces or volumes, as in inner = 3")
     found = {}
     for name, entry in value.items():
         entries = entry if isinstance(entry, (list, tuple)) else [entry]
         if not entries or not all(isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries):
             rule = "must be a name or a number in the file, or a list of them; a face may be { file = 'surface.vtp' }"
-            raise fault(rule, str(name), entry)
+            raise validation_error(rule, str(name), entry)
         found[str(name)] = tuple(entries)
     return found
 
@@ -106,7 +106,7 @@ def _file(value: Any) -> Any:
     files = _files(value)
     if not files:
         mesh, surfaces = ", ".join(READERS), ", ".join(SURFACES)
-        raise fault(
+        raise validation_error(
             f"must be the path of a mesh ({mesh}), relative to the scene's folder, or a list of it "
             f"and paths of its surfaces ({surfaces})"
         )
@@ -125,14 +125,14 @@ def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
 
 def _numbers(key: str, entries: Names, names: Mapping[str, int], groups: Integers) -> list[int]:
     """Return the file's numbers of a face's or region's entries, names or numbers."""
-    there = {*distinct(groups)} - {0}
+    there = {*unique_in_order(groups)} - {0}
     found = [names.get(entry, 0) if isinstance(entry, str) else int(entry) for entry in entries]
     for entry, number in zip(entries, found, strict=True):
         if number not in there:
             listed = [*map(repr, names), *map(str, sorted(there - {*names.values()}))]
             word = "face" if key.startswith("faces") else "volume"
             rule = f"the file has no such {word}; it has {', '.join(listed) or 'none'}"
-            raise SceneError(f"geometry.{key} = {shown(entry)}: {rule}")
+            raise SceneError(f"geometry.{key} = {format_value(entry)}: {rule}")
     return found
 
 
@@ -183,7 +183,7 @@ class FileBody(WithRegions, FromFile):
     @model_validator(mode="after")
     def _units_are_both_there(self) -> Any:
         if self.file_unit is not None and self.length_unit is None:
-            raise fault("needs geometry.length_unit, the unit of the scene", "file_unit", self.file_unit)
+            raise validation_error("needs geometry.length_unit, the unit of the scene", "file_unit", self.file_unit)
         return self
 
     @classmethod
@@ -203,7 +203,7 @@ class FileBody(WithRegions, FromFile):
         try:
             found = read_mesh(file, tags if isinstance(tags, str) else None, surfaces)
         except UnreadableFile as error:
-            raise fault(str(error), "geometry.file", file.name) from None
+            raise validation_error(str(error), "geometry.file", file.name) from None
         return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
 
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -225,7 +225,9 @@ class FileBody(WithRegions, FromFile):
     def check_size(self, mesh: Mesh) -> None:
         """Check that the refinement is a power of 2, because edges are halved."""
         if mesh.refinement & (mesh.refinement - 1):
-            raise fault("must be a power of 2: the elements of a file are halved", "mesh.refinement", mesh.refinement)
+            raise validation_error(
+                "must be a power of 2: the elements of a file are halved", "mesh.refinement", mesh.refinement
+            )
 
     # ------------------------------------------------------------ mesh
     def build(self, mesh: Mesh, comm: MPI.Intracomm | None = None) -> Domain:
@@ -248,7 +250,9 @@ class FileBody(WithRegions, FromFile):
         try:
             boundary = self.boundary(file)
         except mesh_faces.FaceError as error:
-            raise SceneError(f"geometry.faces.{error.face} = {shown(self._asked(error.face))}: {error}") from None
+            raise SceneError(
+                f"geometry.faces.{error.face} = {format_value(self._asked(error.face))}: {error}"
+            ) from None
         except UnreadableFile as error:
             raise self._fault(str(error)) from None
         self.check_boundary(file, boundary)
@@ -283,7 +287,7 @@ class FileBody(WithRegions, FromFile):
         return file
 
     def _fault(self, rule: str) -> SceneError:
-        return SceneError(f"geometry.file = {shown(self._name)}: {rule}")
+        return SceneError(f"geometry.file = {format_value(self._name)}: {rule}")
 
     def _asked(self, face: str) -> Any:
         """Return the scene's entry of a face, or the default."""
@@ -295,12 +299,12 @@ class FileBody(WithRegions, FromFile):
         names, found = file.names[2], file.facet_groups
         asked = {face: (face,) for face in self.face_names} | self.faces
         groups = {face: _numbers(f"faces.{face}", entries, names, found) for face, entries in asked.items()}
-        others = {*distinct(found)}.difference(*groups.values())
+        others = {*unique_in_order(found)}.difference(*groups.values())
         further = {name: [n] for name, n in names.items() if n in others and name not in groups}
         return mesh_faces.boundary_of(file, groups, self.open_boundary, further)
 
     def _regions(self, file: MeshFile) -> dict[str, int]:
-        numbers = distinct(file.cell_groups)
+        numbers = unique_in_order(file.cell_groups)
         if 0 in numbers and len(numbers) > 1:
             lost = file.cell_numbers[file.cell_groups == 0]
             raise self._fault(
@@ -318,7 +322,7 @@ class FileBody(WithRegions, FromFile):
         for name, entries in self.regions.items():
             numbers[name], *others = _numbers(f"regions.{name}", entries, file.names[3], file.cell_groups)
             groups[np.isin(groups, others)] = numbers[name]
-        own = ~mesh_faces.again(file.corners, groups, numbers.values())
+        own = ~mesh_faces.shared_entities(file.corners, groups, numbers.values())
         further = {name: number for name, number in file.names[3].items() if number not in numbers.values()}
         return replace(
             file,
@@ -344,7 +348,7 @@ class FileBody(WithRegions, FromFile):
         """Return the body's loads and those on faces, which `hold_faces` adds."""
         return cls.loads | {name: ON_FACES[on.kind](on.face) for name, on in faces.items()}
 
-    def fills(self, regions: Collection[str]) -> bool:
+    def covers_body(self, regions: Collection[str]) -> bool:
         """Return whether the regions are all volumes of the file."""
         return bool(regions) and set(self._regions(self._mesh())) <= set(regions)
 
@@ -363,7 +367,7 @@ class FileBody(WithRegions, FromFile):
         check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
         moved = {"outlet": "elongation"} if "elongation" in loads else {}
         for name, (face, load) in faces_of(loads).items():
-            key, kind = f"loads.{name}.face = {shown(face)}", chosen.get(face, Support(kind="free")).kind
+            key, kind = f"loads.{name}.face = {format_value(face)}", chosen.get(face, Support(kind="free")).kind
             if face not in domain.faces:
                 raise SceneError(f"{key}: the body has no such face; it has {', '.join(domain.faces)}")
             if load == "displacement":
@@ -424,7 +428,7 @@ def _middle(m: Any) -> Flags:
 
 def _mean_over(elements: Callable[[Any], Flags]) -> AngleOf:
     """Return the mean over elements, which are selected once."""
-    return lambda m, values: m.quadrature.mean_of_known(values, m.tool(elements, lambda: elements(m)))
+    return lambda m, values: m.quadrature.nanmean(values, m.cached(elements, lambda: elements(m)))
 
 
 MEANS_ON_A_MESH: dict[str, tuple[str, AngleOf]] = {
@@ -455,9 +459,9 @@ class WalledMesh(Walled):
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
         """Compute the local axes on the mesh by a few linear solves. Collective."""
-        from remodel_fenicsx.body.axes import found_axes
+        from remodel_fenicsx.body.axes import compute_local_axes
 
-        return found_axes(domain, quadrature)
+        return compute_local_axes(domain, quadrature)
 
     def depth(self, coordinates: Array) -> Array:
         """Return zero: unrecorded depth is unknown, so that all is one layer."""
@@ -513,7 +517,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         inner, outer = boundary.area("inner"), boundary.area("outer")
         if inner > outer:
             words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
-            raise SceneError(f"geometry.faces.inner = {shown(self._asked('inner'))}: {words}")
+            raise SceneError(f"geometry.faces.inner = {format_value(self._asked('inner'))}: {words}")
         if mesh_faces.through_the_wall(boundary):
             log.warning(
                 "the wall is one element thick in places, which resolves neither bending nor the "
@@ -538,13 +542,13 @@ class Solid(FileBody):
             "fibre_angle",
             "degrees",
             "angle between chains and `geometry.axis` in the reference configuration, volume mean",
-            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
+            lambda m: m.quadrature.nanmean(m.fibre_angle),
         ),
         Column("volume", "length^3", "deformed volume", lambda m: m.quadrature.integral(np.linalg.det(m.F))),
     )
     columns_on_request = cauchy_columns("x", "y", "z")
     angle_in_words = ("along the axis", "across")
-    depth_in_words = ("in the body", "", "")
+    depth_labels = ("in the body", "", "")
 
     shape: Literal["solid"] = "solid"
     """Shape of the body."""
@@ -572,7 +576,7 @@ def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     with gmsh_model("file") as gmsh:
         model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
         for dimension, rows, groups in ((3, file.cells, file.cell_groups), (2, file.facets, file.facet_groups)):
-            for group in distinct(groups):
+            for group in unique_in_order(groups):
                 entity = model.addDiscreteEntity(dimension)
                 mesh.addNodes(dimension, entity, number, file.points.reshape(-1))
                 number = []

@@ -23,7 +23,7 @@ from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.body.mesh_file import MeshFile
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import agreed, over_ranks
+from remodel_fenicsx.fem.assembly import raise_on_all_ranks, allreduce
 from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
@@ -79,7 +79,7 @@ class MeshDomain(Domain):
         psi = harmonic(slopes(mesh, degree, dx), self.facets("inlet"), self.facets("outlet"))
         slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(mesh, np.float64(1.0))
         parts = [float(np.real(dolfinx.fem.assemble_scalar(jit.form(value * dx)))) for value in (one, slope)]
-        volume, total = over_ranks(self.comm, np.array(parts), MPI.SUM)
+        volume, total = allreduce(self.comm, np.array(parts), MPI.SUM)
         return float(volume / total)
 
 
@@ -87,7 +87,7 @@ def shared(
     read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm, shape: str = "mesh"
 ) -> MeshDomain:
     """Distribute the mesh that rank 0 reads. Collective."""
-    found = agreed(comm, lambda: read() if comm.rank == 0 else None)
+    found = raise_on_all_ranks(comm, lambda: read() if comm.rank == 0 else None)
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # see `domain.build_domain`
     told = cells = groups = None
     points: Array = np.empty((0, 3))

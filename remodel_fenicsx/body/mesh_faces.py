@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.body.mesh_file import MeshFile, as_rows, distinct, in_place
+from remodel_fenicsx.body.mesh_file import MeshFile, as_rows, unique_in_order, format_position
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Flags, Integers, det
 
@@ -95,25 +95,25 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Gro
                 words = f"shares facets with the face {owner[row]!r}"
             elif key in as_rows(np.sort(twice, axis=1)):
                 words = "has facets inside the body"
-            raise FaceError(name, f"{words}, the first at {in_place(file.points[list(key)].mean(axis=0))}")
+            raise FaceError(name, f"{words}, the first at {format_position(file.points[list(key)].mean(axis=0))}")
         else:
             owner[found] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
-        where, share = in_place(places[bare][0].mean(axis=0)), bare.sum()
+        where, share = format_position(places[bare][0].mean(axis=0)), bare.sum()
         rule = f"{share} of {len(bare)} boundary facets are in no face, first at {where}"
         raise UnreadableFile(rule + "; add them to geometry.faces, or set geometry.open_boundary = true")
     faces = []
     for name in (*groups, *others):
         rows = np.flatnonzero(owner == name)
         label = components(facets[rows], len(file.points))
-        parts = (rows[label == one] for one in distinct(label))
+        parts = (rows[label == one] for one in unique_in_order(label))
         faces += [Face(name, part, places[part]) for part in parts]
     volume = float(np.einsum("fi,fi->", places.mean(axis=1), area_vectors(places)) / 3)
     return Boundary(facets, cell, owner, faces, volume)
 
 
-def again(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flags:
+def shared_entities(corners: Integers, groups: Integers, numbers: Collection[int]) -> Flags:
     """Mark the elements or facets of other groups that are also in these groups, (rows,)."""
     chosen = np.isin(groups, list(numbers))
     _, which = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
@@ -145,7 +145,7 @@ def rims(facets: Integers) -> list[Integers]:
     _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     alone = np.sort(first[count == 1])
     label = components(edges[alone], int(facets.max(initial=0)) + 1)
-    return [edges[alone[label == one]] for one in distinct(label)]
+    return [edges[alone[label == one]] for one in unique_in_order(label)]
 
 
 def cap_volume(points: Array, rim: Integers) -> float:
@@ -196,7 +196,7 @@ def _checked_signs(file: MeshFile) -> Array:
     extent = np.ptp(file.points, axis=0).max()
     if extent == 0:
         raise UnreadableFile("all nodes coincide")
-    bodies = len(distinct(components(file.corners, len(file.points))))
+    bodies = len(unique_in_order(components(file.corners, len(file.points))))
     if bodies > 1:
         raise UnreadableFile(f"{bodies} bodies without common nodes; must be one (in Gmsh: BooleanFragments)")
     determinants = jacobian_determinants(file)
@@ -204,7 +204,7 @@ def _checked_signs(file: MeshFile) -> Array:
     bad = np.flatnonzero((determinants * signs[:, None]).min(axis=1) <= FLAT * np.abs(determinants).mean())
     if len(bad):
         cell = int(bad[0])
-        where = in_place(file.points[file.corners[cell]].mean(axis=0))
+        where = format_position(file.points[file.corners[cell]].mean(axis=0))
         raise UnreadableFile(
             f"element {file.cell_numbers[cell]} at {where} is inverted or degenerate: its Jacobian "
             f"is not positive ({len(bad)} such element{'s' if len(bad) > 1 else ''})"

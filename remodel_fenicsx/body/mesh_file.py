@@ -101,12 +101,12 @@ def as_rows(table: Integers) -> list[tuple[int, ...]]:
     return [tuple(row) for row in listed]
 
 
-def in_place(point: Array) -> str:
+def format_position(point: Array) -> str:
     """Format the coordinates of a point."""
     return "(" + ", ".join(f"{number:.4g}" for number in point) + ")"
 
 
-def distinct(values: Integers) -> list[int]:
+def unique_in_order(values: Integers) -> list[int]:
     """Return the distinct numbers of an array, in its order."""
     listed: Any = values.tolist()
     return list(dict.fromkeys(listed))
@@ -120,7 +120,7 @@ READERS[".msh"] = f"gmsh {READERS['.msh']}"
 _FORMAT = re.compile(rb"\$MeshFormat\s+(2\.2|4\.1) 0 \d+\s+\$EndMeshFormat")
 _SECTION = re.compile(rb"^\$(\w+)\s*?\n(.*?)^\$End\1\b", re.DOTALL | re.MULTILINE)
 _OLD_TAGS = re.compile(rb"(?m)^[ \t]*\d+([ \t]+\d+[ \t]+\d+[ \t]+(\d+)[ \t]+)\d+(?=[ \t])")
-SAVED_OTHERWISE = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
+SAVE_AS_VTU_HINT = "; save it as VTU with data mode ASCII (ParaView: File, Save Data), or as .msh"
 TAGS = ("gmsh:physical", "CellEntityIds", "medit:ref")
 """Names of the array of face and volume numbers in meshio, VMTK and Medit."""
 
@@ -147,7 +147,7 @@ def read_exchange_file(path: Path) -> ExchangeFile:
         arrays, data = read_guarded(path, READERS[ending])
     except UnreadableFile as error:
         is_exchanged = ending != ".msh" and str(error).startswith(DAMAGED)
-        raise UnreadableFile(f"{error}{SAVED_OTHERWISE if is_exchanged else ''}") from None
+        raise UnreadableFile(f"{error}{SAVE_AS_VTU_HINT if is_exchanged else ''}") from None
     names, points, *others = arrays.values()
     (kinds, of_points, of_cells, groups), rest = json.loads(names.tobytes()), iter(others)
     cells = [*zip(kinds, rest, strict=False)]  # each zip consumes its part of the iterator
@@ -464,10 +464,10 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
     away, nodes = cKDTree(file.points).query(corners)
     far = away > SAME_NODE * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1, keepdims=True)
     if far.any():
-        where = f"at {in_place(corners[far][0])}, the nearest is {away[far][0]:.3g} away"
+        where = f"at {format_position(corners[far][0])}, the nearest is {away[far][0]:.3g} away"
         rule = f"{where}: is it the surface of this mesh, in its unit?"
         raise UnreadableFile(f"{path.name}: {far.sum()} triangle corners are not nodes of the mesh, the first {rule}")
-    number = 1 + max([*distinct(file.facet_groups), *file.names[2].values()], default=0)
+    number = 1 + max([*unique_in_order(file.facet_groups), *file.names[2].values()], default=0)
     return replace(
         file,
         facets=np.concatenate([file.facets, nodes]),

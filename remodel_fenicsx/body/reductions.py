@@ -153,7 +153,7 @@ POINTS = {
     ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
     ("hexahedron", 1): 8, ("hexahedron", 2): 27, ("tetrahedron", 1): 1, ("tetrahedron", 2): 4,
 }  # fmt: skip
-POINTS_OF_THE_REST = 60.0  # a step's cost independent of the mesh, in points of hexahedra
+OVERHEAD_IN_POINTS = 60.0  # a step's cost independent of the mesh, in points of hexahedra
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def choice(scene: ReducedScene) -> Choice:
     found = {name: objections(scene, name) for name in reductions}
     if scene.model.kinematics != AUTO:
         return Choice(scene.model.kinematics, found)
-    if threats(scene):
+    if buckling_risks(scene):
         return Choice("full", found)
     exact = (name for name, reasons in found.items() if not reasons and not is_for_means(scene, name))
     return Choice(next(exact, "full"), found)
@@ -250,13 +250,13 @@ def only_for_means(scene: ReducedScene) -> list[str]:
 
 def for_means(scene: ReducedScene) -> str:
     """Return the cheapest kinematics that is right for means over many random seeds, or `auto`."""
-    if threats(scene):
+    if buckling_risks(scene):
         return AUTO
     found = (name for name in scene.geometry.reductions if is_for_means(scene, name) and not objections(scene, name))
     return next(found, AUTO)
 
 
-def explained(scene: ReducedScene) -> list[str]:
+def describe_choice(scene: ReducedScene) -> list[str]:
     """Describe the choice: why nothing cheaper is allowed, and what the kinematics cannot show."""
     made = choice(scene)
     lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}"]
@@ -274,11 +274,14 @@ def explained(scene: ReducedScene) -> list[str]:
     cannot = ", which this one cannot show" if KINEMATICS[made.name].reduced else ""
     return [
         *lines,
-        *(f"{threat}: the body may buckle out of the symmetry of a reduction{cannot}" for threat in threats(scene)),
+        *(
+            f"{threat}: the body may buckle out of the symmetry of a reduction{cannot}"
+            for threat in buckling_risks(scene)
+        ),
     ]
 
 
-def threats(scene: ReducedScene) -> list[str]:
+def buckling_risks(scene: ReducedScene) -> list[str]:
     """Describe loads that may buckle the body: negative ones, which are compression or suction."""
     if not scene.geometry.reductions or not scene.geometry.buckles:
         return []
@@ -314,7 +317,7 @@ def step_cost(scene: ReducedScene, name: str) -> float:
     element, number = kinematics.element(mesh.element), elements(scene, name)
     if element == "tetrahedron":
         number *= 6
-    return POINTS_OF_THE_REST + kinematics.cost * number * POINTS[element, mesh.degree]
+    return OVERHEAD_IN_POINTS + kinematics.cost * number * POINTS[element, mesh.degree]
 
 
 def _leaves_symmetry(scene: ReducedScene) -> str:

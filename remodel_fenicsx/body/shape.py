@@ -16,7 +16,8 @@ from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from remodel_fenicsx.body.gmsh_model import length_fault
+from remodel_fenicsx._renamed import with_old_names
+from remodel_fenicsx.body.gmsh_model import mesh_length_problem
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis, global_axes
@@ -31,7 +32,7 @@ from remodel_fenicsx.schema.settings import (
     Support,
     faces_of,
 )
-from remodel_fenicsx.schema.tables import fault, with_key
+from remodel_fenicsx.schema.tables import validation_error, with_key
 from remodel_fenicsx.schema.units import FORCE, Dimension, LengthUnit
 
 if TYPE_CHECKING:
@@ -131,8 +132,8 @@ def profile_weights(depth: Array) -> Array:
 
 
 def _profile(number: int, m: Any) -> float:
-    hats = m.tool("hats", lambda: profile_weights(m.state.cells.local_axes.depth))
-    return m.quadrature.mean_of_known(m.fibre_angle, hats[..., number])
+    hats = m.cached("hats", lambda: profile_weights(m.state.cells.local_axes.depth))
+    return m.quadrature.nanmean(m.fibre_angle, hats[..., number])
 
 
 _PROFILE_COLUMNS = tuple(
@@ -158,7 +159,7 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
             f"fibre_angle_{name}",
             "degrees",
             f"mean reference fibre angle in the region `{name}`",
-            lambda m: m.quadrature.mean_of_known(m.fibre_angle, m.elements_of_region(name)),
+            lambda m: m.quadrature.nanmean(m.fibre_angle, m.elements_of_region(name)),
             by_case=False,
         ),
         Column(
@@ -217,7 +218,7 @@ COLUMNS: dict[str, Column] = {
 """Columns of every shape by name, after `time` and the shape's columns; scripts may add columns."""
 
 
-def _of_turnover(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
+def _turnover_warnings(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
     """Make a column of a function of `evolution.turnover.Turnover`."""
     return Column(name, unit, meaning, lambda m: float(value(m.observer.stepper.part("turnover"))), by_case=False)
 
@@ -251,11 +252,11 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "asleep_share",
             "",
             "inactive fraction of the volume, below remodeling.threshold",
-            lambda m: m.observer.stepper.remodeling.asleep_share(),
+            lambda m: m.observer.stepper.remodeling.inactive_fraction(),
             by_case=False,
         ),
         *(
-            _of_turnover(
+            _turnover_warnings(
                 name,
                 "",
                 f"{what} of collagen over its initial value, volume mean; with remodeling.turnover",
@@ -270,13 +271,13 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             lambda m: m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio),
             by_case=False,
         ),
-        _of_turnover(
+        _turnover_warnings(
             "collagen_share",
             "",
             "volume fraction of collagen in the tissue, mean over the initial volume",
             methodcaller("collagen_share"),
         ),
-        _of_turnover(
+        _turnover_warnings(
             TURNOVER_POWER,
             "stress length^3 / time",
             "power that turnover releases at the row's F, without growth",
@@ -347,7 +348,7 @@ def columns_of(
     of_loads = (
         kind.make_column(name)
         for name, kind in kinds.items()
-        if not kind.frees_length or loads is None or name in loads or kind.column_name(name) in requested
+        if not kind.makes_length_unknown or loads is None or name in loads or kind.column_name(name) in requested
     )
     always = (FIRST_COLUMN, *of_loads)
     of_regions = [column for name in regions for column in columns_of_region(name)]
@@ -382,6 +383,7 @@ def _support_force(face: str, m: Any) -> float:
     return float(m.support_force(face))
 
 
+@with_old_names
 @dataclass(frozen=True)
 class LoadKind:
     """Registry entry of a load of a shape.
@@ -402,12 +404,12 @@ class LoadKind:
         Names of the reduced kinematics that can apply the load.
     value
         Function of a measurement that returns the column's value; default: the load's magnitude.
-    frees_length
+    makes_length_unknown
         Whether the load makes the body's length an unknown. In scenes without the load its column
         is on request.
     area
         For a force: function of the shape that returns the reference area that carries it.
-    instead_of
+    replaces
         Name of another load that the load excludes.
     of_one_strain
         Whether the load is a strain of the whole body, for kinematics of uniform strain.
@@ -438,9 +440,9 @@ class LoadKind:
     above: float = -np.inf
     reductions: tuple[str, ...] = ()
     value: Callable[[Any], float] | None = None
-    frees_length: bool = False
+    makes_length_unknown: bool = False
     area: Callable[[Any], float] | None = None
-    instead_of: str = ""
+    replaces: str = ""
     of_one_strain: bool = False
 
     def column_name(self, name: str) -> str:
@@ -454,6 +456,7 @@ class LoadKind:
         return Column(self.column_name(name), unit, self.meaning, value)
 
 
+@with_old_names
 class End(NamedTuple):
     """Supports of a body's ends.
 
@@ -461,18 +464,18 @@ class End(NamedTuple):
     ----------
     hold
         Function of shape and loading that adds the supports.
-    frees_length
+    makes_length_unknown
         Whether the supports make the body's length an unknown.
 
     Examples
     --------
     >>> from remodel_fenicsx.parts import Tube
-    >>> {name: end.frees_length for name, end in Tube.ends.items()}
+    >>> {name: end.makes_length_unknown for name, end in Tube.ends.items()}
     {'free': False, 'clamped': False, 'closed': True}
     """
 
     hold: Callable[[Any, Loading], None]
-    frees_length: bool = False
+    makes_length_unknown: bool = False
 
 
 _Is: Any = with_key(
@@ -484,6 +487,7 @@ _Is: Any = with_key(
 )
 
 
+@with_old_names
 class Shape(_Is):  # type: ignore[misc]
     """Body of a scene.
 
@@ -513,7 +517,7 @@ class Shape(_Is):  # type: ignore[misc]
         Whether compressive loads may buckle the body.
     ends
         Supports of the ends, an `End` for each value of `supports.ends`.
-    depth_in_words
+    depth_labels
         Labels of `depth`: its direction, its value 0, and its value 1.
     angle_in_words
         Labels of the directions of fibre angles of 0 and 90 degrees.
@@ -564,7 +568,7 @@ class Shape(_Is):  # type: ignore[misc]
     reductions: ClassVar[dict[str, reduced.Reduction]] = {}
     buckles: ClassVar[bool] = True
     ends: ClassVar[dict[str, End]] = {"free": End(lambda shape, loading: shape.hold(loading))}
-    depth_in_words: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
+    depth_labels: ClassVar[tuple[str, str, str]] = ("along the body", "bottom", "top")
     angle_in_words: ClassVar[tuple[str, str]] = ("along the load", "across")
     constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
@@ -745,7 +749,7 @@ class Shape(_Is):  # type: ignore[misc]
         """
         return []
 
-    def fills(self, regions: Collection[str]) -> bool:
+    def covers_body(self, regions: Collection[str]) -> bool:
         """Return whether these regions of a scene, by name, cover the body."""
         return False
 
@@ -860,7 +864,7 @@ class WithRegions(Shape):
         for name, region in regions.items():
             if region.outer_radius is not None:
                 rule = f"the mesh defines the regions of a {self.name}; only a tube has this key"
-                raise fault(rule, f"regions.{name}.outer_radius", region.outer_radius)
+                raise validation_error(rule, f"regions.{name}.outer_radius", region.outer_radius)
 
 
 class Unloads(Shape):
@@ -873,9 +877,9 @@ class FromFile(Shape):
 
 def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
     """Check that Gmsh can mesh a body of these lengths, or raise the fault at its key."""
-    found = length_fault(lengths)
+    found = mesh_length_problem(lengths)
     if found is not None:
-        raise fault(found[1], found[0], getattr(shape, found[0]))
+        raise validation_error(found[1], found[0], getattr(shape, found[0]))
 
 
 def axial_dead_force(face: str) -> LoadKind:
@@ -934,7 +938,7 @@ def uniaxial_columns(top: str, length: str) -> Columns:
             "mean_fibre_angle",
             "degrees",
             "angle between chains and load axis in the reference configuration, volume mean",
-            lambda m: m.quadrature.mean_of_known(m.fibre_angle),
+            lambda m: m.quadrature.nanmean(m.fibre_angle),
         ),
     )
 

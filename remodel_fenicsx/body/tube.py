@@ -31,7 +31,7 @@ from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import Mesh
-from remodel_fenicsx.schema.tables import fault, shown
+from remodel_fenicsx.schema.tables import validation_error, format_value
 from remodel_fenicsx.schema.units import FORCE, LENGTH, STRESS
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def _mean_hoop_stress(m: Any) -> float:
     local = m.state.cells.local_axes
     around = np.linalg.norm(np.einsum("...ij,...j->...i", m.F, local.axes[..., 0, :]), axis=-1)
     radii = np.linalg.norm(local.coordinates[..., :2], axis=-1)
-    return m.quadrature.mean_of_known(m.wall_stress[..., 0], np.linalg.det(m.F) / (radii * around))
+    return m.quadrature.nanmean(m.wall_stress[..., 0], np.linalg.det(m.F) / (radii * around))
 
 
 def _layer_angle(share: float) -> AngleOf:
@@ -176,7 +176,7 @@ def _layer_angle(share: float) -> AngleOf:
 
     def mean(m: Any, angle: Array) -> float:
         inner, outer = (m.domain.dimensions[f"{face}_radius"] for face in FACES)
-        return m.quadrature.mean_of_known(angle, m.elements_touching_radius((1.0 - share) * inner + share * outer))
+        return m.quadrature.nanmean(angle, m.elements_touching_radius((1.0 - share) * inner + share * outer))
 
     return mean
 
@@ -199,7 +199,7 @@ def _elongation(m: Any) -> float:
 
 
 def _of_the_end(name: str, m: Any) -> float:
-    """Return `of_the_wall` or `reduced` of an `EndForce`."""
+    """Return `wall_force` or `reduced` of an `EndForce`."""
     return float(getattr(m.end_force("inner"), name)(m.state.loading.values.get("pressure", 0.0)))
 
 
@@ -229,7 +229,7 @@ def _opening_angle(m: Any) -> float:
     rows = np.column_stack([m.quadrature.volumes.reshape(-1), *columns])
     owned = m.quadrature.owned(rows.reshape(*m.quadrature.shape, -1))
     rows = np.concatenate(comm.allgather(owned.reshape(-1, rows.shape[1])))
-    edges, parts = m.tool("cut", lambda: _elements_through(m.domain, m.quadrature.element_degree))
+    edges, parts = m.cached("cut", lambda: _elements_through(m.domain, m.quadrature.element_degree))
     volumes, means = means_through(rows[:, 1], rows[:, 0], rows[:, 1:], parts)
     (radii, density), (squared, changed, turnover) = means[:, :2].T, np.split(means[:, 2:], [3, 6], axis=1)
     rings = Rings(radii, volumes * density, changed * at_first(radii), squared)
@@ -300,7 +300,7 @@ class Tube(RoundWall):
             "ends, in addition to the pressure on caps; the length is then an unknown",
             FORCE,
             reductions=tuple(REDUCTIONS),
-            frees_length=True,
+            makes_length_unknown=True,
             value=partial(_of_the_end, "of_the_wall"),
             area=lambda shape: shape.section_area,
         ),
@@ -352,7 +352,7 @@ class Tube(RoundWall):
     reductions = REDUCTIONS
     ends = Shape.ends | {
         "clamped": End(lambda shape, loading: shape.clamp(loading)),
-        "closed": End(lambda shape, loading: shape.close(loading), frees_length=True),
+        "closed": End(lambda shape, loading: shape.close(loading), makes_length_unknown=True),
     }
     supported_faces = ("outer",)
     # With global axes a tube of isotropic cells would not stay round in the first step.
@@ -373,18 +373,18 @@ class Tube(RoundWall):
             from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # few tubes need it
 
             add_support(loading, face, support, modulus, None)
-            if loading.kinematics.moves_rigidly:
+            if loading.kinematics.has_rigid_modes:
                 warn_of_twist(face, support, loading.domain.comm)
 
     def wall(self, elements: int, regions: Regions) -> Wall:
         """Return its wall with so many elements through it."""
-        return Wall.of(self.inner_radius, self.outer_radius, elements, regions)
+        return Wall.from_regions(self.inner_radius, self.outer_radius, elements, regions)
 
     @model_validator(mode="after")
     def _has_a_wall(self) -> Tube:
         if self.inner_radius >= self.outer_radius:
-            limit = f"must be smaller than geometry.outer_radius = {shown(self.outer_radius)}"
-            raise fault(limit, "inner_radius", self.inner_radius)
+            limit = f"must be smaller than geometry.outer_radius = {format_value(self.outer_radius)}"
+            raise validation_error(limit, "inner_radius", self.inner_radius)
         wall = self.outer_radius - self.inner_radius
         check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
         return self

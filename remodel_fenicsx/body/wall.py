@@ -11,14 +11,14 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from remodel_fenicsx.body.gmsh_model import length_fault
+from remodel_fenicsx.body.gmsh_model import mesh_length_problem
 from remodel_fenicsx.body.shape import Column, Columns, Regions, Shape, Unloads, WithRegions
 from remodel_fenicsx.model.axes import LocalAxes
-from remodel_fenicsx.model.cells import pitch_angle, radial_share
+from remodel_fenicsx.model.cells import pitch_angle, radial_fraction
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import Natural, Region
-from remodel_fenicsx.schema.tables import fault, shown
+from remodel_fenicsx.schema.tables import validation_error, format_value
 
 if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
@@ -36,7 +36,7 @@ class Wall(NamedTuple):
     counts: tuple[int, ...]
 
     @classmethod
-    def of(cls, inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> Wall:
+    def from_regions(cls, inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> Wall:
         """Return the wall of a scene's regions with these elements, at least one a layer."""
         order = sorted(regions, key=lambda name: _outer(regions[name], outer_radius)) or ["body"]
         inside = [_outer(regions[name], outer_radius) for name in order[:-1]]
@@ -73,28 +73,28 @@ def shared_out(thicknesses: list[float], elements: int) -> tuple[int, ...]:
 
 def check_layers(inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> None:
     """Check that the regions are layers of the wall, with at least one element each."""
-    # A layer is at least as thick as Gmsh can mesh (`length_fault`).
+    # A layer is at least as thick as Gmsh can mesh (`mesh_length_problem`).
     seen: dict[float, str] = {}
     for name, region in regions.items():
         key, radius = f"regions.{name}.outer_radius", _outer(region, outer_radius)
         if not inner_radius < radius <= outer_radius:
-            limits = f"geometry.inner_radius = {shown(inner_radius)}, at most outer_radius = {shown(outer_radius)}"
-            raise fault(f"must be greater than {limits}", key, radius)
+            limits = f"geometry.inner_radius = {format_value(inner_radius)}, at most outer_radius = {format_value(outer_radius)}"
+            raise validation_error(f"must be greater than {limits}", key, radius)
         if radius in seen:
-            rule = f"regions.{seen[radius]} also ends at {shown(radius)}; outer radii must differ"
-            raise fault(rule, key, region.outer_radius)
+            rule = f"regions.{seen[radius]} also ends at {format_value(radius)}; outer radii must differ"
+            raise validation_error(rule, key, region.outer_radius)
         seen[radius] = name
     if regions and outer_radius not in seen:
         last = seen[max(seen)]
-        rule = f"must be geometry.outer_radius = {shown(outer_radius)} or omitted: outermost region"
-        raise fault(rule, f"regions.{last}.outer_radius", max(seen))
+        rule = f"must be geometry.outer_radius = {format_value(outer_radius)} or omitted: outermost region"
+        raise validation_error(rule, f"regions.{last}.outer_radius", max(seen))
     if len(regions) > elements:
         rule = f"{len(regions)} regions, {elements} elements through the wall; increase mesh.refinement"
-        raise fault(rule, "regions", None)
+        raise validation_error(rule, "regions", None)
     for inside, radius in itertools.pairwise([inner_radius, *sorted(seen)]):
         key = f"regions.{seen[radius]}.outer_radius"
-        if (found := length_fault({key: radius - inside, "geometry.outer_radius": outer_radius})) is not None:
-            raise fault(f"the layer is {found[1]}", key, radius)
+        if (found := mesh_length_problem({key: radius - inside, "geometry.outer_radius": outer_radius})) is not None:
+            raise validation_error(f"the layer is {found[1]}", key, radius)
 
 
 # ---------------------------------------------------------------- stress-free configurations
@@ -187,7 +187,7 @@ SECOND_LAYER = 1.5  # depth over layer thickness, between the start of the secon
 
 def _stress(where: str, mean: AngleOf, component: int, m: Any) -> float:
     if where in FACES:
-        return float(m.tool_of_step(("stress at", where), lambda: _fitted_to_face(where, m))[component])
+        return float(m.cached_for_step(("stress at", where), lambda: _fitted_to_face(where, m))[component])
     return mean(m, m.wall_stress[..., component])
 
 
@@ -199,7 +199,7 @@ def _fitted_to_face(face: str, m: Any) -> Array:
     from remodel_fenicsx.fem.compat import geometry_dofmap
 
     quadrature, comm = m.quadrature, m.domain.comm
-    inner, outer = (m.tool(("area", name), lambda name=name: m.face_area(name)) for name in FACES)
+    inner, outer = (m.cached(("area", name), lambda name=name: m.face_area(name)) for name in FACES)
     widening, depths = outer / inner - 1, m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
     if face == "outer":
         widening, depths = inner / outer - 1, 1 - depths
@@ -239,7 +239,7 @@ class Walled(Shape):
             "radial_share",
             "",
             "fraction of the chains that points out of the wall, volume mean of A_rr / tr A",
-            lambda m: m.quadrature.mean_of_known(m.radial_share),
+            lambda m: m.quadrature.nanmean(m.radial_share),
             by_case=False,
         ),
     )
@@ -248,14 +248,14 @@ class Walled(Shape):
         "fibre_angle_middle": 0.5,
         "fibre_angle_outer": 1.0,
     }
-    depth_in_words = ("through the wall", "inside", "outside")
+    depth_labels = ("through the wall", "inside", "outside")
     angle_in_words = ("around", "along")
 
     @classmethod
     def region_columns_on_request(cls, name: str) -> Columns:
         """Return columns of the stresses in the region's wall."""
         words = f"of the region `{name}`"
-        return stress_columns({name: (words, lambda m, v: m.quadrature.mean_of_known(v, m.elements_of_region(name)))})
+        return stress_columns({name: (words, lambda m, v: m.quadrature.nanmean(v, m.elements_of_region(name)))})
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Return the pitch of chains, degrees, (...,): circumferential 0, axial 90, else NaN."""
@@ -263,7 +263,7 @@ class Walled(Shape):
 
     def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Return the fraction of the chains across the wall, A_rr / tr A, (...,)."""
-        return radial_share(dimensions, axes, local)
+        return radial_fraction(dimensions, axes, local)
 
 
 class RoundWall(Walled, WithRegions, Unloads):
@@ -296,6 +296,6 @@ class RoundWall(Walled, WithRegions, Unloads):
             found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
         return found
 
-    def fills(self, regions: Collection[str]) -> bool:
+    def covers_body(self, regions: Collection[str]) -> bool:
         """Return whether there are regions; the outermost one ends at the outer radius."""
         return bool(regions)

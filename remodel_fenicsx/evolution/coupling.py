@@ -11,18 +11,19 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import allreduce
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import FROM_EXPECTED, FROM_LAST, Attempt, attempted, say
-from remodel_fenicsx.solver.continuation import Blend, Change, Work
+from remodel_fenicsx.solver.continuation import CellHomotopy, Continuation, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
-from remodel_fenicsx.state import Earlier, Numbers, State
+from remodel_fenicsx.state import FieldHistory, StateNumbers, State
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -30,10 +31,10 @@ log = logging.getLogger(__name__)
 
 # Record of a target at one point.
 TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])
-NEVER = -1.0  # time of a target before the first one
+NO_TIME = -1.0  # time of a target before the first one
 # Smallest switch of a target that counts. The cells change less by a smaller one than by a step's
 # error.
-COUNTS = 0.01
+MIN_TARGET_WEIGHT = 0.01
 # Number of rates that predict the next one, and number of rates to which the weights are fitted.
 ORDER, FITTED = 3, 2
 SAME_RATE = 1e-9  # relative tolerance of equal load rates
@@ -61,8 +62,8 @@ class Predictor:
     def __init__(self, state: State):
         self.state = state
         # Rates are increments over the duration of their steps, so that the step size may change.
-        self._speeds = Earlier(state, "predictor_speed", state.unknown.copy, ORDER + FITTED)
-        self._numbers = Numbers(state, "predictor", {f"rate_{name}": 0.0 for name in state.loading.values})
+        self._speeds = FieldHistory(state, "predictor_speed", state.unknown.copy, ORDER + FITTED)
+        self._numbers = StateNumbers(state, "predictor", {f"rate_{name}": 0.0 for name in state.loading.values})
 
     def expected(self, step: LoadStep) -> Array | None:
         """Return predicted unknowns with boundary values, ghosts included; None if unknown."""
@@ -98,7 +99,7 @@ class Predictor:
     def _weights(self, speeds: list[Array]) -> Array:
         """Fit the newest rates by the rates before them, by least squares. Collective."""
         rows = np.array([speed[: self.state.number_of_owned_unknowns] for speed in speeds])
-        products = over_ranks(self.state.comm, rows @ rows.T, MPI.SUM)
+        products = allreduce(self.state.comm, rows @ rows.T, MPI.SUM)
         matrix, right = np.zeros((ORDER, ORDER)), np.zeros(ORDER)
         for k in range(FITTED):
             matrix += products[k + 1 : k + 1 + ORDER, k + 1 : k + 1 + ORDER]
@@ -106,6 +107,7 @@ class Predictor:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=INDEPENDENT)[0], dtype=np.float64)
 
 
+@with_old_names
 class Traits(NamedTuple):
     """Properties of a coupling's time discretisation error, for adaptive time stepping.
 
@@ -115,19 +117,19 @@ class Traits(NamedTuple):
         Order of the error in the step size.
     accumulates
         Whether the errors of steps accumulate; otherwise the row lags behind by a step.
-    longest
+    max_scaled_step
         Largest adaptive step times kappa; an explicit rule oscillates with larger steps.
 
     Examples
     --------
     >>> from remodel_fenicsx.extend import Traits
-    >>> Traits(order=2, accumulates=True).longest
+    >>> Traits(order=2, accumulates=True).max_scaled_step
     inf
     """
 
     order: int
     accumulates: bool
-    longest: float = math.inf
+    max_scaled_step: float = math.inf
 
 
 class Coupling(Protocol):
@@ -157,7 +159,7 @@ class Coupling(Protocol):
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> coupling = Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.coupling
     >>> coupling.traits
-    Traits(order=1, accumulates=False, longest=inf)
+    Traits(order=1, accumulates=False, max_scaled_step=inf)
     """
 
     equilibrium: Equilibrium
@@ -166,7 +168,7 @@ class Coupling(Protocol):
     tangents: int
 
     @property
-    def better(self) -> UnitCell | None:
+    def higher_order_cells(self) -> UnitCell | None:
         """Cells of a higher-order rule, (n, 3) and (n, 3, 3), after `remodel`; or None."""
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -203,6 +205,7 @@ class Coupling(Protocol):
         """Free the PETSc objects of the coupling."""
 
 
+@with_old_names
 class Staggered:
     """Paper's coupling: equilibrium with the previous cells, then one remodeling pass.
 
@@ -240,11 +243,11 @@ class Staggered:
         self.equilibrium.compile_energy()
         self.newton = GuardedNewton(self.equilibrium, settings)
         self.predictor = None if settings.predictor == "none" else Predictor(state)
-        self._last = Numbers(state, "last_solution", {"extension": 0.0})  # largest r/L
+        self._last = StateNumbers(state, "last_solution", {"extension": 0.0})  # largest r/L
         self.residual = 0.0
         self.tangents = 0  # assembled in the last solve of the state
         changes = any(process.changes for process in (remodeling, *remodeling.beside))
-        self.blend = Blend(state, tissue, settings) if changes else None
+        self.blend = CellHomotopy(state, tissue, settings) if changes else None
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Solve for equilibrium at `time` with the present cells.
@@ -255,13 +258,13 @@ class Staggered:
             If no admissible equilibrium is found.
         """
         self._before(time)
-        return self.balanced(time, loads)
+        return self.solve_equilibrium(time, loads)
 
     def _before(self, time: float) -> None:
         for process in self.remodeling.beside:
             process.before(time, self.traits.order)
 
-    def balanced(self, time: float, loads: LoadValues, again: bool = False) -> Work:
+    def solve_equilibrium(self, time: float, loads: LoadValues, again: bool = False) -> Work:
         """Solve for equilibrium with remodeled values; call `settle` of remodeling processes.
 
         Parameters
@@ -281,10 +284,10 @@ class Staggered:
         before = unknown.x.array.copy()
         step = LoadStep.between(time - state.time, old_loads, loads)
         self._solve(step, time, old_loads, loads, work, again)
-        self._whole(time, old_loads, loads).look_back(before, work, again)
+        self._combined_change(time, old_loads, loads).check_for_jump(before, work, again)
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
-        state.settle_cells()
+        state.mark_cells_in_equilibrium()
         self.residual = work.residual
         work.extension = work.extension or self.equilibrium.extension()
         self._last["extension"] = work.extension.max_chain_extension
@@ -304,9 +307,9 @@ class Staggered:
         return sum(process.after(time) for process in self.remodeling.beside)
 
     @property
-    def better(self) -> UnitCell | None:
+    def higher_order_cells(self) -> UnitCell | None:
         """Cells after a full pass with the row's stress; the row's cells lag behind by a step."""
-        return self.remodeling.asked
+        return self.remodeling.full_pass_cells
 
     def close(self) -> None:
         """Free the PETSc objects of the coupling."""
@@ -348,7 +351,7 @@ class Staggered:
             return False
         unknown = self.state.unknown
         unknown.x.array[:] = expected
-        return self.newton.may_start(self._last["extension"])
+        return self.newton.is_admissible_start(self._last["extension"])
 
     def _tried(self, attempt: Attempt, work: Work, origin: Array | None = None) -> SolveFailure | None:
         """Solve from the present unknowns, and return the failure or None."""
@@ -371,18 +374,18 @@ class Staggered:
         if self.blend is not None and self._has_remodeled():
             blend = self.blend
             cell_change = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
-            Change(*cell_change, halvings, blend.largest_part, roughly=True).advance(work)
+            Continuation(*cell_change, halvings, blend.largest_part, loose_tolerance=True).advance(work)
             failure = None  # the loads were not yet tried from this state
 
         def set_load_fraction(fraction: float) -> None:
             loading.set(between(old_loads, new_loads, fraction))
 
         load_change = time, "the change of the loads", set_load_fraction, self.state, lambda: self.newton
-        Change(*load_change, halvings).advance(work, failure)
+        Continuation(*load_change, halvings).advance(work, failure)
         loading.set(new_loads)
         log.info("time %g solved in %d substeps", time, work.substeps)
 
-    def _whole(self, time: float, old_loads: LoadValues, new_loads: LoadValues) -> Change:
+    def _combined_change(self, time: float, old_loads: LoadValues, new_loads: LoadValues) -> Continuation:
         """Return the change of cells and loads together."""
         blend = self.blend if self.blend is not None and self._has_remodeled() else None
 
@@ -393,8 +396,10 @@ class Staggered:
 
         halvings = self.settings.maximum_halvings
         if blend is None:
-            return Change(time, "the step", set_fraction, self.state, lambda: self.newton, halvings)
-        return Change(time, "the step", set_fraction, self.state, lambda: blend.newton, halvings, blend.largest_part)
+            return Continuation(time, "the step", set_fraction, self.state, lambda: self.newton, halvings)
+        return Continuation(
+            time, "the step", set_fraction, self.state, lambda: blend.newton, halvings, blend.largest_part
+        )
 
     def _set_part(self, fraction: float) -> None:
         """Apply a fraction of the remodeling since the last solved state."""
@@ -420,7 +425,7 @@ class Extrapolated(Staggered):
 
     # See docs/theory.md, Extrapolated coupling.
 
-    traits = Traits(order=2, accumulates=True, longest=0.5)
+    traits = Traits(order=2, accumulates=True, max_scaled_step=0.5)
 
     def __init__(self, state: State, tissue: Tissue, remodeling: RemodelingPass, settings: Solver):
         super().__init__(state, tissue, remodeling, settings)
@@ -432,7 +437,7 @@ class Extrapolated(Staggered):
         self._newest: NDArray[np.void]
         self._older: NDArray[np.void]
         self._newest, self._older = np.moveaxis(memory.view(TARGET)[..., 0], 1, 0)
-        self._newest["time"] = self._older["time"] = NEVER
+        self._newest["time"] = self._older["time"] = NO_TIME
         state.remember(targets)
         self._power = 0.0
         self._start: UnitCell  # the cells at the start of the step
@@ -441,10 +446,10 @@ class Extrapolated(Staggered):
         self._duration = 0.0  # duration of the step
 
     @property
-    def better(self) -> UnitCell:
+    def higher_order_cells(self) -> UnitCell:
         """Cells by the targets at both ends of the step, or only by the first target of a point."""
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
-        mean = known(self._older).towards(self._solved_target, weight)
+        mean = target_from_records(self._older).towards(self._solved_target, weight)
         mean = mean.where(self._begins, self._solved_target)
         return self.remodeling.followed(mean, self._duration, self._start)
 
@@ -454,14 +459,14 @@ class Extrapolated(Staggered):
         self._start, expected = cells.point_cells.copy(), self._extrapolated(time)
         self._follow(expected, time)
         self._before(time)
-        work = self.balanced(time, loads)
+        work = self.solve_equilibrium(time, loads)
         self._solved_target = self.remodeling.target(self.residual)
-        self._begins = (self._newest["switch"] < COUNTS) & (self._solved_target.switch >= COUNTS)
-        if not how_many(self.state, self._begins):
+        self._begins = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (self._solved_target.switch >= MIN_TARGET_WEIGHT)
+        if not count_points(self.state, self._begins):
             return work
         cells.set(*self._start[:2])
         self._follow(expected.where(self._begins, self._solved_target), time)
-        repeated = self.balanced(time, loads, again=True)
+        repeated = self.solve_equilibrium(time, loads, again=True)
         self._solved_target = self.remodeling.target(self.residual)
         repeated.substeps += work.substeps - 1
         repeated.count(work)
@@ -471,7 +476,7 @@ class Extrapolated(Staggered):
         """Record the target of the solved state; the cells are already those of the row."""
         self._duration = time - self.state.time
         self._older[:] = self._newest
-        self._older["time"][self._begins] = NEVER  # this step used the target of its end
+        self._older["time"][self._begins] = NO_TIME  # this step used the target of its end
         self._newest["direction"], self._newest["switch"] = self._solved_target
         self._newest["time"] = time
         return self._power + self._after(time)
@@ -479,35 +484,35 @@ class Extrapolated(Staggered):
     def _extrapolated(self, time: float) -> Target:
         """Return the target extrapolated to the middle of the step."""
         last, before = self._newest["time"], self._older["time"]
-        weight, has_both = np.zeros_like(last), before != NEVER
+        weight, has_both = np.zeros_like(last), before != NO_TIME
         weight[has_both] = (time - last[has_both]) / 2 / (last[has_both] - before[has_both])
-        return known(self._newest).towards(known(self._older), -weight)
+        return target_from_records(self._newest).towards(target_from_records(self._older), -weight)
 
     def _follow(self, target: Target, time: float) -> None:
         """Compute the cells after the step; use the last target if A would become indefinite."""
         duration = time - self.state.time
         self._power = 0.0
-        if not how_many(self.state, target.switch != 0.0):
+        if not count_points(self.state, target.switch != 0.0):
             return
         cells = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(cells.dimensions).all(axis=-1)
         if lost.any():
-            cells = self.remodeling.followed(target.where(lost, known(self._newest)), duration)
-        points = how_many(self.state, lost)
+            cells = self.remodeling.followed(target.where(lost, target_from_records(self._newest)), duration)
+        points = count_points(self.state, lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not extrapolated", time, points)
         self._power = self.remodeling.replace(cells, self.state.elastic_gradient(), duration)
 
 
-def how_many(state: State, points: Flags) -> int:
+def count_points(state: State, points: Flags) -> int:
     """Count selected points (n,) over all ranks. Collective."""
     quadrature = state.cells.quadrature
-    return int(over_ranks(state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM))
+    return int(allreduce(state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM))
 
 
-def known(records: NDArray[np.void]) -> Target:
+def target_from_records(records: NDArray[np.void]) -> Target:
     """Return the target stored in records of `TARGET`; zero before the first target."""
     return Target(records["direction"], records["switch"])
 
 
-Maker = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]
+CouplingFactory = Callable[[State, Tissue, RemodelingPass, Solver], Coupling]

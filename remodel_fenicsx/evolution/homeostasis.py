@@ -35,9 +35,9 @@ PATH_TOLERANCE, UNLOADING = 3.0, 0.5
 load reversal. With unloading, points lose their tension and keep the error of the path. The paper's
 artery takes 25 solves."""
 # Tolerance in degrees without error control, for steps whose error decays completely.
-UNCHECKED = 90.0
+NO_ERROR_CONTROL = 90.0
 # Largest step on the path times kappa. Larger steps would check slowly converging cells too rarely.
-LONGEST = 1.0
+MAX_STEP = 1.0
 LENGTHENING_OF_STEPS, LONGEST_AT_END = 1.5, 8.0
 """Growth factor of the largest step under constant loads while changes decrease, and its limit
 times kappa. At the limit a step is a pass to the limit within 0.03 %."""
@@ -45,11 +45,11 @@ FRONT = 1.2
 """Difference of A over r0^2 between neighbouring points that indicates a front. Chains of one
 direction that rotate by 58 degrees have this difference. The paper's artery has 0.67 at most; tubes
 with a front had 1.35 to 1.41."""
-REST = 1e-4
+STEADY_TOLERANCE = 1e-4
 """Change of A over r0^2 in a time of 1/kappa at which the path ends. Changes of the slowest bodies
 seen decay at a twentieth of kappa: the remaining change before the tail is 0.002, a tenth of a
 degree."""
-LONGEST_HOLD = 100.0  # largest time under constant loads, times kappa
+MAX_HOLD = 100.0  # largest time under constant loads, times kappa
 # Change of A over r0^2 below which the tail is tried, and the factor by which it must decrease
 # before the next trial.
 NEAR_REST, AGAIN = 0.01, 0.5
@@ -84,7 +84,7 @@ class Homeostasis:
         self.remodels = [process for process in stepper.remodels if process.components]
         self.quadrature = self.state.cells.quadrature
         # No row of the path is a result; fronts report points with abrupt changes.
-        self.control = StepControl(stepper, plan.tolerance, plan.first, plan.stops, LONGEST, logging.INFO)
+        self.control = StepControl(stepper, plan.tolerance, plan.first, plan.stops, MAX_STEP, logging.INFO)
         self.steps, self._residual = 0, 0.0
         self._held: Snapshot | None = None  # the first state under constant loads
 
@@ -96,7 +96,7 @@ class Homeostasis:
         """Yield the steady state as one committed step."""
         self.stepper.start(watchers)
         for time in self.remaining():
-            yield self.stepper.advance(time, watchers, is_last=True, way=self)
+            yield self.stepper.advance(time, watchers, is_last=True, strategy=self)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Solve for the equilibrium of forces and of cells."""
@@ -105,41 +105,41 @@ class Homeostasis:
         self.steps, self._held = 0, None
         remembers = any(process.depends_on_path for process in self.remodels)
         traits = self.stepper.coupling.traits
-        coarsens = not (traits.accumulates or self.plan.tolerance >= UNCHECKED or remembers)
+        coarsens = not (traits.accumulates or self.plan.tolerance >= NO_ERROR_CONTROL or remembers)
         if self.plan.before_change is not None:
-            self._rest_before(*self.plan.before_change, work)
+            self._equilibrate_before_growth(*self.plan.before_change, work)
         held = max(start, self.plan.held_from)
-        self._go(self.control, time, loads, held, coarsens, work)
+        self._integrate(self.control, time, loads, held, coarsens, work)
         if coarsens and self._held is not None and self._largest_jump()[0] > FRONT:
             log.info("the cells have a front, which depends on the path; repeating it with error control")
             state.restore(self._held)
-            self._go(self.control, time, loads, held, False, work)
-        state.reach(start, number)
+            self._integrate(self.control, time, loads, held, False, work)
+        state.complete_step(start, number)
         for case in state.each_case().values():
-            case.settle_cells()
+            case.mark_cells_in_equilibrium()
         self._residual = work.residual
         return work
 
-    def _rest_before(self, held: float, change: float, work: Work) -> None:
+    def _equilibrate_before_growth(self, held: float, change: float, work: Work) -> None:
         """Integrate to the steady state under constant loads, then start waiting processes."""
         stops = [*(stop for stop in self.plan.stops if stop <= held), self.plan.stops[-1]]
         control = self.control.with_stops(stops)
         with self.stepper.holding(held):
-            self._go(control, stops[-1], self.stepper.load_values(held), held, False, work)
-        self.state.settle_cells()
+            self._integrate(control, stops[-1], self.stepper.load_values(held), held, False, work)
+        self.state.mark_cells_in_equilibrium()
         log.info("steady state reached after %d steps, before time %g", self.steps, change)
         for process in self.remodels:
             process.rested(change)
-        self.state.reach(change, self.state.number)
+        self.state.complete_step(change, self.state.number)
 
-    def _go(
+    def _integrate(
         self, control: StepControl, time: float, loads: LoadValues, held: float, coarsens: bool, work: Work
     ) -> None:
         """Integrate from the present state to the steady state."""
         # The error of a lagging row vanishes in the steady state, unless the cells reach another
         # one. The steady state of turnover depends on the path.
         state, waiting = self.state, 0.0
-        before, longest = np.inf, LONGEST
+        before, longest = np.inf, MAX_STEP
         try_below = NEAR_REST
         for process in self.remodels:
             process.begin_path()
@@ -154,7 +154,7 @@ class Homeostasis:
             if state.time < held:
                 continue
             if coarsens:
-                control.limit(UNCHECKED, longest)
+                control.limit(NO_ERROR_CONTROL, longest)
             ahead, solved = state.snapshot(), state.equilibrium_cells
             self._held = self._held or ahead
             # The cells of the present stress.
@@ -163,35 +163,35 @@ class Homeostasis:
             # A step larger than 1/kappa counts as 1/kappa.
             waiting += min(1.0, self.stepper.slowest * (state.time - start))
             start = state.time
-            is_over = self._is_over(change, waiting)
+            is_over = self._has_converged(change, waiting)
             if (is_over or change <= try_below) and (self._add_tail(time, loads, work) or is_over):
                 return
             work.residual, try_below = residual, min(try_below, AGAIN * change)
             state.restore(ahead)
             if coarsens:
                 longer = min(LENGTHENING_OF_STEPS * longest, LONGEST_AT_END)
-                longest, before = longer if change < before else LONGEST, change
-                control.limit(UNCHECKED, longest)
+                longest, before = longer if change < before else MAX_STEP, change
+                control.limit(NO_ERROR_CONTROL, longest)
 
     def _left(self, residual: float) -> float:
         """Return the largest relative change in a time of 1/kappa."""
         soon = self.state.time + 1 / self.stepper.slowest
         return max(process.left(soon, residual) for process in self.remodels)
 
-    def _is_over(self, change: float, waiting: float) -> bool:
+    def _has_converged(self, change: float, waiting: float) -> bool:
         """Return whether the path ends, because of equilibrium or because there is none."""
-        if change <= REST:
+        if change <= STEADY_TOLERANCE:
             return True
         if without := [text for process in self.remodels if (text := process.without_rest(waiting))]:
-            self._say(logging.WARNING, without[0])
+            self._log(logging.WARNING, without[0])
             return True
-        if waiting > LONGEST_HOLD:
+        if waiting > MAX_HOLD:
             text = (
                 "the cells have not reached equilibrium: a time of 1/kappa still changes the state "
                 "by %.2g of its size. Set time.end to a late time to follow the history"
             )
-            self._say(logging.WARNING, text, change)
-        return waiting > LONGEST_HOLD
+            self._log(logging.WARNING, text, change)
+        return waiting > MAX_HOLD
 
     # ------------------------------------------------------------ the tail of the decay
     def _add_tail(self, time: float, loads: LoadValues, work: Work) -> bool:
@@ -210,7 +210,7 @@ class Homeostasis:
             for process, change in zip(self.remodels, changes, strict=True):
                 process.follow(change, factor, time, residual)
             soon = state.time + 1 / self.stepper.slowest
-            outcome = attempted(partial(coupling.balanced, soon, loads, again=True), StepFailure)
+            outcome = attempted(partial(coupling.solve_equilibrium, soon, loads, again=True), StepFailure)
             if isinstance(outcome, StepFailure):
                 log.info("extrapolation of the path stopped: %s", outcome)
                 state.restore(before)
@@ -252,7 +252,7 @@ class Homeostasis:
         r0 = assembly.point_values(self.stepper.tissue.end_to_end_length, quadrature)
         tensors = self.state.cells.structure_tensor() / r0[..., None, None] ** 2
         fields = [quadrature.owned(values) for values in (quadrature.coordinates, tensors)]
-        all_ranks = zip(*assembly.of_all_ranks(quadrature.mesh.comm, fields), strict=True)
+        all_ranks = zip(*assembly.allgather(quadrature.mesh.comm, fields), strict=True)
         positions, structure = (
             np.concatenate([values.reshape(-1, size) for values in arrays])
             for arrays, size in zip(all_ranks, (3, 9), strict=True)
@@ -263,19 +263,19 @@ class Homeostasis:
         point, neighbour = np.unravel_index(int(jumps.argmax()), jumps.shape)
         return float(jumps.max()), (positions[point] + positions[neighbours[point, neighbour]]) / 2
 
-    def _say(self, level: int, text: str, *values: float) -> None:
+    def _log(self, level: int, text: str, *values: float) -> None:
         if self.state.comm.rank == 0:
             log.log(level, text, *values)
 
     def remodel(self, time: float) -> float:
         """Log the distance to the cells of the row's own stress, fronts, and slack regions."""
-        self.remodeling.look_ahead(time, self._residual)
+        self.remodeling.predict_limit(time, self._residual)
         quadrature, r0 = self.quadrature, self.remodeling.parameters.largest().end_to_end_length
         distance = self.remodeling.distance() / r0**2
-        self._say(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", distance, self.steps)
+        self._log(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", distance, self.steps)
         jump, position = self._largest_jump()
         if jump > FRONT:
-            self._say(
+            self._log(
                 NOTICE,
                 "the cells have a front near %.4g, %.4g, %.4g: A jumps by %.2g r0^2. Its position "
                 "depends on the load path, time.tolerance and the mesh (docs/theory.md)",
@@ -284,7 +284,7 @@ class Homeostasis:
             )
         slack = self.remodeling.without_tension(self._residual).reshape(quadrature.shape)
         if fraction := quadrature.mean(slack.astype(float)):
-            self._say(
+            self._log(
                 NOTICE,
                 "%.3g %% of the body carries no tension in equilibrium; the cells there depend on "
                 "the load path (docs/theory.md)",

@@ -63,7 +63,7 @@ class Remodels:
     tissue: Tissue | None = None
     watchers: Sequence[Callable[[Scene, Stepper], Watcher | None]] = ()
 
-    def begin_with(self, values: Callable[[str], Array]) -> None:
+    def set_initial(self, values: Callable[[str], Array]) -> None:
         """Set the initial values from fields of an earlier run by name, (elements, points, ...)."""
 
     # ------------------------------------------------------------ a step
@@ -88,7 +88,7 @@ class Remodels:
     def row(self) -> Values:
         """Return the values of the solved state."""
 
-    def better(self) -> Values:
+    def higher_order(self) -> Values:
         """Return the values of a higher-order rule after a step, or None."""
 
     def set(self, values: Values) -> None:

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import Remembered, coefficient, over_ranks, point_values
-from remodel_fenicsx.kernels import TensorKernels, in_numpy
+from remodel_fenicsx.fem.assembly import CachedValue, coefficient, allreduce, point_values
+from remodel_fenicsx.kernels import TensorKernels, uses_numpy
 from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
-from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, carried_axes
+from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, convected_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, relaxed, tensor_target
-from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above
+from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, switch_threshold
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
-from remodel_fenicsx.state import Numbers, State, stress_rounding
+from remodel_fenicsx.state import StateNumbers, State, stress_rounding
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -38,9 +38,9 @@ TYPICAL_SHARE = 1e-2
 # Stress of the residual over the body's stress above which a warning is logged. For the artery on
 # one radius with the law "tensor", radii are within 0.1 % at 0.02 to 0.05; at 0.4 their error is 2
 # %.
-WORTH_A_WORD = 0.1
+WARNED_RESIDUAL_FRACTION = 0.1
 STRESS_ROUNDINGS = 64.0  # error of a principal value over the rounding of a stress
-AWAKE = 0.5  # switch below which a point counts as a point without tension
+MIN_ACTIVATION = 0.5  # switch below which a point counts as a point without tension
 LOOSE_SOLVER = (
     "the residual may correspond to stresses of up to %.2g (stress in the body: %.2g); stresses "
     "below %.2g are treated as zero. Lower solver.relative_tolerance or solver.absolute_tolerance"
@@ -74,26 +74,26 @@ class RemodelingPass(Remodels):
         # Drives of further load cases, which have the same cells.
         self.further: list[Callable[[], Drive]] = []
         # Relaxation factor of a pass's change of the cells.
-        self.relaxation = settings.relaxation_factor if COUPLINGS[settings.coupling].makes_a_share else 1.0
+        self.relaxation = settings.relaxation_factor if COUPLINGS[settings.coupling].relaxes else 1.0
         self.parameters = state.parameters(tissue)
         self.driver, self.law = DRIVERS[settings.driver], LAWS[settings.law]
         self.frame = FRAMES[settings.frame]
         self.set_kappa(settings.kappa if kappa is None else kappa)
-        if self.fastest == 0.0 and self.law.asks_kappa:  # cells that never change need no pass
+        if self.fastest == 0.0 and self.law.stops_at_zero_kappa:  # cells that never change need no pass
             self.law = LAWS["none"]
         if not self.law.remodels:
             return
         self._change: tuple[UnitCell, UnitCell] | None = None
         self.kernels = state.cells.kernels
-        self._numbers = Numbers(state, "noise", {"said": 0, "stress": 0.0, "floor": 0.0})
+        self._numbers = StateNumbers(state, "noise", {"said": 0, "stress": 0.0, "floor": 0.0})
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
         F = state.kinematics.elastic_gradient(state.unknown)
         self.stresses = PointStresses(state, tissue)
         tensor = ufl.as_ufl(self.driver.tensor(F, self.stresses.ufl))
         self._expression = jit.expression(tensor, self.quadrature.points)
-        self._cached_tensor: Remembered[Array] = Remembered(state.comm, tensor)
+        self._cached_tensor: CachedValue[Array] = CachedValue(state.comm, tensor)
         self._target = self.law.target
-        if self._target is tensor_target and not settings.has_set_point and not in_numpy():
+        if self._target is tensor_target and not settings.has_set_point and not uses_numpy():
             self._target = TensorKernels(state.comm).target  # exponent 2, no threshold
 
     @property
@@ -144,10 +144,10 @@ class RemodelingPass(Remodels):
         # Principal axes of the driver for which the cells' axes would stay.
         steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
-            steady = carried_axes(F, steady)
+            steady = convected_axes(F, steady)
         return Drive(
             F,
-            self.kernels.without_noise(tensor, steady, noise),
+            self.kernels.drop_noise_shear(tensor, steady, noise),
             self.driver,
             self.frame,
             noise,
@@ -173,24 +173,24 @@ class RemodelingPass(Remodels):
         rounding = STRESS_ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
         state = self.state
         displacement = float(np.abs(state.unknown.x.array).max(initial=0.0))
-        displacement = over_ranks(state.comm, displacement, MPI.MAX)
+        displacement = allreduce(state.comm, displacement, MPI.MAX)
         rounded = rounding * (1 + self.quadrature.largest_gradient * displacement)
         squares = np.sum(tensor**2, axis=(1, 2)).reshape(self.quadrature.shape)
         typical = float(np.sqrt(self.quadrature.mean(squares)))
         unbalanced = RESIDUAL_SHARE * residual / self._smallest_area
         limit = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
-        if unbalanced > max(WORTH_A_WORD * typical, limit) and not self._numbers["said"]:
+        if unbalanced > max(WARNED_RESIDUAL_FRACTION * typical, limit) and not self._numbers["said"]:
             self._numbers["said"] = 1
             if state.comm.rank == 0:
                 log.warning(LOOSE_SOLVER, unbalanced, typical, limit)
         noise = Noise(rounded + min(unbalanced, limit), rounding)
         if self.law.target is not None and typical > self._numbers["stress"]:
-            self._numbers["stress"], self._numbers["floor"] = typical, float(floor_above(*noise))
+            self._numbers["stress"], self._numbers["floor"] = typical, float(switch_threshold(*noise))
         return noise
 
-    def weakness(self) -> float:
+    def relative_switch_threshold(self) -> float:
         """Return the half-weight tension over the body's largest stress so far; 0 without loads."""
-        # Laws with a target remodel more slowly below this tension (`tensor_law.floor_above`).
+        # Laws with a target remodel more slowly below this tension (`tensor_law.switch_threshold`).
         if not self.law.remodels or self.law.target is None or not self.driver.is_stress:
             return 0.0
         stress, floor = self._numbers["stress"], self._numbers["floor"]
@@ -230,11 +230,11 @@ class RemodelingPass(Remodels):
         """Return flags (n,) of points with no or hardly any tension, whose cells stay."""
         drive = self.drive(residual)
         if self.law.target is not None:
-            return np.asarray(self.target(residual).switch < AWAKE)
+            return np.asarray(self.target(residual).switch < MIN_ACTIVATION)
         values = np.linalg.eigvalsh(drive.tensor)
         return ~spectral.positive_direction(values, threshold=drive.noise)[1]
 
-    def asleep_share(self) -> float:
+    def inactive_fraction(self) -> float:
         """Return the volume fraction without a principal value above `remodeling.threshold`."""
         tensor = self.drive().tensor if self.further else self.driving_tensor()[1]
         asleep = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
@@ -247,7 +247,7 @@ class RemodelingPass(Remodels):
         return self.law.follow(cells or self.state.cells.point_cells, target, r0, self.kappa * duration)
 
     @property
-    def asked(self) -> UnitCell | None:
+    def full_pass_cells(self) -> UnitCell | None:
         """Cells of the last pass before relaxation; None before the first pass."""
         return self._change[1] if self.law.remodels and self._change is not None else None
 
@@ -255,7 +255,7 @@ class RemodelingPass(Remodels):
         """Remodel over a step with the stress of the solved state at time_new; return the power."""
         # The power is the stored energy that the pass releases at frozen deformation, per time, to
         # first order (`Tissue.energy_increment`; Remark 6). A principal stress above `noise` counts
-        # as tension. The factor `relaxation` applies to the change of the cells (`Law.share`).
+        # as tension. The factor `relaxation` applies to the change of the cells (`Law.relax`).
         full_pass, F = self.updated_cells(time_old, time_new, residual)
         return self.replace(full_pass, F, time_new - time_old, self.relaxation)
 
@@ -263,13 +263,13 @@ class RemodelingPass(Remodels):
         """Replace the cells with a relaxation factor; return the power at frozen F."""
         cells = self.state.cells
         self._change = cells.point_cells.copy(), full_pass
-        updated = self.law.share(self._change[0], full_pass, factor)
+        updated = self.law.relax(self._change[0], full_pass, factor)
         increment = self.parameters.at_points().energy_increment(F, self._change[0], updated)
         power: float = 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
         cells.set(*updated[:2])
         return power
 
-    def look_ahead(self, time: float, residual: float = 0.0) -> None:
+    def predict_limit(self, time: float, residual: float = 0.0) -> None:
         """Record the cells of a pass to the limit for `distance`; the state does not change."""
         # The time of the steady state is so late that the start has decayed (`Scene.last_time`). A
         # pass to twice that time leads to the limit.
@@ -302,7 +302,9 @@ class RemodelingPass(Remodels):
 
     def moved(self, values: UnitCell, change: Array) -> UnitCell:
         """Return cells after a change of A, in Mandel components."""
-        squared, axes = spectral.continued(structure_tensor(*values[:2]) + tensors.from_mandel(change), values.axes)
+        squared, axes = spectral.principal_by_continuity(
+            structure_tensor(*values[:2]) + tensors.from_mandel(change), values.axes
+        )
         return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
     def passed(self, values: UnitCell, time: float, residual: float) -> UnitCell:

@@ -9,21 +9,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
+from remodel_fenicsx._renamed import with_old_arguments, with_old_names
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Coupling, Maker
+from remodel_fenicsx.evolution.coupling import Coupling, CouplingFactory
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.remodeling import RemodelingPass
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling, Solver
-from remodel_fenicsx.solver.continuation import Change, Work
-from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
+from remodel_fenicsx.solver.continuation import Continuation, Work
+from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits
 from remodel_fenicsx.solver.newton import GuardedNewton
-from remodel_fenicsx.state import Numbers, State
+from remodel_fenicsx.state import StateNumbers, State
 from remodel_fenicsx.system.interrupts import Paused
 
 if TYPE_CHECKING:
@@ -35,9 +37,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SLOWNESS = 5  # steps between two checks of slow changes; a check costs up to a third of a step
+CHECK_INTERVAL = 5  # steps between two checks of slow changes; a check costs up to a third of a step
 
 
+@with_old_names
 @dataclass
 class Step:
     """Step, from its solution to its end.
@@ -80,14 +83,14 @@ class Step:
     ...     print(step.number, step.time, step.loads, step.work.newton_iterations)
     1 1.0 {'force': 1.0} 4
     2 2.0 {'force': 2.0} 3
-    >>> round(step.extension.max_chain_extension, 4), step.moment
+    >>> round(step.extension.max_chain_extension, 4), step.label
     (0.4769, 'time 2')
     """
 
     time: float
     number: int
     loads: LoadValues
-    extension: Extension
+    extension: StateLimits
     work: Work
     remodeling_power: float = 0.0
     seconds: float = 0.0
@@ -102,10 +105,10 @@ class Step:
     @property
     def is_due(self) -> bool:
         """Whether slow changes are checked: in the first, the last, and every fifth step."""
-        return self.is_last or self.number % SLOWNESS == 1
+        return self.is_last or self.number % CHECK_INTERVAL == 1
 
     @property
-    def moment(self) -> str:
+    def label(self) -> str:
         """Label with the time, and the number of the load case if it is not the first."""
         return f"time {self.time:g}" + (f", load case {self.case}" if self.case > 1 else "")
 
@@ -154,6 +157,7 @@ class Watcher:
         """Free PETSc's objects of the watcher."""
 
 
+@with_old_names
 class WarnsOnce(Watcher):
     """Watcher that logs one warning at most once in a run, also if the run is resumed.
 
@@ -178,13 +182,13 @@ class WarnsOnce(Watcher):
     >>> class Stretched(WarnsOnce):
     ...     name = "stretched"
     ...
-    ...     def look(self, step):
+    ...     def check(self, step):
     ...         return "the cube is long" if step.row["mean_stretch"] > 1.5 else ""
-    >>> WATCHERS["stretched"] = WatcherKind(Stretched.of)
+    >>> WATCHERS["stretched"] = WatcherKind(Stretched.for_scene)
     >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
     >>> for step in simulation.steps():
     ...     pass
-    >>> simulation.watchers[-1].said
+    >>> simulation.watchers[-1].is_reported
     True
     >>> del WATCHERS["stretched"]
     """
@@ -196,10 +200,10 @@ class WarnsOnce(Watcher):
     def __init__(self, stepper: LoadCaseSolver):
         self.stepper, self.state = stepper, stepper.state
         self.quadrature = stepper.state.cells.quadrature
-        self._numbers = Numbers(self.state, self.name, {"said": 0} | dict(self.initial))
+        self._numbers = StateNumbers(self.state, self.name, {"said": 0} | dict(self.initial))
 
     @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> WarnsOnce | None:
+    def for_scene(cls, scene: Scene, stepper: Stepper) -> WarnsOnce | None:
         """Make the watcher of a scene's stepper or load case (`WATCHERS`), or return None.
 
         Parameters
@@ -217,7 +221,7 @@ class WarnsOnce(Watcher):
         return cls(stepper)
 
     @property
-    def said(self) -> bool:
+    def is_reported(self) -> bool:
         """Whether the warning was issued."""
         return bool(self._numbers["said"])
 
@@ -236,7 +240,7 @@ class WarnsOnce(Watcher):
         """
         return step.is_due
 
-    def look(self, step: Step) -> str:
+    def check(self, step: Step) -> str:
         """Check the solved state, and return the warning or an empty string.
 
         Parameters
@@ -253,10 +257,10 @@ class WarnsOnce(Watcher):
 
     def solved(self, step: Step) -> None:
         """Check the state until the warning is issued."""
-        if self.due(step) and not self.said and (text := self.look(step)):
-            self.find(step, text)
+        if self.due(step) and not self.is_reported and (text := self.check(step)):
+            self.emit(step, text)
 
-    def find(self, step: Step, text: str) -> None:
+    def emit(self, step: Step, text: str) -> None:
         """Issue the warning; it is logged when the step is accepted, and discarded otherwise.
 
         Parameters
@@ -267,7 +271,7 @@ class WarnsOnce(Watcher):
             One line without the time.
         """
         self._numbers["said"] = True
-        step.findings.append((self.level, f"{step.moment}: {text}"))
+        step.findings.append((self.level, f"{step.label}: {text}"))
 
 
 class LoadCaseSolver:
@@ -334,7 +338,7 @@ class Stepper(LoadCaseSolver):
         remodeling: Remodeling,
         solver: Solver,
         load_values: Callable[[float], LoadValues],
-        coupling: Maker | None = None,
+        coupling: CouplingFactory | None = None,
         kappa: float | Function | None = None,
     ):
         self.state, self._solver = state, solver
@@ -410,14 +414,15 @@ class Stepper(LoadCaseSolver):
                 watcher.started(step)
         return step
 
+    @partial(with_old_arguments, "advance")
     def advance(
         self,
         time: float,
         watchers: Sequence[Watcher] = (),
         is_last: bool = False,
         rejected: Step | None = None,
-        way: Homeostasis | None = None,
-        judge: Callable[[Step], object] = lambda step: None,
+        strategy: Homeostasis | None = None,
+        control_error: Callable[[Step], object] = lambda step: None,
     ) -> Step:
         """Advance by one step: equilibrium with the loads of `time`, and remodeling.
 
@@ -430,9 +435,9 @@ class Stepper(LoadCaseSolver):
         rejected
             Last rejected attempt at the step. Its work and seconds, which contain those of earlier
             attempts, are added to the step's.
-        way
+        strategy
             Strategy that solves and remodels in place of the coupling (`homeostasis.Homeostasis`).
-        judge
+        control_error
             Function that is called after the pass; if it raises, the step is rejected
             (`time_steps`).
 
@@ -459,23 +464,23 @@ class Stepper(LoadCaseSolver):
         if time <= state.time:
             raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
         with state.transaction():
-            work = (way or self.coupling).solve(time, self.load_values(time))
+            work = (strategy or self.coupling).solve(time, self.load_values(time))
             extension = work.extension or self.coupling.equilibrium.extension()
             if rejected is not None:
                 work.add(rejected.work)
             loads = dict(state.loading.values)  # also loads without a specified value
             step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
-            with undone_by_all(watchers, step):
+            with notify_undone(watchers, step):
                 for watcher in watchers:
                     watcher.solved(step)
-                step.remodeling_power = (way or self.coupling).remodel(time)
+                step.remodeling_power = (strategy or self.coupling).remodel(time)
                 step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
                 if rejected is not None:
                     step.seconds += rejected.seconds
                     step.processor_seconds += rejected.processor_seconds
-                judge(step)
-                state.reach(time, step.number)
+                control_error(step)
+                state.complete_step(time, step.number)
                 for watcher in watchers:
                     watcher.completed(step)
         if state.comm.rank == 0:
@@ -489,7 +494,7 @@ class Stepper(LoadCaseSolver):
         self,
         times: Iterable[float],
         watchers: Sequence[Watcher] = (),
-        judge: Callable[[Step], object] = lambda step: None,
+        control_error: Callable[[Step], object] = lambda step: None,
     ) -> Iterator[Step]:
         """Start, and yield each committed step up to the end of `times`.
 
@@ -499,7 +504,7 @@ class Stepper(LoadCaseSolver):
             Times of the steps, ascending.
         watchers
             Watchers of the steps.
-        judge
+        control_error
             See `advance`.
 
         Yields
@@ -510,7 +515,7 @@ class Stepper(LoadCaseSolver):
         remaining = list(times)
         self.start(watchers)
         for number, time in enumerate(remaining, start=1):
-            yield self.advance(time, watchers, is_last=number == len(remaining), judge=judge)
+            yield self.advance(time, watchers, is_last=number == len(remaining), control_error=control_error)
 
     def take(self, load_values: Callable[[float], LoadValues], kappa: float | Function) -> None:
         """Replace the loads and the rate kappa.
@@ -558,8 +563,10 @@ class Way(Protocol):
 class FixedSteps:
     """Time stepping with a constant step size."""
 
-    def __init__(self, stepper: Stepper, end: float, step: float, judge: Callable[[Step], object] = lambda step: None):
-        self.stepper, self.judge = stepper, judge
+    def __init__(
+        self, stepper: Stepper, end: float, step: float, control_error: Callable[[Step], object] = lambda step: None
+    ):
+        self.stepper, self.control_error = stepper, control_error
         self.end, self.step = end, step
 
     def remaining(self) -> list[float]:
@@ -568,7 +575,7 @@ class FixedSteps:
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Yield the committed steps from the present state to the end."""
-        return self.stepper.march(self.remaining(), watchers, self.judge)
+        return self.stepper.march(self.remaining(), watchers, self.control_error)
 
 
 def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work) -> None:
@@ -582,7 +589,9 @@ def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work
         G[:] = prestretch if fraction == 1.0 else identity + fraction * (prestretch - identity)
 
     with state.transaction(), closing(GuardedNewton(equilibrium, settings)) as newton:
-        change = Change(state.time, "the prestretch", set_fraction, state, lambda: newton, settings.maximum_halvings)
+        change = Continuation(
+            state.time, "the prestretch", set_fraction, state, lambda: newton, settings.maximum_halvings
+        )
         try:
             change.advance(work)
         finally:
@@ -591,7 +600,7 @@ def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work
 
 
 @contextmanager
-def undone_by_all(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
+def notify_undone(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
     """Call `undone` of all watchers, the last first, if the block raises."""
     try:
         yield

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels, Values
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, Watcher
-from remodel_fenicsx.model.tensors import largest_change_of_length
+from remodel_fenicsx.model.tensors import max_stretch_increment
 from remodel_fenicsx.solver.attempts import SHORTER_STEP, attempted, say
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.state import Earlier, Numbers
+from remodel_fenicsx.state import FieldHistory, StateNumbers
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -55,10 +55,10 @@ class TimeError:
         # Names of the errors of rows so far; "row" is that of the cells.
         self._errors = ["row" if process is stepper.remodeling else process.name for process in self.remodels]
         initial = {"speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0}
-        self._numbers = Numbers(stepper.state, "time_error", initial | dict.fromkeys(self._errors, 0.0))
+        self._numbers = StateNumbers(stepper.state, "time_error", initial | dict.fromkeys(self._errors, 0.0))
         # The last error if rows lag behind, otherwise the last row.
         self._last = [
-            Earlier(
+            FieldHistory(
                 stepper.state,
                 f"time_error_{process.name}",
                 partial(self.quadrature.function, "", (process.components,)),
@@ -85,18 +85,20 @@ class TimeError:
         return estimate
 
     def _better(self, process: Remodels) -> Values:
-        return self.stepper.coupling.better if process is self.stepper.remodeling else process.better()
+        return (
+            self.stepper.coupling.higher_order_cells if process is self.stepper.remodeling else process.higher_order()
+        )
 
     # ------------------------------------------------------------ rows that lag behind
     def _lag(self, step: Step, rows: AllValues, betters: AllValues, duration: float) -> float:
         """Return the error of a lagging row, by a pass after the linear response of the body."""
-        first_betters, angle = betters, self._apart(rows, betters)
+        first_betters, angle = betters, self._distance(rows, betters)
         with self.state.tentative():
             strain, admissible = self._strain(step, self._expected(rows, betters, duration))
             if admissible:
                 pairs = zip(self.remodels, rows, strict=True)
                 betters = [process.passed(row, step.time, step.work.residual) for process, row in pairs]
-        limit, angle = SLOWEST * angle, self._apart(rows, betters)
+        limit, angle = SLOWEST * angle, self._distance(rows, betters)
         if angle > limit:  # the pass leads to another state, to which this state does not tend
             betters, angle = first_betters, limit
         for process, last, row, better in zip(self.remodels, self._last, rows, betters, strict=True):
@@ -115,8 +117,8 @@ class TimeError:
 
     # ------------------------------------------------------------ accumulating errors
     def _added_up(self, step: Step, rows: AllValues, betters: AllValues, duration: float) -> Estimate:
-        decay_rate = self._fading(step, rows, duration)
-        amplification = self._answer(decay_rate, duration)
+        decay_rate = self._decay_rate(step, rows, duration)
+        amplification = self._stress_amplification(decay_rate, duration)
         numbers, strain = self._numbers, 0.0
         limits, errors = [], []
         if any(better is not None for better in betters):
@@ -126,13 +128,13 @@ class TimeError:
         for process, name, row, better in zip(self.remodels, self._errors, rows, _known(betters, rows), strict=True):
             error = max(process.apart(row, better), strain if process is self.stepper.remodeling else 0.0)
             # Bounded rates do not change for longer than the cells do.
-            limits.append(_end_of(error, max(self.kappa, process.slowest) * duration))
+            limits.append(_accumulated_error(error, max(self.kappa, process.slowest) * duration))
             rate = min(decay_rate, process.slowest) if decay_rate else process.slowest
             numbers[name] = float(np.exp(-rate * duration)) * numbers[name] + error
             errors.append(numbers[name])
         return Estimate(amplification * max(limits), max(errors))
 
-    def _fading(self, step: Step, rows: AllValues, duration: float) -> float:
+    def _decay_rate(self, step: Step, rows: AllValues, duration: float) -> float:
         """Return the decay rate of errors, from changes that slow down under constant loads."""
         numbers, speed = self._numbers, 0.0
         shape = self.quadrature.shape
@@ -153,7 +155,7 @@ class TimeError:
         numbers["speed"], numbers["fading"] = speed, decay_rate
         return decay_rate
 
-    def _answer(self, decay_rate: float, duration: float) -> float:
+    def _stress_amplification(self, decay_rate: float, duration: float) -> float:
         """Return the amplification of an error by the stress since loads are constant."""
         # It tends to kappa over the decay rate.
         decay = float(np.exp(-decay_rate * duration))
@@ -173,7 +175,7 @@ class TimeError:
         )
 
     # ------------------------------------------------------------ distances
-    def _apart(self, rows: AllValues, betters: AllValues) -> float:
+    def _distance(self, rows: AllValues, betters: AllValues) -> float:
         """Return the largest distance over all remodeling processes, in degrees."""
         return max(process.apart(*pair) for process, *pair in zip(self.remodels, rows, betters, strict=True))
 
@@ -192,7 +194,7 @@ class TimeError:
         state, equilibrium = case.state, case.coupling.equilibrium
         state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
         after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
-        changes = np.minimum(largest_change_of_length(before, after), LARGEST_LINEAR_CHANGE)
+        changes = np.minimum(max_stretch_increment(before, after), LARGEST_LINEAR_CHANGE)
         changes = changes.reshape(self.quadrature.shape)
         return float(np.degrees(self.quadrature.maximum(changes))), admissible
 
@@ -202,7 +204,7 @@ def _known(betters: AllValues, rows: AllValues) -> AllValues:
     return [row if better is None else better for better, row in zip(betters, rows, strict=True)]
 
 
-def _end_of(difference: float, forgotten: float) -> float:
+def _accumulated_error(difference: float, forgotten: float) -> float:
     """Return the limit of an error that each step increases and damps by exp(-forgotten)."""
     fraction = float(-np.expm1(-forgotten))
     return difference / fraction if fraction else difference
@@ -212,7 +214,7 @@ def _end_of(difference: float, forgotten: float) -> float:
 # The step size follows from the errors of earlier steps. A step with too large an error is
 # rejected.
 
-AIM = 0.85  # the next step aims at this fraction of the tolerance
+SAFETY_FACTOR = 0.85  # the next step aims at this fraction of the tolerance
 KEPT, WORTHWHILE = 0.9, 1.5  # optimal over present step size between which the size stays
 LENGTHENING, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two step sizes
 HALVED = 0.5  # largest factor after a second rejection, because the error hardly decreases
@@ -223,13 +225,13 @@ SMALLEST = 2.0**-12  # minimum over the first step: unsolved steps are not reduc
 FASTEST = 360.0
 # Number of steps of minimum size above the tolerance, in the time of `_fastest_time`, after which
 # larger steps follow.
-IN_VAIN = 20
+MAX_FUTILE_STEPS = 20
 NEAR_TOLERANCE = 4.0  # error over the tolerance below which smaller steps are tried again
 FAILED_STEPS = 3  # maximum number of failed steps in sequence, each a quarter of the step before
-TELLING_ERROR = 1e-4  # smallest error over the tolerance that affects the next step size
+MIN_ERROR = 1e-4  # smallest error over the tolerance that affects the next step size
 
 
-class StepTooLongError(Exception):
+class StepRejectedError(Exception):
     """Step rejected because its error exceeds the tolerance."""
 
     def __init__(self, step: Step, duration: float, error: float):
@@ -256,14 +258,14 @@ class StepControl:
         self.level = level  # of warnings about steps above the tolerance
         # "before" is the error of the last step, "usual" the step size within the tolerance.
         initial = {"wanted": first, "before": 1.0, "usual": first, "in_vain": 0.0, "said": 0.0}
-        self._numbers = Numbers(stepper.state, "step_control", initial)
-        self._rejected: list[StepTooLongError] = []  # rejected attempts at the present step
+        self._numbers = StateNumbers(stepper.state, "step_control", initial)
+        self._rejected: list[StepRejectedError] = []  # rejected attempts at the present step
         self.limit(tolerance, longest)
 
     def limit(self, tolerance: float, longest: float) -> None:
         """Set the tolerance in degrees, and the largest step times kappa."""
         traits = self.stepper.coupling.traits
-        self.tolerance, self.longest = tolerance, min(longest, traits.longest)
+        self.tolerance, self.longest = tolerance, min(longest, traits.max_scaled_step)
 
     def with_stops(self, stops: Sequence[float]) -> StepControl:
         """Return a copy with other breakpoints."""
@@ -289,15 +291,22 @@ class StepControl:
         while True:
             time = self._end_of_step(duration, stop)
             before = self._rejected[-1].step if self._rejected else None
-            advance = partial(self.stepper.advance, time, watchers, time == self.stops[-1], before, judge=self._judge)
-            outcome = attempted(advance, StepFailure, StepTooLongError)
+            advance = partial(
+                self.stepper.advance,
+                time,
+                watchers,
+                time == self.stops[-1],
+                before,
+                control_error=self._accept_or_reject,
+            )
+            outcome = attempted(advance, StepFailure, StepRejectedError)
             if isinstance(outcome, Step):
                 return outcome
-            if isinstance(outcome, StepTooLongError):
+            if isinstance(outcome, StepRejectedError):
                 log.debug("time %g: %s; step rejected", time, outcome)
                 self._rejected.append(outcome)
                 max_factor = 1.0 if len(self._rejected) == 1 else HALVED
-                duration = max(self._best(outcome.error, outcome.duration, max_factor), self._shortest())
+                duration = max(self._optimal_step(outcome.error, outcome.duration, max_factor), self._shortest())
                 continue
             failures += 1
             duration = (time - self.state.time) / 4
@@ -313,36 +322,38 @@ class StepControl:
         return stop if number <= 1 else time + interval / number
 
     # ------------------------------------------------------------ within the step's transaction
-    def _judge(self, step: Step) -> None:
+    def _accept_or_reject(self, step: Step) -> None:
         """Accept a step and choose the next step size, or raise."""
         error, duration = self.error.measure(step).controlled / self.tolerance, step.time - self.state.time
         numbers, shortest = self._numbers, self._shortest()
-        goes_on = numbers["in_vain"] > IN_VAIN
+        goes_on = numbers["in_vain"] > MAX_FUTILE_STEPS
         if error > 1 and not (goes_on or duration <= (1 + 1e-9) * STRETCHED * shortest):
-            raise StepTooLongError(step, duration, error)
+            raise StepRejectedError(step, duration, error)
         next_step = self._next(error, duration)
         goes_on = self._count(error, duration)
         if step.time_error > self.tolerance and error > 1 and numbers["said"] < 1 + goes_on:
             numbers["said"] = 1.0 + goes_on
-            self._say(step, goes_on)
+            self._log(step, goes_on)
         fastest = self.stepper.fastest
         next_step = max(numbers["usual"] if goes_on else next_step, shortest)
         numbers["wanted"] = min(next_step, self.longest / fastest if fastest else next_step)
-        numbers["before"] = max(error, TELLING_ERROR)
+        numbers["before"] = max(error, MIN_ERROR)
 
-    def _best(self, error: float, duration: float, max_factor: float) -> float:
+    def _optimal_step(self, error: float, duration: float, max_factor: float) -> float:
         """Return the step size with the intended error."""
         traits = self.stepper.coupling.traits
-        ratio = (AIM / max(error, TELLING_ERROR)) ** (1 / traits.order)
+        ratio = (SAFETY_FACTOR / max(error, MIN_ERROR)) ** (1 / traits.order)
         return duration * min(max_factor, max(SHRINKAGE, ratio))
 
     def _next(self, error: float, duration: float) -> float:
         """Return the next step size, the present one within the deadband."""
         if self._rejected:
-            return self._best(error, duration, 1.0)
+            return self._optimal_step(error, duration, 1.0)
         # A lagging error rises a second time after a larger step, by the same amount.
         present = self._numbers["wanted"]
-        best = self._best(error + max(0.0, error - self._numbers["before"]), duration, LENGTHENING * present / duration)
+        best = self._optimal_step(
+            error + max(0.0, error - self._numbers["before"]), duration, LENGTHENING * present / duration
+        )
         return present if KEPT * present <= best < WORTHWHILE * present else best
 
     # ------------------------------------------------------------ steps of minimum size
@@ -352,11 +363,11 @@ class StepControl:
         numbers["in_vain"] *= decay
         if error <= 1:
             numbers["usual"] = max(duration, decay * numbers["usual"])
-        elif numbers["in_vain"] <= IN_VAIN:
+        elif numbers["in_vain"] <= MAX_FUTILE_STEPS:
             numbers["in_vain"] += 1
         if error <= NEAR_TOLERANCE:
-            numbers["in_vain"] = min(numbers["in_vain"], IN_VAIN)
-        return numbers["in_vain"] > IN_VAIN
+            numbers["in_vain"] = min(numbers["in_vain"], MAX_FUTILE_STEPS)
+        return numbers["in_vain"] > MAX_FUTILE_STEPS
 
     def _shortest(self) -> float:
         """Return the minimum step size of error control."""
@@ -367,11 +378,11 @@ class StepControl:
         remodeling, fastest = self.stepper.remodeling, self.stepper.fastest
         after = self.remaining()[0]
         before = max([0.0, *(stop for stop in self.stops if stop < after)])
-        if remodeling.law.remodels and not remodeling.law.asks_kappa:
+        if remodeling.law.remodels and not remodeling.law.stops_at_zero_kappa:
             return min(after - before, remodeling.settings.rotation_time)
         return min(after - before, 1 / fastest) if fastest else after - before
 
-    def _say(self, step: Step, goes_on: bool) -> None:
+    def _log(self, step: Step, goes_on: bool) -> None:
         if self.state.comm.rank:
             return
         log.log(

@@ -17,8 +17,8 @@ from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TurnoverRates
 from remodel_fenicsx.schema.settings import Remodeling, Turnover
 from remodel_fenicsx.solver.continuation import StepFailure, Work
-from remodel_fenicsx.solver.diagnosis import Refusal
-from remodel_fenicsx.state import Earlier, Numbers, State
+from remodel_fenicsx.solver.diagnosis import FailureCause
+from remodel_fenicsx.state import FieldHistory, StateNumbers, State
 
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 
 # Smallest volume over the initial volume. Below it hardly any tissue is left, and the step fails.
 LEAST_VOLUME = 0.05
-GONE = Refusal("lost tissue", "lower remodeling.turnover.volume or gain, or raise the loads")
+TISSUE_LOST = FailureCause("lost tissue", "lower remodeling.turnover.volume or gain, or raise the loads")
 # Largest |change of ln rho| in a step, as in the prototype; inactive near a steady state.
 LARGEST_TURNOVER = 0.5
 # Change factor of the natural length above which the rates may end a path to the steady state.
-MUCH = 10.0
+MIN_UNBOUNDED_FACTOR = 10.0
 
 
 def changed(start: Array, rates: Array, duration: float) -> Array:
@@ -69,7 +69,7 @@ class Growth:
         """Return the volume fraction of collagen, phi m/(m_ref J_g), (elements, points)."""
         return np.asarray(self.settings.volume * content / (self._reference * self.ratio))
 
-    def begin_with(self, content: Array, ratio: Array) -> None:
+    def set_initial(self, content: Array, ratio: Array) -> None:
         """Set J_g, and m_ref so that it matches the content, from an earlier run."""
         volume = self.settings.volume
         self._reference[:] = content * volume / (ratio - 1.0 + volume)
@@ -87,10 +87,13 @@ class Growth:
         if self.quadrature.shape[1] > 1:
             # The strain of an element cannot follow a higher degree, which would alternate between
             # points.
-            ratio = ratio - self.quadrature.beyond(self.quadrature.element_degree - 1, ratio[..., None])[..., 0]
+            ratio = (
+                ratio
+                - self.quadrature.polynomial_residual(self.quadrature.element_degree - 1, ratio[..., None])[..., 0]
+            )
         if (smallest := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
             text = f"time {self.state.time:g}: tissue volume below {100 * LEAST_VOLUME:g} %"
-            raise StepFailure(self.state.time, f"{text} of its initial value: J_g = {smallest:.3g}", GONE)
+            raise StepFailure(self.state.time, f"{text} of its initial value: J_g = {smallest:.3g}", TISSUE_LOST)
         self.set(ratio)
 
     def set(self, ratio: Array) -> None:
@@ -98,15 +101,15 @@ class Growth:
         self._gradient[:] = self._initial - (1.0 - 1.0 / ratio)[..., None, None] * self._across
 
 
-class Slowing:
+class DecayMonitor:
     """Monitor that compares a rate with the rate at a quarter to a half of the time."""
 
     INITIAL = dict.fromkeys(("early_time", "early_rate", "late_time", "late_rate"), 0.0)
 
-    def __init__(self, numbers: Numbers | dict[str, float]):
+    def __init__(self, numbers: StateNumbers | dict[str, float]):
         self.numbers = numbers
 
-    def goes_on(self, elapsed: float, rate: float) -> bool:
+    def is_unbounded(self, elapsed: float, rate: float) -> bool:
         """Return whether the rate decays no faster than 1/t; False while this is unknown."""
         numbers = self.numbers
         if elapsed >= 2 * numbers["late_time"]:
@@ -134,23 +137,23 @@ class TurnoverPass(Remodels):
             state.remember(function)
         self._parameters = state.parameters(replace(tissue, **turned_over))
         self.tissue = self._parameters.tissue
-        self._numbers = Numbers(state, "turnover", {"duration": 0.0})
-        self._earlier = Earlier(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
+        self._numbers = StateNumbers(state, "turnover", {"duration": 0.0})
+        self._earlier = FieldHistory(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
         self.growth = Growth(state, settings) if state.kinematics.grows else None
         # `_before` has the values of the last solved state.
         self._start = self._before = self._row = self._better = self.logarithms()
-        self.watchers = (GrowthWithoutRest.of,)
+        self.watchers = (UnboundedGrowth.for_scene,)
         self._start_rates: Array | None = None  # used if the mean of both ends is of higher order
         self.begin_path()
 
-    def begin_with(self, values: Callable[[str], Array]) -> None:
+    def set_initial(self, values: Callable[[str], Array]) -> None:
         """Set content, natural length and J_g from fields of an earlier run."""
         for name in TURNED_OVER:
             self._values(name)[:] = values(name)
         self._start = self._before = self._row = self._better = self.logarithms()
         if self.growth is not None:
-            self.growth.begin_with(self._values("content"), values(GROWTH))
+            self.growth.set_initial(self._values("content"), values(GROWTH))
 
     # ------------------------------------------------------------ over a step
     def before(self, time: float, order: int) -> None:
@@ -196,7 +199,7 @@ class TurnoverPass(Remodels):
         """Return ln m and ln rho of the solved state."""
         return self._row
 
-    def better(self) -> Array:
+    def higher_order(self) -> Array:
         """Return the higher-order values, by the rates of the solved state."""
         return self._better
 
@@ -234,12 +237,12 @@ class TurnoverPass(Remodels):
 
     def begin_path(self) -> None:
         """Reset the monitor of the rates."""
-        self._slowing = Slowing(dict(Slowing.INITIAL))
+        self._slowing = DecayMonitor(dict(DecayMonitor.INITIAL))
 
     def without_rest(self, waiting: float) -> str:
         """Return a message if the natural length grew much and rates decay no faster than 1/t."""
-        goes_on = self._slowing.goes_on(waiting, self.quadrature.maximum(self.fastest_changes()))
-        if not goes_on or self.quadrature.maximum(self.factors("natural_length")) <= MUCH:
+        goes_on = self._slowing.is_unbounded(waiting, self.quadrature.maximum(self.fastest_changes()))
+        if not goes_on or self.quadrature.maximum(self.factors("natural_length")) <= MIN_UNBOUNDED_FACTOR:
             return ""
         return (
             "growth has not reached equilibrium: its rates decay no faster than 1/t "
@@ -266,7 +269,7 @@ class TurnoverPass(Remodels):
 
     def rates(self, present: bool = False) -> Array:
         """Return d ln m / dt and d ln rho / dt of the row, (2, n); mean over load cases."""
-        states = (self.state, *self.state.others)
+        states = (self.state, *self.state.other_cases)
         rates = [np.array(self._rates(state, present)) for state in states]
         return np.asarray(
             sum(weight * case_rates for weight, case_rates in zip(self.state.weights, rates, strict=True))
@@ -308,34 +311,34 @@ class TurnoverPass(Remodels):
 # ---------------------------------------------------------------- runs without a steady state
 # Turnover times before the rates are judged. In walls with a steady state they have risen and fall
 # by then.
-EARLY = 10.0
+MIN_TURNOVER_TIMES = 10.0
 FAR_FROM_REST = 0.01  # smallest change of ln m or ln rho per turnover time that is reported
 
 
-class GrowthWithoutRest(WarnsOnce):
-    """Warning at the end of a run whose turnover rates decay no faster than 1/t (`Slowing`)."""
+class UnboundedGrowth(WarnsOnce):
+    """Warning at the end of a run whose turnover rates decay no faster than 1/t (`DecayMonitor`)."""
 
-    name, initial = "growth", Slowing.INITIAL
+    name, initial = "growth", DecayMonitor.INITIAL
 
     def __init__(self, stepper: Stepper, held_from: float):
         super().__init__(stepper)
-        self.held_from, self._slowing = held_from, Slowing(self._numbers)
+        self.held_from, self._slowing = held_from, DecayMonitor(self._numbers)
         self.turnover = stepper.part(TurnoverPass.name)
 
     @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> GrowthWithoutRest:
+    def for_scene(cls, scene: Scene, stepper: Stepper) -> UnboundedGrowth:
         return cls(stepper, scene.end_of_ramps)
 
     def due(self, step: Step) -> bool:
         return step.time > self.held_from
 
-    def look(self, step: Step) -> str:
+    def check(self, step: Step) -> str:
         """Check the rates under constant loads."""
         elapsed, period = step.time - self.held_from, self.turnover.settings.time
         rates = self.turnover.fastest_changes()
         rate = self.quadrature.maximum(rates)
-        goes_on = self._slowing.goes_on(elapsed, rate)
-        if not (goes_on and step.is_last and elapsed >= EARLY * period and rate * period >= FAR_FROM_REST):
+        goes_on = self._slowing.is_unbounded(elapsed, rate)
+        if not (goes_on and step.is_last and elapsed >= MIN_TURNOVER_TIMES * period and rate * period >= FAR_FROM_REST):
             return ""
         return (
             "turnover has not reached equilibrium: content or natural length change by up to "

@@ -39,7 +39,7 @@ TOLERANCE = 1e-12
 ITERATION_LIMIT = 20_000  # a thousand elements in a line need some thousands
 
 
-def rigid_motions(space: FunctionSpace, matrix: PETSc.Mat) -> PETSc.NullSpace:
+def rigid_body_modes(space: FunctionSpace, matrix: PETSc.Mat) -> PETSc.NullSpace:
     """Return a vector space's rigid body modes, the near null space of multigrid. Collective."""
     place = matrix.createVecRight()
     place.array[:] = space.tabulate_dof_coordinates()[: place.getLocalSize() // 3].ravel()
@@ -56,7 +56,7 @@ def degree_one(space: FunctionSpace) -> tuple[FunctionSpace, PETSc.Mat]:
     return below, prolongation
 
 
-class DegreeOne:
+class PMultigrid:
     """Multigrid for elements of degree 2, with `degree_one` as the next level. Collective."""
 
     # All coarser levels then cost little.
@@ -72,7 +72,7 @@ class DegreeOne:
         self._coarse = matrix.PtAP(self._prolongation)
         self._coarse.setBlockSize(below.dofmap.bs)
         if elastic:
-            self._coarse.setNearNullSpace(rigid_motions(below, self._coarse))
+            self._coarse.setNearNullSpace(rigid_body_modes(below, self._coarse))
         self._options = ProblemOptions(multigrid_options(), {})
         pc.setType("mg")
         pc.setMGLevels(2)
@@ -97,11 +97,11 @@ class DegreeOne:
         self._coarse.destroy()
 
 
-class SolveStopped(ArithmeticError):
+class LinearSolveFailure(ArithmeticError):
     """Failure of an iterative linear solve to converge."""
 
 
-class Positive:
+class SpdSolver:
     """Linear solver for a positive definite form, used by several solves. Collective."""
 
     def __init__(self, bilinear: ufl.Form):
@@ -141,7 +141,7 @@ class Positive:
         solver.getPC().setType("gamg" if multigrid else "jacobi")
         levels = None
         if multigrid and self.space.ufl_element().degree > 1:
-            levels = DegreeOne(solver.getPC(), self._degree_one, matrix, elastic=False)
+            levels = PMultigrid(solver.getPC(), self._degree_one, matrix, elastic=False)
         solver.setInitialGuessNonzero(True)
         solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
         solver.solve(load, answer)
@@ -150,7 +150,7 @@ class Positive:
         for thing in (solver, load, *([levels] if levels else [])):
             thing.destroy()
         if reason < 0:
-            raise SolveStopped(f"no convergence in {iterations} iterations of the linear solve (reason {reason})")
+            raise LinearSolveFailure(f"no convergence in {iterations} iterations of the linear solve (reason {reason})")
         return unknown
 
 
@@ -159,7 +159,7 @@ T = TypeVar("T")
 # ---------------------------------------------------------------- over ranks
 
 
-def over_ranks(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
+def allreduce(comm: MPI.Intracomm, value: Any, operation: MPI.Op) -> Any:
     """Return the reduction of the values of all ranks, on all ranks. Collective."""
     # A Newton iteration needs about ten reductions, and a small problem on one rank has no time for
     # them.
@@ -171,12 +171,12 @@ def integral(form: Form) -> float:
     return float(form.mesh.comm.allreduce(np.real(dolfinx.fem.assemble_scalar(form)), MPI.SUM))
 
 
-def of_all_ranks(comm: MPI.Intracomm, value: Any) -> list[Any]:
+def allgather(comm: MPI.Intracomm, value: Any) -> list[Any]:
     """Return the values of all ranks, on all ranks. Collective."""
     return [value] if comm.size == 1 else comm.allgather(value)
 
 
-def agreed(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
+def raise_on_all_ranks(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
     """Return the result of `make`; raise a ValueError of any rank on all ranks. Collective."""
     made = refusal = None
     try:
@@ -233,7 +233,7 @@ def point_values(value: Constant | Function, quadrature: Quadrature) -> NDArray[
 # ---------------------------------------------------------------- cached values
 
 
-class Remembered(Generic[T]):
+class CachedValue(Generic[T]):
     """Cache of one value, valid until a function or constant of the expressions changes."""
 
     def __init__(self, comm: MPI.Intracomm | None, *expressions: Expr):
@@ -254,7 +254,7 @@ class Remembered(Generic[T]):
         numbers = [number.tobytes() for number in self._numbers]
         known = numbers == self._seen_numbers and all(map(np.array_equal, self._arrays, self._seen))
         if self._comm is not None:
-            known = bool(over_ranks(self._comm, known, MPI.LAND))
+            known = bool(allreduce(self._comm, known, MPI.LAND))
         if not known:
             self.forget()  # in case `make` fails
             self._value = make()

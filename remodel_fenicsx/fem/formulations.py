@@ -14,6 +14,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import Late
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ ufl, basix = Late("ufl"), Late("basix")
 Array = NDArray[np.float64]
 
 
-class Dilatation:
+class DiscreteFormulation:
     """Formulation on a mesh: energy, stresses and J that belong together; here J at all points."""
 
     jacobian: Any = None
@@ -67,6 +68,7 @@ class Dilatation:
         return np.empty((len(self.quadrature.elements), 0))
 
 
+@with_old_names
 class Formulation:
     """Formulation of elements: the points at which they take the volumetric part of the energy.
 
@@ -74,7 +76,7 @@ class Formulation:
     ----------
     meaning
         Description for docs/scene.md.
-    takes_parts
+    splits_energy
         Whether it needs a matrix energy with a separate volumetric part (`model.energy.Matrix`).
     locks
         Whether differences of J inside an element cost energy, so that nearly incompressible
@@ -86,15 +88,15 @@ class Formulation:
     >>> whole, selective = FORMULATIONS["displacement"], FORMULATIONS["selective-integration"]
     >>> whole.locks, selective.locks
     (True, False)
-    >>> selective.has("hexahedron", 1)
+    >>> selective.applies_to("hexahedron", 1)
     True
     """
 
     meaning: str
-    takes_parts: bool = False
+    splits_energy: bool = False
     locks: bool = True
 
-    def has(self, element: str, degree: int) -> bool:
+    def applies_to(self, element: str, degree: int) -> bool:
         """Return whether the formulation changes anything for an element.
 
         Parameters
@@ -106,17 +108,17 @@ class Formulation:
         """
         return True
 
-    def pays_above(self, element: str, degree: int) -> float:
+    def auto_threshold(self, element: str, degree: int) -> float:
         """Return the lambda/mu above which "auto" takes the formulation for an element.
 
         Parameters
         ----------
         element, degree
-            See `has`.
+            See `applies_to`.
         """
         return np.inf
 
-    def on(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> Dilatation:
+    def discretise(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> DiscreteFormulation:
         """Return the formulation for these unknowns at these quadrature points.
 
         Parameters
@@ -124,7 +126,7 @@ class Formulation:
         kinematics, unknown, quadrature
             Kinematics, dolfinx function of the unknowns, and quadrature points.
         """
-        return Dilatation(quadrature)
+        return DiscreteFormulation(quadrature)
 
 
 @dataclass(frozen=True)
@@ -153,38 +155,38 @@ class Selective(Formulation):
     pays
         Largest lambda/mu for which "auto" still takes J at all points, by element. Without an entry
         "auto" always does.
-    takes_parts, locks
+    splits_energy, locks
         See `Formulation`.
 
     Examples
     --------
     >>> from remodel_fenicsx.extend import Selective
     >>> selective = Selective("volume at one point", {("hexahedron", 1): 1})
-    >>> selective.has("hexahedron", 1), selective.has("tetrahedron", 1)
+    >>> selective.applies_to("hexahedron", 1), selective.applies_to("tetrahedron", 1)
     (True, False)
     """
 
     meaning: str
     degrees: Mapping[tuple[str, int], int]
     pays: Mapping[str, float] = MappingProxyType({})
-    takes_parts: bool = True
+    splits_energy: bool = True
     locks: bool = False
 
-    def has(self, element: str, degree: int) -> bool:
+    def applies_to(self, element: str, degree: int) -> bool:
         """Return whether there is a rule for the element."""
         return (element, degree) in self.degrees
 
-    def pays_above(self, element: str, degree: int) -> float:
+    def auto_threshold(self, element: str, degree: int) -> float:
         """Return `pays` of the element, or infinity if there is no rule for it."""
-        return self.pays.get(element, np.inf) if self.has(element, degree) else np.inf
+        return self.pays.get(element, np.inf) if self.applies_to(element, degree) else np.inf
 
-    def on(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> Dilatation:
+    def discretise(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> DiscreteFormulation:
         """Return the formulation with J at the points of the rule."""
         degree = self.degrees[quadrature.element_kind, quadrature.element_degree]
-        return _PartsApart(kinematics, unknown, quadrature, degree)
+        return _SplitFormulation(kinematics, unknown, quadrature, degree)
 
 
-class _PartsApart(Dilatation):
+class _SplitFormulation(DiscreteFormulation):
     def __init__(
         self,
         kinematics: Kinematics,

@@ -33,7 +33,7 @@ from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
-from remodel_fenicsx.system.interrupts import held_back, stopping_at_once
+from remodel_fenicsx.system.interrupts import held_back, raise_on_signal
 from remodel_fenicsx.system import NOTICE
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 
 TIMEOUT = 600  # seconds that FFCx waits for another process; `_compiling` removes what was cut off
 # Environment variable: file that gets a line per compiled kernel.
-COMPILED = "REMODEL_FENICSX_COMPILED"
+COMPILED_LOG_VARIABLE = "REMODEL_FENICSX_COMPILED"
 
 # There is no -ffast-math: NaN and infinity keep their meaning, which the guards rely on. Its macro
 # alone makes glibc's headers declare their SIMD logarithm (error at most 4 ulp), which vectorises
@@ -283,7 +283,7 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
     """Lock a kernel that the block compiles, log the compilation, and hold back signals."""
     # The compiler must not get signals either: terminals and batch systems send them to all
     # processes of a job.
-    with stopping_at_once(), _alone(kernel), held_back():
+    with raise_on_signal(), _exclusive(kernel), held_back():
         if _is_cached(kernel):  # compiled by the run that this one waited for
             yield
             return
@@ -292,8 +292,8 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
         yield
         log.info("compiled %s in %.1f s: %s", what, clock.monotonic() - start, kernel)
         _compiled.append(kernel)
-        if os.environ.get(COMPILED):
-            with open(os.environ[COMPILED], "a") as file:
+        if os.environ.get(COMPILED_LOG_VARIABLE):
+            with open(os.environ[COMPILED_LOG_VARIABLE], "a") as file:
                 file.write(f"{kernel}\n")
 
 
@@ -311,7 +311,7 @@ def _is_cached(kernel: str) -> bool:
 
 
 @contextmanager
-def _alone(kernel: str) -> Iterator[None]:
+def _exclusive(kernel: str) -> Iterator[None]:
     """Lock a kernel against other processes, and remove a compilation of it that was cut off."""
     # FFCx itself would wait for a compilation that was cut off: its .c file is the lock, and stays
     # if a process is killed. The lock here is the operating system's, which ends with its process.

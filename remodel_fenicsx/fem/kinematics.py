@@ -12,6 +12,7 @@ from typing import Any, ClassVar, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import Late
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ ufl, basix_ufl, fem = Late("ufl"), Late("basix.ufl"), Late("dolfinx.fem")
 Array = NDArray[np.float64]
 
 
+@with_old_names
 class Kinematics(ABC):
     """Meaning of the unknowns for forms, supports and results.
 
@@ -37,7 +39,7 @@ class Kinematics(ABC):
         scenes only.
     three_dimensional
         Whether the unknown is the displacement field of a mesh in three dimensions: F = I + grad u.
-    moves_rigidly
+    has_rigid_modes
         Whether the whole body can move across z or rotate about z. Supports at single nodes then
         constrain it.
     symmetry_planes
@@ -48,7 +50,7 @@ class Kinematics(ABC):
     suits_multigrid
         Whether algebraic multigrid converges for these unknowns.
     closing
-        Closed ring of a tube with residual stress (`model.residual_stress.Closing`); otherwise
+        Closed ring of a tube with residual stress (`model.residual_stress.ClosedRing`); otherwise
         None.
     grows
         Whether the tissue's volume changes in time (`volume_ratio`).
@@ -66,7 +68,7 @@ class Kinematics(ABC):
     meaning: ClassVar[str]
     reduced: ClassVar[bool] = True
     three_dimensional: ClassVar[bool] = False
-    moves_rigidly: ClassVar[bool] = False
+    has_rigid_modes: ClassVar[bool] = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {}
     homogeneous: ClassVar[bool] = False
     suits_multigrid: ClassVar[bool] = True
@@ -78,7 +80,7 @@ class Kinematics(ABC):
         """Return the kind of the mesh's elements for the kind that the scene sets."""
         return kind
 
-    def on(self, mesh: Mesh, body: Any) -> Kinematics:
+    def for_mesh(self, mesh: Mesh, body: Any) -> Kinematics:
         """Return the kinematics for the mesh of a body (`body.shape.Shape`)."""
         return self
 
@@ -170,7 +172,7 @@ class FullKinematics(Kinematics):
     meaning = "the displacement in three dimensions"
     reduced = False
     three_dimensional = True
-    moves_rigidly = True
+    has_rigid_modes = True
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
         """Return a vector function, zero."""
@@ -202,7 +204,7 @@ class SectorKinematics(FullKinematics):
     name = "sector"
     meaning = "the displacement in three dimensions on a quarter of a tube, between planes of symmetry"
     reduced = True
-    moves_rigidly = False
+    has_rigid_modes = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
 
     def weight(self, mesh: Mesh) -> Expr | float:
@@ -228,7 +230,7 @@ class _Reduced(Kinematics):
         """Return the kind of elements with fewer dimensions."""
         return self.element_kind
 
-    def on(self, mesh: Mesh, body: Any) -> Kinematics:
+    def for_mesh(self, mesh: Mesh, body: Any) -> Kinematics:
         """Return new kinematics, because their Constants belong to the mesh."""
         return type(self)(mesh, body)
 
@@ -377,7 +379,7 @@ KINEMATICS: dict[str, Kinematics] = {
 # ---------------------------------------------------------------- natural configuration
 
 
-class _Around:
+class _KinematicsWrapper:
     """Wrapper of other kinematics, `field`, for all that the subclass does not define."""
 
     field: Kinematics
@@ -392,7 +394,7 @@ class _Around:
         return self.elastic(self.deformation_gradient(unknown))
 
 
-class NaturalConfiguration(_Around):
+class NaturalConfiguration(_KinematicsWrapper):
     """Body with a stress-free (natural) configuration; G leads from it to the mesh, F_e = F G."""
 
     # G of growing tissue changes in time. `initial` is G at the start, to whose volume all amounts
@@ -424,7 +426,7 @@ class NaturalConfiguration(_Around):
 # ---------------------------------------------------------------- the length as an unknown
 
 
-class FreeLength(_Around):
+class FreeLength(_KinematicsWrapper):
     """Body whose length is an unknown too, for a prescribed axial force or pressure on end caps."""
 
     suits_multigrid = False  # GMRES with GAMG does not converge if a row is full
@@ -437,13 +439,13 @@ class FreeLength(_Around):
         element = self.field.unknown(mesh, degree).function_space.ufl_element()
         number = basix_ufl.element("DG", mesh.topology.cell_name(), 0)
         space = fem.functionspace(mesh, basix_ufl.mixed_element([element, number]))
-        unknown = fem.Function(with_one_value(space, 1), name="displacement")
+        unknown = fem.Function(global_constant_space(space, 1), name="displacement")
         nodes, self._dofs = unknown.function_space.sub(0).collapse()
         self._nodal = fem.Function(nodes)
         self._length = _constant(mesh, self.body.axial_length)
         return unknown
 
-    def change_of_length(self, unknown: Function) -> Expr:
+    def length_change(self, unknown: Function) -> Expr:
         """Return the change of length e, UFL, linear in the unknown."""
         return ufl.split(unknown)[1]
 
@@ -483,7 +485,7 @@ class FreeLength(_Around):
         return float(unknown.function_space.mesh.comm.allreduce(here, MPI.MAX)) / self.body.axial_length
 
 
-def with_one_value(space: FunctionSpace, component: int) -> FunctionSpace:
+def global_constant_space(space: FunctionSpace, component: int) -> FunctionSpace:
     """Return a mixed space whose DG0 component has one value for the whole mesh. Collective."""
     # The first rank with elements owns the value; it is a ghost on all other ranks with elements.
     import dolfinx.la

@@ -14,8 +14,9 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import of_all_ranks, over_ranks
+from remodel_fenicsx.fem.assembly import allgather, allreduce
 from remodel_fenicsx.fem.compat import geometry_dofmap
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def shape_functions(kind: str, degree: int, points: NDArray[np.float64]) -> NDAr
     return np.asarray(element.tabulate(1, points))[..., 0]
 
 
+@with_old_names
 class Quadrature:
     """Quadrature points of a mesh, with functions and reductions over them.
 
@@ -159,13 +161,13 @@ class Quadrature:
     def integral(self, values: NDArray[np.float64]) -> float:
         """Integrate values (elements or owned elements, points) over the body. Collective."""
         local = float((self.owned(values) * self.owned(self.volumes)).sum())
-        return float(over_ranks(self.mesh.comm, local, MPI.SUM))
+        return float(allreduce(self.mesh.comm, local, MPI.SUM))
 
     def mean(self, values: NDArray[np.float64]) -> float:
         """Return the volume mean of values (elements, points). Collective."""
         return self.integral(values) / self.volume
 
-    def mean_of_known(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
+    def nanmean(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
         """Return the volume mean over the points whose value is not NaN. Collective.
 
         The mean is NaN if all values are NaN.
@@ -204,7 +206,7 @@ class Quadrature:
         """Return the volume mean over each element, (elements, points, ...) to (elements, ...)."""
         return np.einsum("ep,ep...->e...", self._shares, values)
 
-    def element_mean_of_known(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def element_nanmean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return each element's volume mean without NaN, (elements, points) to (elements,)."""
         known = ~np.isnan(values)
         sums, shares = self.element_mean(np.where(known, values, 0.0)), self.element_mean(known.astype(np.float64))
@@ -215,7 +217,7 @@ class Quadrature:
         """Volume fraction of each quadrature point in its element, (elements, points)."""
         return self.volumes / self.volumes.sum(axis=1, keepdims=True)
 
-    def beyond(self, degree: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def polynomial_residual(self, degree: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values (owned elements, points, n) minus a least-squares polynomial.
 
         Each element has its own polynomial of this degree. In elements of a single point it is
@@ -258,11 +260,11 @@ class Quadrature:
         Values are extrapolated to the element's nodes, and compared with the mean over all elements
         there. The result has shape (owned elements,). Collective.
         """
-        continued = self._continuation @ values
+        continued = self._extrapolation @ values
         return np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
 
     @cached_property
-    def _continuation(self) -> NDArray[np.float64]:
+    def _extrapolation(self) -> NDArray[np.float64]:
         """Matrix from values at an element's points to those at its nodes, (nodes, points)."""
         functions = shape_functions(self.element_kind, self.mesh.geometry.cmap.degree, self.points)
         return np.asarray(np.linalg.pinv(functions[0]))
@@ -281,20 +283,20 @@ class Quadrature:
     def maximum(self, values: NDArray[np.float64]) -> float:
         """Return the largest of values (elements, ...) over all ranks. Collective."""
         local = float(np.max(self.owned(values), initial=-np.inf))
-        return float(over_ranks(self.mesh.comm, local, MPI.MAX))
+        return float(allreduce(self.mesh.comm, local, MPI.MAX))
 
-    def place_of_largest(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
+    def argmax_position(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
         """Return the reference position of the largest of values (elements, points). Collective."""
         owned = self.owned(values)
         local: tuple[float, tuple[float, float, float]] = (-np.inf, (np.nan, np.nan, np.nan))
         if owned.size:
             at = np.unravel_index(int(np.argmax(owned)), owned.shape)
             local = (float(owned[at]), tuple(self.coordinates[at].tolist()))
-        return max(of_all_ranks(self.mesh.comm, local), key=lambda found: found[0])[1]
+        return max(allgather(self.mesh.comm, local), key=lambda found: found[0])[1]
 
     def shown_place_of_largest(self, values: NDArray[np.float64]) -> str:
         """Return the reference position of the largest value as text. Collective."""
-        return f"({', '.join(f'{c:.4g}' for c in self.place_of_largest(values))})"
+        return f"({', '.join(f'{c:.4g}' for c in self.argmax_position(values))})"
 
     def minimum(self, values: NDArray[np.float64]) -> float:
         """Return the smallest of values (elements, ...) over all ranks. Collective."""

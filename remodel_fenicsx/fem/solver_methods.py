@@ -32,7 +32,7 @@ class SolverMethod:
     meaning
         Description for docs/scene.md, which lists the methods of the package.
     linear
-        Class that solves the linear systems, an `EveryTangent`, or its dotted name. Scenes are read
+        Class that solves the linear systems, an `FullNewton`, or its dotted name. Scenes are read
         without PETSc, which the class needs.
     on_several_ranks
         Options that replace those of the same name on several ranks.
@@ -53,7 +53,7 @@ class SolverMethod:
 
     options: Mapping[str, object]
     meaning: str = ""
-    linear: Callable[..., Any] | str = "remodel_fenicsx.solver.linear.EveryTangent"
+    linear: Callable[..., Any] | str = "remodel_fenicsx.solver.linear.FullNewton"
     on_several_ranks: Mapping[str, object] = field(default_factory=dict)
 
     @property
@@ -63,11 +63,11 @@ class SolverMethod:
 
 
 NEWTON = {"snes_type": "newtonls", "snes_linesearch_type": "basic"}
-BY_MUMPS = {
+MUMPS_LU = {
     "pc_type": "lu",
     "pc_factor_mat_solver_type": "mumps",
 }
-ON_ONE_RANK = {
+GATHERED_MUMPS_LU = {
     "pc_type": "telescope",
     "telescope_ksp_type": "preonly",
     "telescope_pc_type": "lu",
@@ -79,9 +79,9 @@ SOLVER_METHODS = {
     # from run to run. Therefore one rank has the whole matrix and factorises it, which costs little
     # for the sizes that are factorised at all.
     "direct": SolverMethod(
-        NEWTON | {"ksp_type": "preonly", **BY_MUMPS},
+        NEWTON | {"ksp_type": "preonly", **MUMPS_LU},
         "Newton's method; MUMPS factorises each system, and runs repeat to the last digit",
-        on_several_ranks=ON_ONE_RANK,
+        on_several_ranks=GATHERED_MUMPS_LU,
     ),
     LAGGED: SolverMethod(
         NEWTON | {"ksp_type": "preonly"},
@@ -138,21 +138,21 @@ FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
 # reduction has a small bandwidth: MUMPS is faster above 2,000 unknowns. A body in three dimensions
 # has much fill-in: `lagged` takes as long at about 200 unknowns, 0.6 of the time at 380, 0.4 at 650
 # and 0.25 at 1,500 (cubes and tubes of random cells, 40 steps).
-SMALL_REDUCTION, SMALL_BODY = 2000, 200
-LARGE = 100_000  # unknowns above which even a few factorisations cost more than multigrid
-WORTH_RANKS = 5_000  # unknowns below which a second rank costs more than it saves
+MAX_DIRECT_REDUCED, MAX_DIRECT_3D = 2000, 200
+MIN_MULTIGRID = 100_000  # unknowns above which even a few factorisations cost more than multigrid
+MIN_PARALLEL_UNKNOWNS = 5_000  # unknowns below which a second rank costs more than it saves
 
 
 def is_small(unknowns: int, reduced: bool) -> bool:
     """Return whether PETSc's own LU is the fastest for a reduction, or for a body in 3D."""
-    return unknowns <= (SMALL_REDUCTION if reduced else SMALL_BODY)
+    return unknowns <= (MAX_DIRECT_REDUCED if reduced else MAX_DIRECT_3D)
 
 
-def chosen(method: str, unknowns: int, reduced: bool, multigrid: bool = True) -> str:
+def resolve_auto(method: str, unknowns: int, reduced: bool, multigrid: bool = True) -> str:
     """Return the method, with `auto` resolved by the number of unknowns."""
     if method != AUTO:
         return method
-    if multigrid and unknowns > LARGE:
+    if multigrid and unknowns > MIN_MULTIGRID:
         return "iterative"
     return "direct" if is_small(unknowns, reduced) else LAGGED
 
@@ -199,7 +199,7 @@ _FILES = re.compile(r"_(?:dump|save|file)(?:_|$)", re.IGNORECASE)
 _FILE_OR_TERMINAL = re.compile(r"_print_subdomains$", re.IGNORECASE)
 
 
-def fault_of_option(name: str, value: str | float | bool) -> str | None:
+def option_problem(name: str, value: str | float | bool) -> str | None:
     """Return why a scene may not set this PETSc option; None if it may."""
     words = re.split(r"[,.]", value.lower()) if isinstance(value, str) else []
     if not _SOLVERS.fullmatch(name):

@@ -11,7 +11,7 @@ in C                replaces
 =================== ============================================================
 principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
-without_noise       model.spectral.without_noise
+drop_noise_shear       model.spectral.drop_noise_shear
 squared_length      model.energy.squared_end_to_end_length
 structure           model.cells.structure_tensor
 log_sum             model.energy.log_sum
@@ -43,7 +43,7 @@ from numpy.typing import ArrayLike, NDArray
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model import cells, energy, spectral, tensor_law, tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.drivers import rotated_back
+from remodel_fenicsx.model.drivers import corotational_tensor
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import Drive
 from remodel_fenicsx.system import NOTICE, environment
@@ -61,7 +61,7 @@ HEADER = "suitesparse/cholmod.h"
 C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}
 NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
 """Constants that tensor.c takes from Python."""
-FIRST = 5  # first version of CHOLMOD with single precision
+MIN_CHOLMOD_VERSION = 5  # first version of CHOLMOD with single precision
 
 
 def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
@@ -82,16 +82,16 @@ def declarations(text: str) -> list[str]:
     return re.findall(r"^((?!static)\w+ \w+\([^)]*\)(?=\n\{)|enum \{[^}]*\}(?=;))", text, flags=re.MULTILINE)
 
 
-def in_numpy() -> bool:
+def uses_numpy() -> bool:
     """Return whether numpy's functions replace those in C, and log that once."""
     if environment.kernels() == "numpy":
-        _say_so()
+        _log_numpy_once()
         return True
     return False
 
 
 @functools.cache
-def _say_so() -> None:
+def _log_numpy_once() -> None:
     if MPI.COMM_WORLD.rank == 0:
         log.log(NOTICE, "%s=numpy: using the numpy kernels (slower; for debugging)", environment.KERNELS)
 
@@ -127,7 +127,7 @@ class Library:
 
 def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
     """Return the tissue with its repulsion in C if that is `log`. Collective."""
-    if tissue.chain is None or tissue.repulsion.sum is not energy.log_sum or in_numpy():
+    if tissue.chain is None or tissue.repulsion.sum is not energy.log_sum or uses_numpy():
         return tissue
     kernels = TensorKernels(comm)
     return replace(
@@ -143,7 +143,7 @@ class PointKernels:
 
     principal: spectral.Pairing = staticmethod(spectral.principal)
     positive_direction: Callable[..., tuple[Array, Flags]] = staticmethod(spectral.positive_direction)
-    without_noise: Callable[..., Array] = staticmethod(spectral.without_noise)
+    drop_noise_shear: Callable[..., Array] = staticmethod(spectral.drop_noise_shear)
     structure_tensor: Callable[..., Array] = staticmethod(cells.structure_tensor)
 
     def squared_length(self, F: Array, cell: UnitCell) -> Array:
@@ -164,7 +164,7 @@ class CompiledPointKernels(PointKernels):
         tensors, previous = np.asarray(tensors), np.asarray(previous)
         n, limit = len(tensors), np.broadcast_to(threshold, len(tensors))
         values, axes, left_open = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n, np.uint8)
-        given = tensors, previous, tolerance, limit, spectral.DECISIVE
+        given = tensors, previous, tolerance, limit, spectral.MIN_OVERLAP
         if self._call("principal", n, *given, values, axes, left_open):
             # Numpy raises an error that names the first such point.
             if np.any(left_open == NOT_FINITE):
@@ -181,9 +181,9 @@ class CompiledPointKernels(PointKernels):
             return super().positive_direction(values, threshold)  # numpy raises the error
         return direction, active
 
-    def without_noise(self, tensors: Array, axes: Array, noise: ArrayLike) -> Array:
+    def drop_noise_shear(self, tensors: Array, axes: Array, noise: ArrayLike) -> Array:
         n, steady = len(tensors), np.empty(tensors.shape)
-        self._call("without_noise", n, tensors, axes, np.broadcast_to(noise, n), steady)
+        self._call("drop_noise_shear", n, tensors, axes, np.broadcast_to(noise, n), steady)
         return steady
 
     def structure_tensor(self, dimensions: Array, axes: Array) -> Array:
@@ -199,7 +199,7 @@ class CompiledPointKernels(PointKernels):
 
 def point_kernels(comm: MPI.Intracomm) -> PointKernels:
     """Return the point functions in C, or in numpy on request. Collective."""
-    return PointKernels() if in_numpy() else CompiledPointKernels(comm)
+    return PointKernels() if uses_numpy() else CompiledPointKernels(comm)
 
 
 # ---------------------------------------------------------------- the structure tensor
@@ -215,7 +215,7 @@ class TensorKernels:
         """Compute the target of `laws.tensor_target`."""
         F, given = drive.deformation_gradient, drive.tensor
         n, turned_back = len(F), not drive.driver.material
-        if turned_back and drive.frame.tensor is not rotated_back:
+        if turned_back and drive.frame.tensor is not corotational_tensor:
             turned_back, given = False, drive.frame.tensor(F, given)
         direction, switch = np.empty((n, 3, 3)), np.empty(n)
         self.call("target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, switch)
@@ -226,7 +226,7 @@ class TensorKernels:
         if np.iscomplexobj(F):
             return energy.log_sum(F, cells, end_to_end_length)
         result = np.empty(F.shape[:-2])
-        self.call("log_sum", result.size, F, np.broadcast_to(energy.whole_structure_tensor(cells), F.shape), result)
+        self.call("log_sum", result.size, F, np.broadcast_to(energy.total_structure_tensor(cells), F.shape), result)
         return result
 
     def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
@@ -246,21 +246,21 @@ def include_folder() -> Path | None:
         path = folder / HEADER
         if path.is_file():
             version = re.search(r"define CHOLMOD_MAIN_VERSION\s+(\d+)", path.read_text(encoding="utf-8"))
-            if version and int(version[1]) >= FIRST:
+            if version and int(version[1]) >= MIN_CHOLMOD_VERSION:
                 return folder
     log.info(
         "CHOLMOD %d headers not found; lagged factorisations use double precision " "and take about twice the time",
-        FIRST,
+        MIN_CHOLMOD_VERSION,
     )
     return None
 
 
-def is_available() -> bool:
+def has_single_precision() -> bool:
     """Return whether factorisations in single precision are available."""
-    return include_folder() is not None and not in_numpy()
+    return include_folder() is not None and not uses_numpy()
 
 
-class SingleFactor:
+class SinglePrecisionFactor:
     """Cholesky factorisation L L^T of sparse matrices of one pattern, with seven digits."""
 
     def __init__(self, starts: NDArray[np.int32], columns: NDArray[np.int32]):

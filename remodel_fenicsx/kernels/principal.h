@@ -91,7 +91,7 @@ static inline void cross(const double *a, const double *b, double *result)
     result[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* spectral.without_noise: t with the given axes, rows, for its own, where it has no more than `noise` across them. */
+/* spectral.drop_noise_shear: t with the given axes, rows, for its own, where it has no more than `noise` across them. */
 static inline void steady(const double *t, const double *axes, double noise, double *result)
 {
     double f[3][3], across[3], tf[3][3], part[3], value[3];

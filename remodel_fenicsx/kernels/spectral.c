@@ -100,8 +100,8 @@ int64_t positive_direction(int64_t n, const double *values, const double *thresh
     return count;
 }
 
-/* spectral.without_noise. */
-void without_noise(int64_t n, const double *tensors, const double *axes, const double *noise, double *result)
+/* spectral.drop_noise_shear. */
+void drop_noise_shear(int64_t n, const double *tensors, const double *axes, const double *noise, double *result)
 {
     for (int64_t at = 0; at < n; ++at) steady(tensors + 9 * at, axes + 9 * at, noise[at], result + 9 * at);
 }

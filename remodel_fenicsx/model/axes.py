@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from remodel_fenicsx.model.cells import by_component, cylindrical_axes, global_axes
+from remodel_fenicsx.model.cells import components_first, cylindrical_axes, global_axes
 from remodel_fenicsx.model.spectral import principal
 
 Array = NDArray[np.float64]
@@ -20,9 +20,9 @@ GROWTH = "growth"  # J_g
 MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
 # These need one of SOURCES.
 MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}
-SOURCES = ("structure_tensor", "fibre", "angle")  # exactly one is needed
+FIBRE_INPUTS = ("structure_tensor", "fibre", "angle")  # exactly one is needed
 # Row-major tensor from xx, yy, zz, xy, yz, xz (VTK's order).
-FULL_OF_VTK = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])
+VTK_TO_FULL = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])
 # Smallest negative eigenvalue over the trace that counts as rounding of a file with 7 digits.
 FILE_ROUNDING = 1e-6
 
@@ -128,12 +128,12 @@ class LocalAxes:
         deformation_gradient
             F at the points, (..., 3, 3).
         """
-        return moved_axes(self.axes, deformation_gradient)
+        return push_forward_axes(self.axes, deformation_gradient)
 
 
-def moved_axes(axes: Array, deformation_gradient: Array) -> Array:
+def push_forward_axes(axes: Array, deformation_gradient: Array) -> Array:
     """Return deformed axes, rows (..., 3, 3), from reference axes; see `LocalAxes.deformed`."""
-    F, rows = by_component(deformation_gradient), by_component(axes)
+    F, rows = components_first(deformation_gradient), components_first(axes)
     circumferential, axial = (
         [F[i, 0] * rows[k, 0] + F[i, 1] * rows[k, 1] + F[i, 2] * rows[k, 2] for i in range(3)] for k in (0, 1)
     )
@@ -165,11 +165,11 @@ AXES: dict[str, Callable[[LocalAxes], Array]] = {
 # The measurements are structure tensors, fibre directions or fibre angles.
 
 
-def fault_of_fibres(measured: Mapping[str, Array]) -> str | None:
+def fibres_problem(measured: Mapping[str, Array]) -> str | None:
     """Return the first error in measured fibres, (n, columns) by name of `MEASURED`, or None."""
-    sources = [name for name in SOURCES if name in measured]
+    sources = [name for name in FIBRE_INPUTS if name in measured]
     if len(sources) != 1:
-        return f"has {' and '.join(sources) or 'none'} of {', '.join(SOURCES)}; exactly one is needed"
+        return f"has {' and '.join(sources) or 'none'} of {', '.join(FIBRE_INPUTS)}; exactly one is needed"
     for name, values in measured.items():
         if values.shape[1] not in MEASURED[name]:
             numbers = " or ".join(map(str, MEASURED[name]))
@@ -220,7 +220,7 @@ def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
     return weight * _along(first) + (1 - weight) * remainder
 
 
-def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple[Array, Array]:
+def cells_from_tensors(tensors: Array, end_to_end_length: float, previous: Array) -> tuple[Array, Array]:
     """Return l_I (..., 3), longest first, and n_I as rows (..., 3, 3) with A = r0^2 T / tr T."""
     # Equal eigenvalues of T leave axes undetermined; these are then taken from `previous`,
     # (..., 3, 3).
@@ -233,7 +233,7 @@ def cells_of(tensors: Array, end_to_end_length: float, previous: Array) -> tuple
 
 def _tensors(rows: Array) -> Array:
     """Return symmetric tensors (..., 3, 3) from rows of 9 or 6 numbers."""
-    full = rows if rows.shape[-1] == 9 else rows[..., FULL_OF_VTK]
+    full = rows if rows.shape[-1] == 9 else rows[..., VTK_TO_FULL]
     tensors = full.reshape(*rows.shape[:-1], 3, 3)
     return (tensors + np.swapaxes(tensors, -1, -2)) / 2
 

@@ -58,7 +58,7 @@ class UnitCell(NamedTuple):
             F, UFL of shape (3, 3) or array (..., 3, 3).
         """
         if is_array(deformation_gradient):  # by component, three times as fast as np.einsum
-            F, n = by_component(deformation_gradient), by_component(self.axes)
+            F, n = components_first(deformation_gradient), components_first(self.axes)
             along = [F[:, 0] * n[i, 0] + F[:, 1] * n[i, 1] + F[:, 2] * n[i, 2] for i in range(3)]
             return [(fibre**2).sum(axis=0) for fibre in along]
         fibres = [ufl.dot(deformation_gradient, self.axes[i, :]) for i in range(3)]
@@ -131,7 +131,7 @@ def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
 
 
 # Fraction of tr A. Below it the direction in the wall is rounding error, and no picture shows it.
-IN_THE_WALL = 1e-6
+MIN_IN_PLANE_FRACTION = 1e-6
 
 
 def pitch_angle(dimensions: Array, axes: Array, local: Array) -> Array:
@@ -141,10 +141,10 @@ def pitch_angle(dimensions: Array, axes: Array, local: Array) -> Array:
     circumferential, axial, radial = _local_components(dimensions, axes, local)
     inside = circumferential**2 + axial**2
     angle: Array = np.degrees(np.arctan2(axial, circumferential))
-    return np.where(inside < IN_THE_WALL * (inside + radial**2), np.nan, angle)
+    return np.where(inside < MIN_IN_PLANE_FRACTION * (inside + radial**2), np.nan, angle)
 
 
-def radial_share(dimensions: Array, axes: Array, local: Array) -> Array:
+def radial_fraction(dimensions: Array, axes: Array, local: Array) -> Array:
     """Return A_rr / tr A from 0 (chains in the wall) to 1 (across the wall); 0 without chains."""
     circumferential, axial, radial = _local_components(dimensions, axes, local)
     trace = circumferential**2 + axial**2 + radial**2
@@ -153,14 +153,14 @@ def radial_share(dimensions: Array, axes: Array, local: Array) -> Array:
 
 def _local_components(dimensions: Array, axes: Array, local: Array) -> list[Array]:
     """Return the square roots of A_cc, A_aa and A_rr."""
-    l = by_component(dimensions, 1)
-    n, d = by_component(axes), by_component(local)
+    l = components_first(dimensions, 1)
+    n, d = components_first(axes), components_first(local)
     # Explicit sums of three products give the same numbers with every BLAS.
     along = ([n[i, 0] * d[k, 0] + n[i, 1] * d[k, 1] + n[i, 2] * d[k, 2] for i in range(3)] for k in range(3))
     return [np.sqrt((l[0] * x) ** 2 + (l[1] * y) ** 2 + (l[2] * z) ** 2) for x, y, z in along]
 
 
-def by_component(values: Array, order: int = 2) -> Array:
+def components_first(values: Array, order: int = 2) -> Array:
     """Move the components of vectors (..., 3) or tensors (..., 3, 3) to the front."""
     # Numpy is twice as fast over all points then.
     last = tuple(range(-order, 0))

@@ -6,6 +6,7 @@ Pure arithmetic on numbers, arrays or UFL expressions. All lengths are in link l
 
 from __future__ import annotations
 
+from remodel_fenicsx._renamed import with_old_names
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -41,6 +42,7 @@ def wormlike_stiffness(end_to_end_length: UflOrArray, contour_length: UflOrArray
     return (1 + (2 - x) / (4 * (1 - x) ** 2)) / contour_length
 
 
+@with_old_names
 @dataclass(frozen=True)
 class Parameter:
     """Additional parameter of a component: a key of the table in which a scene names the component.
@@ -51,32 +53,33 @@ class Parameter:
         Value if the scene does not set it.
     meaning
         Description in one sentence.
-    above
+    exclusive_minimum
         Exclusive minimum; None allows any finite number.
 
     Examples
     --------
     >>> from remodel_fenicsx.extend import Parameter
-    >>> Parameter(0.5, "Length of a link, in those of the paper.", above=0.0).default
+    >>> Parameter(0.5, "Length of a link, in those of the paper.", exclusive_minimum=0.0).default
     0.5
     """
 
     default: float
     meaning: str
-    above: float | None = None
+    exclusive_minimum: float | None = None
 
 
 NO_PARAMETERS: Mapping[str, Parameter] = MappingProxyType({})
 NO_VALUES: Mapping[str, UflOrArray] = MappingProxyType({})
 
 
+@with_old_names
 class WithParameters:
-    """Component whose functions may take additional parameters by keyword (`of` binds them)."""
+    """Component whose functions may take additional parameters by keyword (`with_parameters` binds them)."""
 
     functions: ClassVar[tuple[str, ...]]
     parameters: Mapping[str, Parameter]
 
-    def of(self, values: Mapping[str, UflOrArray]) -> Self:
+    def with_parameters(self, values: Mapping[str, UflOrArray]) -> Self:
         """Return the component with bound values of its parameters.
 
         Parameters
@@ -109,7 +112,7 @@ class Chain(WithParameters):
     parameters
         Additional parameters, keys of `[material]`. Both functions take them by their names.
     values
-        Values of the parameters (`of`).
+        Values of the parameters (`with_parameters`).
 
     Examples
     --------

@@ -74,7 +74,7 @@ DRIVERS: dict[str, Driver] = {
 }
 
 
-def rotated_back(F: Array, spatial_tensor: Array) -> Array:
+def corotational_tensor(F: Array, spatial_tensor: Array) -> Array:
     """Return R^T t R (n, 3, 3), R of F = R U; U S U / J for t = sigma, C for t = b; objective."""
     squared, basis = tensors.eigen(np.swapaxes(F, 1, 2) @ F)
     R = F @ (basis / np.sqrt(squared)[:, None, :]) @ np.swapaxes(basis, 1, 2)  # F U^-1
@@ -116,7 +116,7 @@ class Frame:
 
     axes: Callable[[Array, Array], Array]
     carries_axes: bool
-    tensor: Callable[[Array, Array], Array] = rotated_back
+    tensor: Callable[[Array, Array], Array] = corotational_tensor
 
 
 def spatial_frame(F: Array, spatial_axes: Array) -> Array:
@@ -141,7 +141,7 @@ FRAMES: dict[str, Frame] = {
 }
 
 
-def carried_axes(F: Array, axes: Array) -> Array:
+def convected_axes(F: Array, axes: Array) -> Array:
     """Return F n_I normalised, the convected axes as rows, (n, 3, 3)."""
     return _unit(axes @ np.swapaxes(F, 1, 2))
 

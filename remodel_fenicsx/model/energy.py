@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
@@ -43,6 +44,7 @@ TURNED_OVER = ("content", "natural_length")  # parameters that turnover changes 
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 
 
+@with_old_names
 class Matrix:
     """Matrix energy with a separate volumetric part, as `fem.formulations` require it.
 
@@ -83,7 +85,7 @@ class Matrix:
         self.volumetric, self.others = volumetric, others
         self.parameters, self.values = parameters, NO_VALUES
 
-    def of(self, values: Mapping[str, UflOrArray]) -> Matrix:
+    def with_parameters(self, values: Mapping[str, UflOrArray]) -> Matrix:
         """Return the matrix with bound values of its parameters.
 
         Parameters
@@ -133,7 +135,7 @@ neo_hookean = Matrix(
 """W_iso = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J (eq. 4a)."""
 
 
-def mixed(matrices: Sequence[Matrix]) -> Matrix:
+def mixture_matrix(matrices: Sequence[Matrix]) -> Matrix:
     """Combine matrices to one sum, weighted by its parameters share_0, share_1, ..."""
     names = [f"share_{number}" for number in range(len(matrices))]
     numbers = {name: number for matrix in matrices for name, number in matrix.parameters.items()}
@@ -141,7 +143,7 @@ def mixed(matrices: Sequence[Matrix]) -> Matrix:
 
     def weighted_matrices(values: Mapping[str, UflOrArray]) -> Iterator[tuple[UflOrArray, UflOrArray]]:
         for key, matrix in zip(names, matrices, strict=True):
-            yield values[key], matrix.of({name: values[name] for name in matrix.parameters})
+            yield values[key], matrix.with_parameters({name: values[name] for name in matrix.parameters})
 
     return Matrix(
         lambda J, lam, mu, **values: sum(
@@ -241,12 +243,12 @@ def length_sum(
 
 def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
     """Return M = A : ln C of arrays; for complex F to first order in the imaginary part."""
-    C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, whole_structure_tensor(cells)
+    C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, total_structure_tensor(cells)
     M = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
     return M + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2)) if np.iscomplexobj(C) else M
 
 
-def whole_structure_tensor(cells: Sequence[UnitCell]) -> Array:
+def total_structure_tensor(cells: Sequence[UnitCell]) -> Array:
     """Return A of one cell or of weighted cells, (n, 3, 3); the weights are numbers."""
     return sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
 
@@ -277,7 +279,7 @@ class Repulsion(WithParameters):
     parameters
         Additional parameters, keys of `[material]`. All functions take them by their names.
     values
-        Values of the parameters (`of`).
+        Values of the parameters (`with_parameters`).
 
     Examples
     --------
@@ -355,6 +357,7 @@ class Stresses(NamedTuple):
         return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F))
 
 
+@with_old_names
 @dataclass(frozen=True)
 class Tissue:
     """Constitutive parameters of matrix and collagen network, with energy and stresses.
@@ -417,11 +420,11 @@ class Tissue:
         return self.contour_length if self.natural_length is None else self.natural_length * self.contour_length
 
     @property
-    def present_modulus(self) -> UflOrArray:
+    def current_modulus(self) -> UflOrArray:
         """Current modulus of the network, m c."""
         return self.network_modulus if self.content is None else self.content * self.network_modulus
 
-    def relative(self, length: UflOrArray) -> UflOrArray:
+    def normalised_length(self, length: UflOrArray) -> UflOrArray:
         """Return the normalised length r/rho.
 
         Parameters
@@ -446,11 +449,11 @@ class Tissue:
         matrix = self.lame_lambda + 2 * self.lame_mu
         if self.chain is None:
             return matrix
-        r, r0 = self.relative(end_to_end_length), self.end_to_end_length
+        r, r0 = self.normalised_length(end_to_end_length), self.end_to_end_length
         L, g = self.contour_length, self.chain.stiffness
         h = 1e-6 * r * (1 - r / L if self.chain.locks else 1)
         slope = ((r + h) * g(r + h, L) - (r - h) * g(r - h, L)) / (2 * h)
-        return matrix + self.present_modulus * (r**2 * slope + g(r0, L) * r0**2)
+        return matrix + self.current_modulus * (r**2 * slope + g(r0, L) * r0**2)
 
     @property
     def parameters(self) -> dict[str, UflOrArray]:
@@ -477,7 +480,7 @@ class Tissue:
         """
         values = {name: function(name, value) for name, value in self.parameters.items()}
         components = {
-            component: getattr(self, component).of({name: values[name] for name in names})
+            component: getattr(self, component).with_parameters({name: values[name] for name in names})
             for component, names in self._own_parameters.items()
         }
         own = {name: values[name] for name in values if name in PARAMETERS + TURNED_OVER}
@@ -537,18 +540,18 @@ class Tissue:
         if self.chain is None:
             return energy
         length = sqrt(squared_end_to_end_length(deformation_gradient, cells))
-        chains = self.chain.energy(self.relative(length), self.contour_length)
+        chains = self.chain.energy(self.normalised_length(length), self.contour_length)
         if not is_array(deformation_gradient) and self.repulsion.derivatives is not None:
-            return energy + self.present_modulus * chains
+            return energy + self.current_modulus * chains
         stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
         repulsion = -stiffness / 2 * self.repulsion.sum(deformation_gradient, cells, self.end_to_end_length)
-        return energy + self.present_modulus * (chains + repulsion)
+        return energy + self.current_modulus * (chains + repulsion)
 
     @property
     def repulsion_modulus(self) -> UflOrArray:
         """Modulus of the repulsion, m c g(r0); W_rep = -m c g(r0) M / 2."""
         assert self.chain is not None
-        return self.present_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        return self.current_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
 
     def stresses(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> Stresses:
         """Return P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5); UFL.
@@ -590,10 +593,10 @@ class Tissue:
         if self.chain is None:
             return 0.0 * det(F)
         squared, squared_after = (squared_end_to_end_length(F, [cell]) for cell in (old, new))
-        stiffness = self.chain.stiffness(self.relative(sqrt(squared)), self.contour_length)
+        stiffness = self.chain.stiffness(self.normalised_length(sqrt(squared)), self.contour_length)
         if self.natural_length is not None:
             stiffness = stiffness / self.natural_length**2
-        chains = self.present_modulus / 2 * stiffness * (squared_after - squared)
+        chains = self.current_modulus / 2 * stiffness * (squared_after - squared)
         repulsion = self.repulsion.sum(F, [new], r0) - self.repulsion.sum(F, [old], r0)
         return chains - self.repulsion_modulus / 2 * repulsion
 
@@ -613,8 +616,8 @@ class Tissue:
         """
         assert self.chain is not None
         F, cells = deformation_gradient, [cell]
-        length = self.relative(sqrt(squared_end_to_end_length(F, cells)))
-        tension = self.present_modulus * self.chain.stiffness(length, self.contour_length) * length**2
+        length = self.normalised_length(sqrt(squared_end_to_end_length(F, cells)))
+        tension = self.current_modulus * self.chain.stiffness(length, self.contour_length) * length**2
         return self._with_network(0.0, F, cells) * content - tension * natural_length
 
 

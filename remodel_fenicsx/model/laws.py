@@ -12,15 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_arguments, with_old_names
 from remodel_fenicsx.model import spectral, tensor_law
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.chains import NO_PARAMETERS, NO_VALUES, Formula, Parameter, UflOrArray
-from remodel_fenicsx.model.drivers import Driver, Frame, carried_axes
+from remodel_fenicsx.model.drivers import Driver, Frame, convected_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target
 
@@ -116,8 +118,8 @@ class Drive(NamedTuple):
 
     @property
     def floor(self) -> Array | float:
-        """Tension at which the switch is one half, (n,) or a number (`tensor_law.floor_above`)."""
-        return tensor_law.floor_above(self.noise, self.rounding)
+        """Tension at which the switch is one half, (n,) or a number (`tensor_law.switch_threshold`)."""
+        return tensor_law.switch_threshold(self.noise, self.rounding)
 
 
 def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
@@ -128,10 +130,13 @@ def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
     if np.ndim(factor) == 0 and factor == 1.0:
         return new
     before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
-    squared, axes = spectral.continued(before + np.reshape(factor, (-1, 1, 1)) * (after - before), new.axes)
+    squared, axes = spectral.principal_by_continuity(
+        before + np.reshape(factor, (-1, 1, 1)) * (after - before), new.axes
+    )
     return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
 
+@with_old_names
 @dataclass(frozen=True)
 class Law:
     """Evolution law of the unit cells.
@@ -144,7 +149,7 @@ class Law:
         Whether the cells tend to a limit under a constant drive that does not depend on the path.
     remodels
         False if the cells never change; then there is no remodeling pass.
-    of_absolute_time
+    depends_on_absolute_time
         Whether the law depends on the absolute time, so that a pass makes up for changes that
         earlier passes have omitted. Cells of other laws change by increments: relaxation slows them
         down.
@@ -157,9 +162,9 @@ class Law:
     keeps_symmetry
         Whether the law preserves planes of symmetry of cells and drive. False if it rotates an axis
         to one of two sides.
-    asks_kappa
+    stops_at_zero_kappa
         Whether kappa = 0 means that cells never change, so that there is no remodeling pass.
-    share
+    relax
         Function of (old, new, factor) that returns relaxed cells; default: `relaxed`.
     over_corrects
         Whether the coupling "staggered" may leave a symmetric solution with this law.
@@ -195,20 +200,21 @@ class Law:
     update: Callable[[UnitCell, Drive, float, float], UnitCell]
     has_limit: bool = False
     remodels: bool = True
-    of_absolute_time: bool = False
+    depends_on_absolute_time: bool = False
     target: Callable[[Drive], tensor_law.Target] | None = None
     follow: Callable[[UnitCell, tensor_law.Target, Array | float, Array | float], UnitCell] | None = None
-    share: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
+    relax: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
     is_ranked: bool = False
     keeps_symmetry: bool = False
-    asks_kappa: bool = False
+    stops_at_zero_kappa: bool = False
     over_corrects: bool = False
     takes_set_points: bool = False
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
     speed: Formula[float] | None = None
 
 
-def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: bool = False) -> Law:
+@partial(with_old_arguments, "ranked")
+def ranked(function: RankedFunction, has_limit: bool = False, depends_on_absolute_time: bool = False) -> Law:
     """Make a law that sets axes to principal directions and changes dimensions (eqs. 8 to 11).
 
     Parameters
@@ -219,7 +225,7 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
         are by axis instead. The target is r0 e with ``e = lambda^+ / |lambda^+|``. kappa is a
         number, or (n, 1) if regions differ. Points without a positive principal value or with
         kappa = 0 keep their cells.
-    has_limit, of_absolute_time
+    has_limit, depends_on_absolute_time
         See `Law`.
 
     Returns
@@ -248,9 +254,9 @@ def ranked(function: RankedFunction, has_limit: bool = False, of_absolute_time: 
     return Law(
         update,
         has_limit,
-        of_absolute_time=of_absolute_time,
+        depends_on_absolute_time=depends_on_absolute_time,
         keeps_symmetry=True,
-        asks_kappa=True,
+        stops_at_zero_kappa=True,
         is_ranked=True,
     )
 
@@ -275,7 +281,7 @@ def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: f
 def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
     """Return principal values and directions of the drive; `previous` are the cells' axes."""
     if not drive.driver.material and drive.frame.carries_axes:
-        previous = carried_axes(drive.deformation_gradient, previous)
+        previous = convected_axes(drive.deformation_gradient, previous)
     function: spectral.Pairing = drive.kernels.principal if pairing is spectral.principal else pairing
     return function(drive.tensor, previous, threshold=drive.noise)
 
@@ -316,14 +322,14 @@ def rotation(cells: UnitCell, drive: Drive, time_old: float, time_new: float) ->
     # the end of the step). The fibre n is the axis of the largest dimension
     # (the first of equal ones). n_max is the principal direction of the largest value, a line,
     # taken in the sense that is nearer to n. If n is orthogonal to the line within
-    # `spectral.DECISIVE`, both senses are equally near; the sense nearer to the next axis of the
+    # `spectral.MIN_OVERLAP`, both senses are equally near; the sense nearer to the next axis of the
     # cell is taken. If the largest values agree, n_max is the direction of their plane that is
     # nearest to n. Points without tension keep their cells.
     order = (np.argmax(cells.dimensions, axis=1)[:, None] + np.arange(3)) % 3
     axes = np.take_along_axis(cells.axes, order[:, :, None], axis=1)
     values, towards = principal_directions(drive, axes, spectral.principal)
     _, active = spectral.positive_direction(values, threshold=drive.noise)
-    largest = spectral.with_signs_of(axes, framed(drive, towards))[:, 0]
+    largest = spectral.align_signs(axes, framed(drive, towards))[:, 0]
     vectors = _turn_towards(axes[:, 0], largest, (time_new - time_old) / drive.rotation_time)
     return UnitCell(cells.dimensions, turned(cells.axes, np.where(active[:, None], vectors, 0.0)))
 
@@ -334,12 +340,12 @@ def _turn_towards(fibre: Array, goal: Array, relative_step: float) -> Array:
     across = np.cross(fibre, goal)
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.einsum("na,na->n", fibre, goal))
-    increment = angle - angle_left(angle, relative_step)
+    increment = angle - remaining_angle(angle, relative_step)
     # The sine is zero if fibre and goal are parallel.
     return across * np.divide(increment, sine, out=np.zeros_like(sine), where=sine > 0.0)[:, None]
 
 
-def angle_left(angle: Array, relative_step: float) -> Array:
+def remaining_angle(angle: Array, relative_step: float) -> Array:
     """Return the root a of a + (dt/tau) sin a = angle after an implicit step; (n,) in [0, pi/2]."""
     # Newton's method starts from angle / (1 + dt/tau), which is below the root. The left side is
     # increasing and concave, so that the iterates approach the root from below.
@@ -363,7 +369,7 @@ def turned(axes: Array, vectors: Array) -> Array:
     return axes + first * once + second * np.cross(along, once)
 
 
-def turned_in_part(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
+def rotate_partially(old: UnitCell, new: UnitCell, factor: float) -> UnitCell:
     """Rotate the old axes by a fraction of the rotation to the new ones, less than 180 degrees."""
     if factor == 1.0:
         return new
@@ -384,17 +390,17 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
     target = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
         return target
-    return target._replace(switch=target.switch * tensor_law.awake(drive.tensor, drive.least_tension))
+    return target._replace(switch=target.switch * tensor_law.activation(drive.tensor, drive.least_tension))
 
 
 def follow_tensor(
     cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, kappa_dt: Array | float
 ) -> UnitCell:
-    """Return cells with A of `tensor_law.follow`; axes of equal eigenvalues stay."""
+    """Return cells with A of `tensor_law.relax_exactly`; axes of equal eigenvalues stay."""
     # Dimensions are NaN if an extrapolated target makes the tensor indefinite by more than
     # rounding.
-    structure = tensor_law.follow(structure_tensor(*cells[:2]), target, end_to_end_length, kappa_dt)
-    squared, axes = spectral.continued(structure, cells.axes)
+    structure = tensor_law.relax_exactly(structure_tensor(*cells[:2]), target, end_to_end_length, kappa_dt)
+    squared, axes = spectral.principal_by_continuity(structure, cells.axes)
     rounding = spectral.ROUNDING * np.abs(squared).max(axis=-1, keepdims=True)
     return UnitCell(np.where(squared < -rounding, np.nan, np.sqrt(np.maximum(squared, 0.0))), axes)
 
@@ -405,7 +411,7 @@ def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> U
 
 
 LAWS: dict[str, Law] = {
-    "explicit": ranked(explicit, has_limit=True, of_absolute_time=True),
+    "explicit": ranked(explicit, has_limit=True, depends_on_absolute_time=True),
     "rate": replace(ranked(rate), over_corrects=True),
     "relaxation": ranked(relaxation, has_limit=True),
     "tensor": Law(
@@ -414,10 +420,10 @@ LAWS: dict[str, Law] = {
         target=tensor_target,
         follow=follow_tensor,
         keeps_symmetry=True,
-        asks_kappa=True,
+        stops_at_zero_kappa=True,
         takes_set_points=True,
     ),
-    "rotation": Law(rotation, share=turned_in_part),
+    "rotation": Law(rotation, relax=rotate_partially),
     "none": Law(keep, remodels=False, keeps_symmetry=True),
 }
 
@@ -476,7 +482,7 @@ def _weighted(values: Sequence[Array | float], weights: Weights) -> Array:
 
 
 @dataclass(frozen=True)
-class Mean:
+class CaseAverage:
     """Average over the drives or targets of load cases."""
 
     meaning: str
@@ -484,10 +490,12 @@ class Mean:
     of_targets: bool = False
 
 
-MEANS_OF_CASES: dict[str, Mean] = {
-    "tensor": Mean("the weighted mean of the driving tensors"),
-    "target": Mean("the weighted mean of the targets that each case has, for the law 'tensor'", of_targets=True),
-    "largest": Mean("at each point the load case with the largest tension, whatever its weight", largest_tension),
+MEANS_OF_CASES: dict[str, CaseAverage] = {
+    "tensor": CaseAverage("the weighted mean of the driving tensors"),
+    "target": CaseAverage("the weighted mean of the targets that each case has, for the law 'tensor'", of_targets=True),
+    "largest": CaseAverage(
+        "at each point the load case with the largest tension, whatever its weight", largest_tension
+    ),
 }
 """Averages by the name in `remodeling.mean`."""
 
@@ -513,7 +521,7 @@ class TurnoverRates(NamedTuple):
     natural_length: Array
 
 
-class Followed(NamedTuple):
+class TurnoverStimulus(NamedTuple):
     """Turnover rates, and the power of lambda in their stimulus, g(lambda r0) lambda^power."""
 
     rates: Callable[[TurnoverRule, Tension, Array], TurnoverRates]
@@ -526,7 +534,7 @@ class TurnoverRule(NamedTuple):
     time: float
     deposition_stretch: float
     gain: float
-    followed: Followed
+    followed: TurnoverStimulus
 
     def rates(self, tissue: Tissue, stretch: Array) -> TurnoverRates:
         """Return the rates at the stretch lambda_e (n,) of chains."""
@@ -541,9 +549,9 @@ class TurnoverRule(NamedTuple):
 
     def at_length(self, tissue: Tissue, length: Array) -> TurnoverRates:
         """Return the rates at the length r (n,) of chains."""
-        return self.rates(tissue, tissue.relative(length) / tissue.end_to_end_length)
+        return self.rates(tissue, tissue.normalised_length(length) / tissue.end_to_end_length)
 
-    def rest(self, tissue: Tissue) -> tuple[float, float]:
+    def gain_and_recovery_time(self, tissue: Tissue) -> tuple[float, float]:
         """Return k a, which must exceed 2 for a steady state of a wall, and the time constant."""
         # Near the steady state a small change decays by a factor of e in E T/(k a - 2) with E = d
         # ln(g - g0/lambda^2)/d ln lambda at lambda_h, the slope for chains and repulsion together.
@@ -580,5 +588,5 @@ def by_tension(rule: TurnoverRule, tension: Tension, stretch: Array) -> Turnover
     return TurnoverRates(content, turned_over * (stretch / rule.deposition_stretch - 1.0))
 
 
-TURNOVER_RATES = {"cauchy": Followed(by_stress, 2), "tension": Followed(by_tension, 1)}
+TURNOVER_RATES = {"cauchy": TurnoverStimulus(by_stress, 2), "tension": TurnoverStimulus(by_tension, 1)}
 """Rates by the name in `remodeling.turnover.rates`."""

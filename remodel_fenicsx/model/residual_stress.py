@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 DEGREE = 24
 # Relative truncation error of dR/dr above which a panel is halved; walls of 1 to 7 and thicker have
 # larger errors.
-MISSING = 1e-8
+TRUNCATION_TOLERANCE = 1e-8
 MOST_POLYNOMIALS = 8  # maximum of one layer; walls of 1 to 1.05 ... 12 take 1 or 2
 # Largest increment of k, half of what works: walls of 1 to 1.05 ... 3 close at 180 degrees (k = 2)
 # in one increment of 1 too.
-LARGEST_TURN = 0.5
+MAX_CLOSING_INCREMENT = 0.5
 # Limit of Newton's method, which takes 5 to 7 for walls of 1 to 1.05 ... 12 at 90 to 270 degrees.
 ITERATIONS = 30
 CLOSED = 1e-9  # tolerance of the residual over lambda + 2 mu
@@ -76,19 +76,19 @@ class Panels:
         """Return the jumps of values from one panel to the next, (..., panels - 1)."""
         return values[..., 1:, 0] - values[..., :-1, -1]
 
-    def of(self, radius: Array) -> NDArray[np.intp]:
+    def panel_index(self, radius: Array) -> NDArray[np.intp]:
         """Return the panel number of each radius (...,); outside the wall it is the nearest."""
         return np.clip(np.searchsorted(self.edges, radius, side="right") - 1, 0, len(self.edges) - 2)
 
-    def missing(self, values: Array) -> Array:
+    def truncation_error(self, values: Array) -> Array:
         """Return the relative truncation error of values (panels, points), (panels,)."""
         # Estimated by the last two Chebyshev coefficients over the largest coefficient.
         coefficients: Array = np.abs(values @ self._coefficients.T)
         return coefficients[:, -2:].max(axis=1) / coefficients.max()
 
-    def at(self, radius: Array, values: Array) -> Array:
+    def interpolate(self, radius: Array, values: Array) -> Array:
         """Interpolate values (panels, points) at radii (...,)."""
-        panel = self.of(radius)
+        panel = self.panel_index(radius)
         coordinate = (radius - self.edges[panel]) / (2 * self._half[panel, 0]) * 2 - 1
         interpolated = np.empty_like(radius, dtype=np.float64)
         for number, row in enumerate(values @ self._coefficients.T):
@@ -121,7 +121,7 @@ class Loads(NamedTuple):
     axial: float = 1.0
 
 
-class Closing(NamedTuple):
+class ClosedRing(NamedTuple):
     """Sector that closes to a ring: its radii at the panels' points, k and axial stretch g_z."""
 
     layers: tuple[Layer, ...]
@@ -132,12 +132,12 @@ class Closing(NamedTuple):
 
     def natural_radius(self, radius: Array) -> Array:
         """Return R at r, both (...,)."""
-        return self.panels.at(radius, self.radius)
+        return self.panels.interpolate(radius, self.radius)
 
     def stretches(self, radius: Array) -> Array:
         """Return circumferential, axial and radial stretch of G at r (...,), (..., 3)."""
-        slope = self.panels.at(radius, self.panels.derivative(self.radius))
-        prestretch = np.array([layer.prestretch for layer in self.layers])[self.panels.of(radius)]
+        slope = self.panels.interpolate(radius, self.panels.derivative(self.radius))
+        prestretch = np.array([layer.prestretch for layer in self.layers])[self.panels.panel_index(radius)]
         return self._joined(radius, self.natural_radius(radius), slope) * prestretch
 
     def at_panels(self) -> Array:
@@ -151,16 +151,16 @@ class Closing(NamedTuple):
         return np.stack(np.broadcast_arrays(hoop, self.axial, 1.0 / slope), axis=-1)
 
 
-def closing(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads()) -> Closing:
+def close_ring(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loads()) -> ClosedRing:
     """Compute the sector that closes to a ring in equilibrium, with isotropic cells."""
     final_k = 360.0 / (360.0 - opening_angle)
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], DEGREE)
-    factors = np.linspace(1.0, final_k, 1 + max(1, int(np.ceil((final_k - 1.0) / LARGEST_TURN))))[1:]
-    ring = Closing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
+    factors = np.linspace(1.0, final_k, 1 + max(1, int(np.ceil((final_k - 1.0) / MAX_CLOSING_INCREMENT))))[1:]
+    ring = ClosedRing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
     for k in factors:
         grown = np.mean(ring.radius + (k - 1.0) * panels.places * 0.5) / np.mean(ring.radius)
         ring = _balanced(ring._replace(radius=grown * ring.radius, circumferential=float(k)), loads)
-    while (rough := ring.panels.missing(ring.panels.derivative(ring.radius)) > MISSING).any():
+    while (rough := ring.panels.truncation_error(ring.panels.derivative(ring.radius)) > TRUNCATION_TOLERANCE).any():
         pieces = [
             piece
             for layer, is_rough in zip(ring.layers, rough, strict=True)
@@ -181,7 +181,7 @@ def _halves(layer: Layer) -> list[Layer]:
     return [layer._replace(radii=(low, middle)), layer._replace(radii=(middle, high))]
 
 
-def _balanced(start: Closing, loads: Loads) -> Closing:
+def _balanced(start: ClosedRing, loads: Loads) -> ClosedRing:
     """Return the neighbouring equilibrium with the loads on both faces and along the axis."""
     panels, tissues = start.panels, [layer.tissue for layer in start.layers]
     stiffness, edges = _stiffness(tissues), panels.edges
@@ -199,7 +199,7 @@ def _balanced(start: Closing, loads: Loads) -> Closing:
             along = (force - loads.force / stiffness) / (np.pi * (edges[-1] ** 2 - edges[0] ** 2))
         return np.concatenate([through, along[..., None]], axis=-1)
 
-    solution = solved(tissues, [None] * len(tissues), stretches, residual, np.append(start.radius, start.axial))
+    solution = solve_newton(tissues, [None] * len(tissues), stretches, residual, np.append(start.radius, start.axial))
     return start._replace(radius=solution[:-1].reshape(start.radius.shape), axial=float(solution[-1]))
 
 
@@ -218,7 +218,7 @@ def _through(panels: Panels, unknown: Array, stresses: Array, pressure: float) -
 
 
 @np.errstate(all="ignore")
-def solved(
+def solve_newton(
     tissues: Sequence[Tissue],
     dimensions: Sequence[Array | None],
     stretches: Callable[[Array], Array],
@@ -316,7 +316,7 @@ class Rings(NamedTuple):
     squared: Array
 
 
-def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = None) -> float:
+def cut(tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None = None) -> float:
     """Return the opening angle in degrees of rings after a cut; `edges` are radii of elements."""
     # The volumes are those of the stress-free tissue. `closed` is the sector of the initial state,
     # a starting value.
@@ -334,7 +334,7 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
         inner = closed.radius[0, 0]
         axial, k = 1 / closed.axial, 1 / closed.circumferential
         depth = closed.natural_radius(rings.radius) - inner
-        steepness = closed.panels.at(rings.radius, closed.panels.derivative(closed.radius))
+        steepness = closed.panels.interpolate(rings.radius, closed.panels.derivative(closed.radius))
     fractions = rings.volume / rings.volume.sum()
     thinner = fractions @ (1 / (steepness * rings.natural[:, 2]))  # growth across the wall
     depth, steepness = thinner * depth, thinner * steepness
@@ -358,7 +358,7 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: Closing | None = Non
 
     values = np.concatenate([[inner * k], np.zeros(functions.shape[1]), [axial, k / thinner]])
     dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
-    solution = solved([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
+    solution = solve_newton([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
     return float(360.0 * (1.0 - solution[-1]))
 
 

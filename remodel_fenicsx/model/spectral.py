@@ -18,7 +18,7 @@ Flags = npt.NDArray[np.bool_]
 ROUNDING = 64 * float(np.finfo(np.float64).eps)
 """Relative size below which a principal value is rounding error (eigh is accurate to a few eps)."""
 
-DECISIVE = 1e-3
+MIN_OVERLAP = 1e-3
 """Cosine below which a previous axis does not determine a direction. In symmetric problems this
 cosine is exactly zero up to rounding; any threshold far above rounding gives the same choice on
 every machine."""
@@ -37,7 +37,7 @@ def principal(
     If neighbouring values agree (also first with second and second with third), the tensor does not
     determine the axes of these ranks. They are then the previous axes of the same ranks, projected
     onto the common eigenspace and orthonormalised in the order of rank. A previous axis that is
-    orthogonal to the eigenspace within ``DECISIVE`` is replaced by the next previous axis
+    orthogonal to the eigenspace within ``MIN_OVERLAP`` is replaced by the next previous axis
     (cyclic order of ranks), so that the result never depends on LAPACK. The zero tensor keeps all
     three previous axes.
 
@@ -87,7 +87,7 @@ def principal(
     return values, _settled(axes, reference, *_agreeing(values, tolerance, threshold))
 
 
-def continued(
+def principal_by_continuity(
     tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = AGREEMENT, threshold: npt.ArrayLike = 0.0
 ) -> tuple[Array, Array]:
     """Return principal values and axes of symmetric tensors in the order of previous axes."""
@@ -95,7 +95,7 @@ def continued(
     # pairings the one with the largest sum of squared cosines is taken, so that values that cross
     # do not exchange their positions. If values agree, their common eigenspace counts as a whole,
     # and the paired previous axes are kept in it as by `principal`. If the sums of several pairings
-    # agree within ``DECISIVE``, the first in lexicographic order is taken, so that rounding does
+    # agree within ``MIN_OVERLAP``, the first in lexicographic order is taken, so that rounding does
     # not decide. Parameters and errors are those of `principal`.
     values, axes, reference = _decomposed(tensors, previous)
     upper, lower = _agreeing(values, tolerance, threshold)
@@ -107,7 +107,7 @@ def continued(
 
 Pairing = Formula[tuple[Array, Array]]
 
-PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": continued}
+PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": principal_by_continuity}
 """Pairings of cell dimensions with principal values: by rank, or by continued axis."""
 
 
@@ -125,7 +125,7 @@ def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) ->
     return positive / np.where(active, norm, 1.0)[:, None], active
 
 
-def without_noise(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array:
+def drop_noise_shear(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array:
     """Return the tensors without shear components in these axes if none exceeds `noise`."""
     # If two principal values are close, an error of the tensor rotates its axes by far more than
     # the relative error. The shear components in the old axes are therefore set to zero up to
@@ -172,7 +172,7 @@ def _settled(axes: Array, reference: Array, upper: Flags, lower: Flags) -> Array
         axes[points, 0] = _project(np.zeros((points.size, 3)), _candidates(reference[points], 0))
         axes[points, 1] = _project(axes[points, 0], _candidates(reference[points], 1))
         axes[points, 2] = np.cross(axes[points, 0], axes[points, 1])
-    return with_signs_of(reference, axes)
+    return align_signs(reference, axes)
 
 
 def _places(axes: Array, reference: Array, upper: Flags, lower: Flags) -> npt.NDArray[np.intp]:
@@ -184,7 +184,7 @@ def _places(axes: Array, reference: Array, upper: Flags, lower: Flags) -> npt.ND
         overlap[points[:, None], ranks] = overlap[points][:, ranks].mean(axis=1, keepdims=True)
     pairings = np.array(list(permutations(range(3))))
     sums = sum(overlap[:, rank, pairings[:, rank]] for rank in range(3))
-    return pairings[np.argmax(sums >= sums.max(axis=1, keepdims=True) - DECISIVE, axis=1)]
+    return pairings[np.argmax(sums >= sums.max(axis=1, keepdims=True) - MIN_OVERLAP, axis=1)]
 
 
 def _require_finite(values: Array, noun: str) -> None:
@@ -230,7 +230,7 @@ def _project(normal: Array, candidates: list[Array]) -> Array:
     open_points = np.ones(len(normal), dtype=bool)
     for candidate in candidates:
         projected = candidate - np.einsum("na,na->n", candidate, normal)[:, None] * normal
-        usable = open_points & (_length(projected) > DECISIVE)
+        usable = open_points & (_length(projected) > MIN_OVERLAP)
         chosen[usable] = projected[usable]
         open_points &= ~usable
         if not open_points.any():
@@ -241,11 +241,11 @@ def _project(normal: Array, candidates: list[Array]) -> Array:
     return _normalised(chosen - np.einsum("na,na->n", chosen, normal)[:, None] * normal)
 
 
-def with_signs_of(reference: Array, axes: Array) -> Array:
+def align_signs(reference: Array, axes: Array) -> Array:
     """Return axes (n, 3, 3) with the signs of `principal`; rows of `reference` are unit vectors."""
     decisive = np.einsum("nia,nia->ni", axes, reference)
     for shift in (1, 2):
-        point, rank = np.nonzero(np.abs(decisive) <= DECISIVE)
+        point, rank = np.nonzero(np.abs(decisive) <= MIN_OVERLAP)
         if point.size:
             next_previous = reference[point, (rank + shift) % 3]
             decisive[point, rank] = np.einsum("na,na->n", axes[point, rank], next_previous)

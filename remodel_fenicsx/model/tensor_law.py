@@ -25,7 +25,7 @@ ABOVE_ROUNDING = 7000.0
 enough that the switch is smooth for Newton's method."""
 
 
-def floor_above(noise: Array | float, rounding: Array | float) -> Array | float:
+def switch_threshold(noise: Array | float, rounding: Array | float) -> Array | float:
     """Return the tension at which the switch is one half without compression."""
     # The noise from the solver's residual is not multiplied like the rounding: the product would be
     # as large as a stress.
@@ -76,7 +76,7 @@ def target(tensor: Array, floor: Array | float, exponent: float = 2.0) -> Target
     return Target(direction, tension / np.where(total > 0, total, 1.0))
 
 
-def awake(tensor: Array, least_tension: float) -> Array:
+def activation(tensor: Array, least_tension: float) -> Array:
     """Return the active fraction of kappa, max(0, 1 - s0/s) for the largest tension s; (n,)."""
     # This is a lazy zone, as in models of bone adaptation; Hypothesis I of the paper reads "within
     # a range".
@@ -94,7 +94,9 @@ def weight_of_the_end(kappa_dt: Array | float) -> Array:
     return np.where(short, 0.5 + z / 12, -1.0 / np.expm1(-long) - 1.0 / long)
 
 
-def follow(structure: Array, towards: Target, end_to_end_length: Array | float, kappa_dt: Array | float) -> Array:
+def relax_exactly(
+    structure: Array, towards: Target, end_to_end_length: Array | float, kappa_dt: Array | float
+) -> Array:
     """Return A after a time with a constant target; exact."""
     squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
     weight = -np.expm1(-kappa_dt * towards.switch)[:, None, None]

@@ -205,7 +205,7 @@ def second_derivative(values: Array, components: Array) -> Array:
 # ---------------------------------------------------------------- deformation gradients
 
 
-def passes_through_zero(before: Array, after: Array) -> Flags:
+def determinant_changes_sign(before: Array, after: Array) -> Flags:
     """Return the points at which det((1 - s) F + s G) is not positive for an s in [0, 1]."""
     # Both ends may be admissible, because two axes can invert simultaneously. Exact: the
     # determinant is cubic in s.
@@ -232,7 +232,7 @@ def cofactor(tensors: Array) -> Array:
     return np.stack(entries, axis=-1).reshape(np.shape(tensors))
 
 
-def largest_change_of_length(before: Array, after: Array) -> Array:
+def max_stretch_increment(before: Array, after: Array) -> Array:
     """Return the largest relative change of a length from F to G, (n,), to first order."""
     # sqrt(2/3) |E| with E the symmetric part of G F^-1 - 1. Without a change of volume it is the
     # largest |e_I| of a bar, and 2/sqrt(3) of the largest |e_I| in pure shear.

@@ -31,7 +31,7 @@ from remodel_fenicsx.body.shape import Column, columns_of_region
 from remodel_fenicsx.body.wall import Walled
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
-from remodel_fenicsx.model.axes import GROWTH, moved_axes
+from remodel_fenicsx.model.axes import GROWTH, push_forward_axes
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -69,7 +69,7 @@ ANGLE_STEPS = 252  # of a byte for 0 to 90 degrees: 14 for each of the 18 colour
 NO_ANGLE = 255
 
 
-def packed(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, object]]]:
+def pack_arrays(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, object]]]:
     """The block, and what tells the page where each array is in it."""
     block, table = bytearray(), {}
     for name, array in arrays.items():
@@ -113,7 +113,7 @@ def section(title: str, content: str) -> str:
     return f'<section class="card half"><h2>{escape(title)}</h2>{content}</section>'
 
 
-def folded(title: str, content: str) -> str:
+def collapsed_section(title: str, content: str) -> str:
     """The same, closed until somebody opens it."""
     return f'<details class="card half"><summary>{escape(title)}</summary>{content}</details>'
 
@@ -128,8 +128,8 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 
 CELL = ("cell_dimensions", *AXIS_FIELDS)
 NAMES = ("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_extension", *CELL)
-MADE = ("content", GROWTH)
-OF_WALLS = ("cauchy_stress", *DIRECTION_FIELDS, *MADE)
+TURNOVER_FIELDS = ("content", GROWTH)
+WALL_FIELDS = ("cauchy_stress", *DIRECTION_FIELDS, *TURNOVER_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -143,9 +143,9 @@ class ShownBody:
     is_deformed: bool
 
     @classmethod
-    def of(cls, whole: WholeBody, times: Places) -> ShownBody:
+    def from_run(cls, whole: WholeBody, times: Places) -> ShownBody:
         """What a run has recorded at these times."""
-        names = (*NAMES, *(OF_WALLS if isinstance(whole.recording.scene.geometry, Walled) else ()))
+        names = (*NAMES, *(WALL_FIELDS if isinstance(whole.recording.scene.geometry, Walled) else ()))
         rows = defaultdict[str, list[NDArray[np.float32]]](list)
         volume, is_deformed = _volumes(whole.points[whole.elements]), True
         for time in times:
@@ -207,8 +207,8 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
         return np.stack(sums[:-1], axis=1) / sums[-1][:, None]
 
     unknown = np.full(len(volume), np.nan)
-    made = [fields.get(name, unknown) for name in MADE]
-    found = {"content": means(made)} if set(MADE) & set(fields) else {}
+    made = [fields.get(name, unknown) for name in TURNOVER_FIELDS]
+    found = {"content": means(made)} if set(TURNOVER_FIELDS) & set(fields) else {}
     shape = whole.recording.scene.geometry
     recorded = DIRECTION_FIELDS if shape.constant_fields else ()  # where axes are no function of the place
     if not set(fields) >= {*TENSOR_FIELDS, *recorded}:
@@ -218,7 +218,7 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
     else:
         axes = shape.axes_at(whole.centres)
     F, stress = (fields[name].reshape(-1, 3, 3) for name in TENSOR_FIELDS)
-    moved = moved_axes(axes, F)
+    moved = push_forward_axes(axes, F)
     return found | {"stress": means([*np.einsum("nki,nij,nkj->kn", moved, stress, moved)])}
 
 
@@ -235,7 +235,7 @@ def _volumes(corners: Places) -> Places:
 # ---------------------------------------------------------------- how a run went, from its folder
 # Whether it has ended and why, what it warned of.
 
-SAID_UNLOADED = "unloaded: "  # as logs say it
+UNLOADED_PREFIX = "unloaded: "  # as logs say it
 _RANKS = re.compile(r"scene .* on (\d+) ranks?, results in ")
 
 
@@ -366,7 +366,7 @@ def angles(run: ReportedRun) -> Card | None:
     body, shape, regions = run.body, run.recording.scene.geometry, run.recording.scene.regions
     if body is None or "angle" not in body.series:
         return None
-    through, start, end = shape.depth_in_words
+    through, start, end = shape.depth_labels
     if not np.isfinite(run.recording.history.get("lumen_volume", np.zeros(1))).any():
         through = "through the body"  # its inner face encloses nothing
     along, across = shape.angle_in_words
@@ -391,7 +391,7 @@ def stress(run: ReportedRun) -> Card | None:
 
 def content(run: ReportedRun) -> Card | None:
     """Content and growth of the collagen through the wall, where they were recorded."""
-    return _by_layer(run, "content", MADE, "over the start")
+    return _by_layer(run, "content", TURNOVER_FIELDS, "over the start")
 
 
 def _by_layer(
@@ -401,7 +401,7 @@ def _by_layer(
     body = run.body
     if body is None or name not in body.series or len(body.whole.depth) < 2:
         return None
-    through, start, end = run.recording.scene.geometry.depth_in_words
+    through, start, end = run.recording.scene.geometry.depth_labels
     known = np.any(np.isfinite(body.series[name]), axis=(0, 1)).tolist()
     names = [*compress(names, known)]
     data = {
@@ -463,12 +463,12 @@ def facts(run: ReportedRun) -> Card:
         if value not in ((), {}):
             tables[place or "load cases"].append(f"{words(name)} {_as_text(value)}")
     said = [text for _, _, text in run.log]
-    tables["geometry"] += [text for text in said if text.startswith(SAID_UNLOADED)][-1:]
+    tables["geometry"] += [text for text in said if text.startswith(UNLOADED_PREFIX)][-1:]
     if run.body:
         tables["mesh"].append(f"{len(run.recording.elements):,} elements")
     tables["model"].append(KINEMATICS[scene.model.kinematics].meaning)
     tables["material"].append(scene.summary())
-    steps = f"{max(0, len(history['time']) - 1)}{'' if scene.time.chooses else ' of'} {scene.time.in_words()}"
+    steps = f"{max(0, len(history['time']) - 1)}{'' if scene.time.is_adaptive else ' of'} {scene.time.in_words()}"
     solving = f"{duration(float(np.nansum(history.get('seconds', 0.0))))} of solving"
     ranks = [f"{found[1]} ranks" for text in said if (found := _RANKS.match(text)) and found[1] != "1"]
     tables["time"] += [steps, solving, *ranks[-1:]]
@@ -513,7 +513,7 @@ def warnings(run: ReportedRun) -> Card:
 def scene(run: ReportedRun) -> Card:
     """The whole scene, with its comments."""
     text = read_regular(run.recording.path / SCENE, LARGEST_HISTORY).decode(errors="replace")
-    return Card("scene", folded("The whole scene, as run", f"<pre>{escape(text)}</pre>"))
+    return Card("scene", collapsed_section("The whole scene, as run", f"<pre>{escape(text)}</pre>"))
 
 
 def versions(run: ReportedRun) -> Card:
@@ -524,7 +524,7 @@ def versions(run: ReportedRun) -> Card:
         for name, file in (("three.js", "three"), ("uPlot", "uplot"))
     )
     note = "<p>This page has the code of three.js and uPlot in it.</p>"
-    return Card("versions", folded("Versions and licences", table(rows) + note + licences))
+    return Card("versions", collapsed_section("Versions and licences", table(rows) + note + licences))
 
 
 PAGE_PARTS: list[Part] = [head, tiles, drawn, view, angles, curves, stress, content, facts, warnings, scene, versions]
@@ -569,18 +569,18 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None) -> Pa
 def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     """The page as text, of about so many MB at most."""
     if not has_a_body(recording):
-        return page_with(cards(ReportedRun(recording)))
+        return render_page(cards(ReportedRun(recording)))
     of_a_time = 4 / 3 * RATIO * (6 * len(recording.points) + 11 * len(recording.elements))  # bytes, in base64
     whole, most = WholeBody(recording), max(FEWEST_TIMES, int(1e6 * size / of_a_time))
-    body = ShownBody.of(whole, kept_times(recording.times, most))
-    return page_with(cards(ReportedRun(recording, body)))
+    body = ShownBody.from_run(whole, kept_times(recording.times, most))
+    return render_page(cards(ReportedRun(recording, body)))
 
 
-def page_with(found: list[Card]) -> str:
+def render_page(found: list[Card]) -> str:
     """A page with these cards, the first one the head, whose data have the page's `name`."""
     data = {card.name: dict(card.data) for card in found}  # as the script takes them
     arrays = {f"{card.name}.{name}": array for card in found for name, array in card.arrays.items()}
-    block, table = packed(arrays)
+    block, table = pack_arrays(arrays)
     script = "{\n" + "\n".join(_asset(name) for name in SCRIPTS) + "\n}\n"
     style = "\n".join(_asset(name) for name in STYLES)
     bundle = _asset("report.bundle.js")

@@ -13,16 +13,16 @@ import numpy as np
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.checkpoint_file import Array, Checkpoint, CheckpointError, write_checkpoint
-from remodel_fenicsx.fem.assembly import agreed
+from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.state import State
 from remodel_fenicsx.system.environment import versions
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
-LONGEST_LOSS = 600.0  # seconds
+MAX_LOSS_SECONDS = 600.0  # seconds
 SHORTEST_PAUSE = 10.0  # seconds between two that are chosen by time: below it nothing worth a write is lost
-LARGEST_SHARE = 0.04  # of the time of a run, that checkpoints chosen by time may cost
+MAX_TIME_FRACTION = 0.04  # of the time of a run, that checkpoints chosen by time may cost
 
 
 class Checkpoints(Watcher):
@@ -57,7 +57,7 @@ class Checkpoints(Watcher):
         """The same on all ranks."""
         if self.every is not None:
             return self.every > 0 and number % self.every == 0
-        pause = min(max(SHORTEST_PAUSE, self._cost / LARGEST_SHARE), LONGEST_LOSS)
+        pause = min(max(SHORTEST_PAUSE, self._cost / MAX_TIME_FRACTION), MAX_LOSS_SECONDS)
         due = clock.monotonic() - self._written_at >= pause
         return bool(self.state.comm.bcast(due, root=0))
 
@@ -103,20 +103,20 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
     """Bring a state to a checkpoint. Collective."""
     domain, comm = state.loading.domain, state.comm
     mesh, first = mesh_arrays(domain), comm.rank == 0
-    agreed(comm, lambda: _check(state, domain, cast(Checkpoint, checkpoint), mesh or {}) if first else None)
+    raise_on_all_ranks(comm, lambda: _check(state, domain, cast(Checkpoint, checkpoint), mesh or {}) if first else None)
     header = comm.bcast(checkpoint.model_copy(update={"arrays": {}}) if first and checkpoint else None)
     missing, counts = [name for name in state.functions() if name not in header.functions], _counts(state)
     for name, function in state.functions().items():
         if name not in missing:
             values = checkpoint.arrays[f"function/{name}"] if first and checkpoint else None
             function.x.array[_places(function)] = domain.scatter_elements(values)
-    state.reach(header.time, header.number)
+    state.complete_step(header.time, header.number)
     numbers = header.numbers | {counts[name]: 0.0 for name in missing}
     if missing and first:
         log.info("not in the checkpoint, so they begin anew: %s", ", ".join(missing))
     for mark, case in state.each_case().items():
-        case.numbers |= with_mark(numbers, mark)
-        kept = with_mark(header.loads, mark)
+        case.numbers |= values_of_case(numbers, mark)
+        kept = values_of_case(header.loads, mark)
         case.loading.set({name: kept.get(name, 0.0) for name in case.loading.values})
 
 
@@ -144,7 +144,7 @@ def marked(state: State, values: Callable[[State], Mapping[str, T]]) -> dict[str
     return {f"{name}{mark}": value for mark, case in cases for name, value in values(case).items()}
 
 
-def with_mark(values: Mapping[str, T], mark: str) -> dict[str, T]:
+def values_of_case(values: Mapping[str, T], mark: str) -> dict[str, T]:
     """Those of one load case, by their names without its mark."""
     parts = {name: name.partition("@") for name in values}
     return {parts[name][0]: value for name, value in values.items() if "".join(parts[name][1:]) == mark}

@@ -14,15 +14,16 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body.shape import Column, Shape, columns_of
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.fem import compat, jit
-from remodel_fenicsx.fem.assembly import integral, over_ranks
+from remodel_fenicsx.fem.assembly import integral, allreduce
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.drivers import DRIVERS
-from remodel_fenicsx.schema.tables import SceneError, shown
+from remodel_fenicsx.schema.tables import SceneError, format_value
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
@@ -92,7 +93,7 @@ class Observer(Watcher):
                 value = column.value(measurement)
                 if not isinstance(value, Real) or np.isinf(value):
                     error = RemodelError(
-                        f"the column {column.name!r} is {shown(value)} at time {step.time:g}: must be a finite number, "
+                        f"the column {column.name!r} is {format_value(value)} at time {step.time:g}: must be a finite number, "
                         "or nan where there is none"
                     )
                     error.on_all_ranks = False
@@ -100,6 +101,7 @@ class Observer(Watcher):
                 step.row[column.name] = float(value)
 
 
+@with_old_names
 class Measurement:
     """What columns may ask of a step; everything is computed once, when the first one asks.
 
@@ -173,7 +175,7 @@ class Measurement:
             stresses = PointStresses(self.state, stepper.tissue)
             return stresses, jit.expression(stresses.ufl.cauchy, self.quadrature.points)
 
-        stresses, expression = self.tool("cauchy stress", compiled)
+        stresses, expression = self.cached("cauchy stress", compiled)
         stresses.refresh()
         return self.quadrature.evaluate(expression, (3, 3))
 
@@ -208,11 +210,11 @@ class Measurement:
         """Of the chains at all points (elements, points)."""
         cells = self.state.cells
         share = self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
-        return self.equilibrium.parameters.where_chains(share)
+        return self.equilibrium.parameters.nan_without_chains(share)
 
     def _angle(self, axes: Array, local: Array) -> Array:
         found = self.observer.shape.fibre_angle(self.state.cells.dimension_values, axes, local)
-        return self.equilibrium.parameters.where_chains(found)
+        return self.equilibrium.parameters.nan_without_chains(found)
 
     @cached_property
     def chain_extension(self) -> Array:
@@ -250,7 +252,7 @@ class Measurement:
         return self._over_face(face, deformed, 1.0)[0]
 
     def _over_face(self, face: str, deformed: bool, *nodal_values: Array | float) -> list[float]:
-        field, form = self.tool((face, deformed), lambda: _face_form(self, face, deformed))
+        field, form = self.cached((face, deformed), lambda: _face_form(self, face, deformed))
         at_nodes, found = field.x.array.reshape(-1, field.function_space.dofmap.index_map_bs)[:, 0], []
         for values in nodal_values:
             at_nodes[:] = values
@@ -261,12 +263,12 @@ class Measurement:
         """Of a tube whose inner face has this name, at the end z = length."""
 
         def measured() -> EndForce:
-            groups = self.tool(("end force", face), lambda: _end_forms(self, face))
+            groups = self.cached(("end force", face), lambda: _end_forms(self, face))
             if self.equilibrium.pointwise is not None:
                 self.equilibrium.pointwise.update()
             return EndForce(*(sum(map(integral, group)) for group in groups))
 
-        return self.tool_of_step(("end force", face), measured)
+        return self.cached_for_step(("end force", face), measured)
 
     def support_force(self, face: str) -> float:
         """Of an own body: force by which the support of a face pulls it, along the mean normal of each of its parts.
@@ -276,11 +278,11 @@ class Measurement:
         face
             Its name, of `Domain.faces`.
         """
-        return self.tool(("support", face), lambda: _support_force(self.equilibrium, face))()
+        return self.cached(("support", face), lambda: _support_force(self.equilibrium, face))()
 
     def lumen_volume(self) -> float:
         """Of an own body (`MeshDomain`): volume inside the deformed inner face, with flat caps on its rims."""
-        return self.tool("lumen volume", lambda: _lumen_volume(self.observer))()
+        return self.cached("lumen volume", lambda: _lumen_volume(self.observer))()
 
     def largest(self, values: Array) -> float:
         """Largest of one value per local element, over all ranks.
@@ -310,7 +312,7 @@ class Measurement:
             radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size
             return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
 
-        return self.tool(("elements touching", radius), touch)  # type: ignore[no-any-return]
+        return self.cached(("elements touching", radius), touch)  # type: ignore[no-any-return]
 
     def of_case(self, number: int) -> Measurement:
         """The same step in another load case; the first one is 1.
@@ -325,15 +327,15 @@ class Measurement:
             observer = self.observer.others[number - 2]
             return Measurement(observer, observer.stepper.seen(self.step))
 
-        return self if number == 1 else self.tool_of_step(("case", number), measured)  # type: ignore[no-any-return]
+        return self if number == 1 else self.cached_for_step(("case", number), measured)  # type: ignore[no-any-return]
 
-    def tool(self, key: object, make: Callable[[], T]) -> T:
+    def cached(self, key: object, make: Callable[[], T]) -> T:
         """What a column needs for every step, a compiled form say: made once, by make(), and kept under a key."""
         if key not in self.observer.tools:
             self.observer.tools[key] = make()
         return self.observer.tools[key]
 
-    def tool_of_step(self, key: object, make: Callable[[], T]) -> T:
+    def cached_for_step(self, key: object, make: Callable[[], T]) -> T:
         """What several columns of one step share: made once for the step."""
         if key not in self._of_step:
             self._of_step[key] = make()
@@ -349,7 +351,7 @@ def _face_form(measured: Measurement, face: str, deformed: bool) -> tuple[dolfin
     F = state.kinematics.deformation_gradient(state.unknown)
     stretched = ufl.cofac(F) * normal if deformed else normal
     weight = ufl.sqrt(ufl.inner(stretched, stretched)) * state.kinematics.weight(mesh)
-    return field, jit.form(value * weight * state.loading.measure_alone(face))
+    return field, jit.form(value * weight * state.loading.separate_measure(face))
 
 
 def _lumen_volume(observer: Observer) -> Callable[[], float]:
@@ -362,14 +364,14 @@ def _lumen_volume(observer: Observer) -> Callable[[], float]:
     place = ufl.SpatialCoordinate(mesh) - dolfinx.fem.Constant(mesh, middle)
     place += state.kinematics.displacement(state.unknown)
     normal = ufl.cofac(state.kinematics.deformation_gradient(state.unknown)) * ufl.FacetNormal(mesh)
-    form = jit.form(-ufl.inner(place, normal) / 3 * state.loading.measure_alone("inner"))
+    form = jit.form(-ufl.inner(place, normal) / 3 * state.loading.separate_measure("inner"))
 
     def volume() -> float:
         displacement = state.gathered_displacement()
         caps = 0.0
         if displacement is not None:
             caps = sum(cap_volume(nodes + displacement, rim) for rim in domain.rims)
-        found = integral(form) + float(over_ranks(domain.comm, caps, MPI.SUM))
+        found = integral(form) + float(allreduce(domain.comm, caps, MPI.SUM))
         return found if abs(found) > NO_LUMEN * domain.size**3 else math.nan
 
     return volume
@@ -398,7 +400,7 @@ def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
         forces = (vectors[0].array + vectors[1].array).reshape(-1, 3)
         for vector in vectors:
             vector.destroy()
-        return float(over_ranks(domain.comm, sum(float((forces[n] @ normal).sum()) for n, normal in held), MPI.SUM))
+        return float(allreduce(domain.comm, sum(float((forces[n] @ normal).sum()) for n, normal in held), MPI.SUM))
 
     return out_of_balance
 
@@ -410,7 +412,7 @@ class EndForce(NamedTuple):
     inward: float
     lumen: float
 
-    def of_the_wall(self, pressure: float) -> float:
+    def wall_force(self, pressure: float) -> float:
         """The force that the wall carries through its section at z = L, with a pressure on the inner face."""
         return self.internal + pressure * self.inward
 
@@ -429,7 +431,7 @@ def _end_forms(measured: Measurement, face: str) -> list[list[dolfinx.fem.Form]]
     one, size = (dolfinx.fem.Constant(mesh, np.float64(v)) for v in (1.0, measured.domain.dimensions["length"]))
     along = ufl.as_tensor([[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)])
     longer = F + change * along
-    energies = state.dilatation.energies(equilibrium.tissue, elastic(longer), [state.cells.ufl_cell], tissue)
+    energies = state.dilatation.energies(equilibrium.tissue, elastic(longer), [state.cells.symbolic_cell], tissue)
     internal = [ufl.derivative(energy, change, one) for energy in energies]
     if equilibrium.pointwise is not None:
         work = ufl.inner(ufl.dot(elastic(F), equilibrium.pointwise.stress), elastic(along))

@@ -58,14 +58,14 @@ class ElementFields:
         """By name, one row per local element."""
         state, measured = self.observer.state, Measurement(self.observer, None)  # type: ignore[arg-type]
         quadrature, mean_cells = measured.quadrature, cache(self.mean_cells)
-        mean, mean_of_known = quadrature.element_mean, quadrature.element_mean_of_known
+        mean, nanmean = quadrature.element_mean, quadrature.element_nanmean
         makers: dict[str, Callable[[], Array]] = {
             "deformation_gradient": lambda: mean(measured.F).reshape(-1, 9),
             "cauchy_stress": lambda: mean(measured.stress).reshape(-1, 9),
             "cell_dimensions": lambda: mean_cells()[0],
-            "fibre_angle": lambda: mean_of_known(measured.fibre_angle),
-            UNLOADED: lambda: mean_of_known(measured.fibre_angle_unloaded),
-            "fibre_angle_deformed": lambda: mean_of_known(measured.fibre_angle_deformed),
+            "fibre_angle": lambda: nanmean(measured.fibre_angle),
+            UNLOADED: lambda: nanmean(measured.fibre_angle_unloaded),
+            "fibre_angle_deformed": lambda: nanmean(measured.fibre_angle_deformed),
             "chain_extension": lambda: measured.chain_extension.max(axis=1),
             REGION: lambda: measured.domain.element_region.astype(np.float64),
         }

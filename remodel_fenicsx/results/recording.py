@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.environment import check_extensions
-from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, open_own, part_of, read_regular
+from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, open_own, partial_path, read_regular
 
 if TYPE_CHECKING:
     import h5py
@@ -412,7 +412,7 @@ class RunLock(ClosedAtEnd):
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 os.close(self._descriptor)
-                raise FolderTaken(f"{folder}: {writer(folder)[0] or 'another process'} writes in it") from None
+                raise FolderTaken(f"{folder}: {lock_holder(folder)[0] or 'another process'} writes in it") from None
             if self._path.exists() and os.path.samestat(os.fstat(self._descriptor), os.stat(self._path)):
                 break
             os.close(self._descriptor)  # the writer before has taken the file away meanwhile
@@ -426,7 +426,7 @@ class RunLock(ClosedAtEnd):
         os.close(self._descriptor)
 
 
-def writer(folder: Path) -> tuple[str | None, bool]:
+def lock_holder(folder: Path) -> tuple[str | None, bool]:
     """The process that writes in a folder, or wrote in it when it was killed, in words; and whether it lives."""
     try:
         descriptor = open_own(folder / LOCK, os.O_RDONLY)
@@ -442,7 +442,7 @@ def writer(folder: Path) -> tuple[str | None, bool]:
     return words or None, lives  # none: just being written
 
 
-def is_vacant(folder: Path) -> bool:
+def is_unused(folder: Path) -> bool:
     """Whether a folder is empty, or holds only what a process leaves that is killed before its scene has its name."""
-    left = {LOCK, part_of(Path(SCENE)).name}
-    return {entry.name for entry in folder.iterdir()} <= left and not writer(folder)[1]
+    left = {LOCK, partial_path(Path(SCENE)).name}
+    return {entry.name for entry in folder.iterdir()} <= left and not lock_holder(folder)[1]

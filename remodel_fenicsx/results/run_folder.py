@@ -17,7 +17,7 @@ from typing import NamedTuple, cast
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.fem.assembly import agreed
+from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.results.recording import (
     CHAIN_LINES,
     FIELDS,
@@ -28,7 +28,7 @@ from remodel_fenicsx.results.recording import (
     RecordingError,
     RunLock,
     SCENE,
-    is_vacant,
+    is_unused,
 )
 from remodel_fenicsx.results.vtkhdf import check_series
 from remodel_fenicsx.system.files import ClosedAtEnd, numbered, open_own, read_regular, write_whole
@@ -39,7 +39,7 @@ def choose_folder(requested: Path | None, name: str) -> Path:
     if requested is not None:
         if requested.exists() and not requested.is_dir():
             raise FolderTaken(f"folder {requested}: is a file; allowed is a new or an empty folder")
-        if requested.is_dir() and not is_vacant(requested):
+        if requested.is_dir() and not is_unused(requested):
             raise FolderTaken(f"folder {requested}: is not empty; allowed is a new or an empty folder")
         return requested
     Path("results").mkdir(exist_ok=True)
@@ -82,14 +82,14 @@ def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) 
     'results/my-cube'
     """
     wanted = None if requested is None else Path(requested)
-    chosen = agreed(comm, lambda: choose_folder(wanted, name) if comm.rank == 0 else None)
+    chosen = raise_on_all_ranks(comm, lambda: choose_folder(wanted, name) if comm.rank == 0 else None)
     return cast(Path, comm.bcast(chosen))
 
 
 @contextmanager
 def locked(folder: Path, comm: MPI.Intracomm, new: bool) -> Iterator[None]:
     """Within, this run alone writes in the folder. Collective."""
-    lock = agreed(comm, lambda: _lock(folder, comm.size, new) if comm.rank == 0 else nullcontext())
+    lock = raise_on_all_ranks(comm, lambda: _lock(folder, comm.size, new) if comm.rank == 0 else nullcontext())
     with lock:
         yield
 
@@ -119,7 +119,7 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
             check_series(folder / name)
 
 
-def forget_steps(folder: Path) -> None:
+def remove_partial_results(folder: Path) -> None:
     """Take away what a run has kept that was killed before its first checkpoint: it starts again."""
     for name in (HISTORY, FIELDS, CHAIN_LINES):
         (folder / name).unlink(missing_ok=True)
@@ -137,7 +137,9 @@ class LastStep(NamedTuple):
     columns: Sequence[str]
     number: int
     time: float
-    went: Sequence[str] = ()  # columns of earlier versions: they stay in the file, and are empty from there on
+    removed_columns: Sequence[
+        str
+    ] = ()  # columns of earlier versions: they stay in the file, and are empty from there on
 
 
 class History:
@@ -214,7 +216,7 @@ def size_of_rows(path: Path, after: LastStep) -> int:
         right = False
     if not right:
         raise RecordingError(f"{path}: lacks rows: the checkpoint belongs to {rows} rows up to time {after.time:g}")
-    if [name for name in found if name not in after.went] != list(after.columns):
+    if [name for name in found if name not in after.removed_columns] != list(after.columns):
         raise RecordingError(f"{path}: has other columns than this run; output.columns must stay as it was")
     return sum(map(len, lines))
 

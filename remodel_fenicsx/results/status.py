@@ -13,8 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from remodel_fenicsx.results.checkpoint_file import time_of_checkpoint
-from remodel_fenicsx.results.recording import HISTORY, LARGEST_HISTORY, LOG, SCENE, RecordedRun, RecordingError, writer
-from remodel_fenicsx.system.files import read_regular, typed
+from remodel_fenicsx.results.recording import (
+    HISTORY,
+    LARGEST_HISTORY,
+    LOG,
+    SCENE,
+    RecordedRun,
+    RecordingError,
+    lock_holder,
+)
+from remodel_fenicsx.system.files import read_regular, command_name
 from remodel_fenicsx.system.terminal import duration
 
 RECENT = 20  # steps whose mean is the rate
@@ -26,7 +34,7 @@ def status(folder: Path) -> list[str]:
     """Lines for people: where the run is, whether it is alive, its rate, its checkpoint; or what a study's runs do."""
     if runs := [] if (folder / SCENE).exists() else sorted(path.parent for path in folder.glob(f"*/{SCENE}")):
         return _of_study(folder, runs)
-    holder, lives = writer(folder)
+    holder, lives = lock_holder(folder)
     if not lives or (folder / HISTORY).exists():
         recording = RecordedRun(folder)  # what is no run's folder is refused
     else:
@@ -59,7 +67,9 @@ def status(folder: Path) -> list[str]:
         lines.append(f"{rate:.3g} s a step (mean of the last {len(seconds)})")
     time_kept = time_of_checkpoint(folder)
     kept = "no checkpoint yet" if time_kept is None else f"checkpoint at time {time_kept:g}"
-    lines.append(kept if lives or state == "finished" else f"{kept}; it goes on with: {typed()} run --resume {folder}")
+    lines.append(
+        kept if lives or state == "finished" else f"{kept}; it goes on with: {command_name()} run --resume {folder}"
+    )
     return lines
 
 
@@ -74,11 +84,11 @@ def state_of(recording: RecordedRun) -> tuple[str, str]:
     times = recording.history["time"]
     if len(times) and math.isclose(float(times[-1]), recording.scene.last_time):
         return "finished", ""
-    state, reason = _said_of_its_end(recording.path)
-    return ("running" if not reason and writer(recording.path)[1] else state), reason
+    state, reason = _outcome_from_log(recording.path)
+    return ("running" if not reason and lock_holder(recording.path)[1] else state), reason
 
 
-def _said_of_its_end(folder: Path) -> tuple[str, str]:
+def _outcome_from_log(folder: Path) -> tuple[str, str]:
     """What run.log says since the run last began: "failed" or "stopped", and why; no reason where it was killed."""
     said = [text.partition("\n")[0] for _, _, text in log_entries(folder)]
     last = next((text for text in reversed(said) if text.startswith((BEGUN, FAILED, STOPPED))), BEGUN)
@@ -97,9 +107,9 @@ def _of_study(folder: Path, runs: list[Path]) -> list[str]:
 
 def _state(folder: Path) -> tuple[str, str]:
     """Of a run of a study in a word; and why it has failed."""
-    if writer(folder)[1]:
+    if lock_holder(folder)[1]:
         return "running", ""
     try:
         return state_of(RecordedRun(folder))
     except RecordingError:
-        return _said_of_its_end(folder)
+        return _outcome_from_log(folder)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from remodel_fenicsx.results.recording import series_file
-from remodel_fenicsx.system.files import ClosedAtEnd, part_of
+from remodel_fenicsx.system.files import ClosedAtEnd, partial_path
 from remodel_fenicsx.system.interrupts import held_back
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ _ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
 _COMPRESSION: dict[str, object] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
-class PatientFile(io.FileIO):
+class DeferredErrorFile(io.FileIO):
     """The file below h5py. A write that fails is said when HDF5 has returned, which would crash the process."""
 
     fault: OSError | None = None
@@ -89,7 +89,7 @@ class TransientGrid(ClosedAtEnd):
     ):
         if os.path.lexists(path):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-        self.path, self._part = path, part_of(path)
+        self.path, self._part = path, partial_path(path)
         self._part.unlink(missing_ok=True)  # of a process that was killed
         self.number_of_steps = 0
         self._open("x+")
@@ -100,7 +100,7 @@ class TransientGrid(ClosedAtEnd):
     def continued(cls, path: Path, time: float) -> TransientGrid:
         """With the steps of a file up to `time`, to append more."""
         grid = cls.__new__(cls)
-        grid.path, grid._part = path, part_of(path)
+        grid.path, grid._part = path, partial_path(path)
         grid._part.unlink(missing_ok=True)
         grid._reopen()
         with grid._written() as file:
@@ -117,12 +117,12 @@ class TransientGrid(ClosedAtEnd):
     def _open(self, mode: str) -> None:
         import h5py
 
-        self._disk = PatientFile(self._part, mode)
+        self._disk = DeferredErrorFile(self._part, mode)
         self._file = h5py.File(self._disk, "w" if mode == "x+" else "r+")
 
     @contextmanager
     def _written(self) -> Iterator[h5py.File]:
-        """Within, HDF5 writes; no signal comes between, whose handler might raise in `PatientFile.write`."""
+        """Within, HDF5 writes; no signal comes between, whose handler might raise in `DeferredErrorFile.write`."""
         with held_back():
             yield self._file
             self._file.flush()

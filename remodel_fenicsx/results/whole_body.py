@@ -32,7 +32,7 @@ DIRECTION_FIELDS = ("axis_c", "axis_a", "axis_r")
 TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
 
 
-class TurnedFields:
+class RotatedFields:
     """Which node and element of a reduction stands for each of a body's own, and its fields there."""
 
     def __init__(self, points: Array, elements: Numbers, own_points: Array, own_elements: Numbers, turn: Turn):
@@ -121,13 +121,13 @@ class WholeBody:
         self.recording, self.is_turned = recording, kinematics.reduced
         points = recording.points
         elements = recording.elements[:, : CORNERS[kinematics.element(scene.mesh.element)]]
-        self._turned: TurnedFields | None = None
+        self._turned: RotatedFields | None = None
         if self.is_turned:
             reduction = shape.reductions[scene.model.kinematics]
             assert reduction.whole is not None
             solved = points, recording.elements
             points, elements = reduction.whole(shape, points, elements)
-            self._turned = TurnedFields(points, elements, *solved, reduction.turn)
+            self._turned = RotatedFields(points, elements, *solved, reduction.turn)
         self._used, corners = np.unique(elements, return_inverse=True)
         self.points, self.elements = points[self._used], corners.reshape(elements.shape)
         self.centres = self.points[self.elements].mean(axis=1)

@@ -16,8 +16,8 @@ from remodel_fenicsx.body.reductions import AUTO, for_means
 from remodel_fenicsx.model.chains import Chain
 from remodel_fenicsx.model.laws import COMPLEX_STEP, LAWS
 from remodel_fenicsx.schema.settings import COUPLINGS, Properties, in_region
-from remodel_fenicsx.schema.tables import fault, quoted
-from remodel_fenicsx.schema.text import merged, put
+from remodel_fenicsx.schema.tables import validation_error, quoted
+from remodel_fenicsx.schema.text import merge_nested, set_nested
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
 _DATA = tomllib.loads(Path(__file__).with_name("presets.toml").read_text(encoding="utf-8"))
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
-    name: {shape: merged(merged(_DATA["method"], body), preset["changes"]) for shape, body in _DATA["bodies"].items()}
+    name: {
+        shape: merge_nested(merge_nested(_DATA["method"], body), preset["changes"])
+        for shape, body in _DATA["bodies"].items()
+    }
     for name, preset in _DATA["presets"].items()
 }
 """Scene keys by preset and shape; a scene's own keys override them."""
@@ -88,7 +91,7 @@ def nested(values: Mapping[str, object]) -> dict[str, Any]:
     """Convert values by dotted key to nested tables."""
     tables: dict[str, object] = {}
     for key, value in values.items():
-        put(tables, key, value)
+        set_nested(tables, key, value)
     return tables
 
 
@@ -121,7 +124,7 @@ def _chain_density(one: Properties, initial_stiffness: float) -> float:
     return initial_stiffness / (tissue.network_modulus * aligned_stiffness(chain, r0, length))
 
 
-class Experiment(NamedTuple):
+class MeasuredParameter(NamedTuple):
     """A parameter in experimental form: its key, and its conversion to the model's parameter."""
 
     table: str
@@ -131,9 +134,9 @@ class Experiment(NamedTuple):
 
 
 EXPERIMENTS = (  # The order matters: the density needs the contour length.
-    Experiment("material", "locking_stretch", "contour_length", lambda one, v: v * one.cells.end_to_end_length),
-    Experiment("material", "initial_stiffness", "chain_density", _chain_density),
-    Experiment("remodeling", "half_life", "kappa", lambda one, value: math.log(2) / value),
+    MeasuredParameter("material", "locking_stretch", "contour_length", lambda one, v: v * one.cells.end_to_end_length),
+    MeasuredParameter("material", "initial_stiffness", "chain_density", _chain_density),
+    MeasuredParameter("remodeling", "half_life", "kappa", lambda one, value: math.log(2) / value),
 )
 
 
@@ -148,17 +151,17 @@ def parts_of(values: Values) -> Iterator[tuple[str, Values]]:
 
 def with_part(values: Values, name: str, over: Values) -> dict[str, Any]:
     """Return the values with changes to the whole body ("") or to a region."""
-    return merged(values, {"regions": {name: over}} if name else over)
+    return merge_nested(values, {"regions": {name: over}} if name else over)
 
 
 def check_exclusive(own: Values) -> None:
     """Check that no experimental parameter is set together with the parameter that it replaces."""
     for name, part in parts_of(own):
         for experiment in EXPERIMENTS:
-            value, key = said(part, experiment.table, experiment.key), f"{place_of(name)}{experiment.table}"
+            value, key = said(part, experiment.table, experiment.key), f"{region_prefix(name)}{experiment.table}"
             if value is not None and said(part, experiment.table, experiment.replaces) is not None:
                 rule = f"{key}.{experiment.replaces} is also set; set only one of them"
-                raise fault(rule, f"{key}.{experiment.key}", value)
+                raise validation_error(rule, f"{key}.{experiment.key}", value)
 
 
 def with_own_numbers(part: S, properties: Callable[[S], Properties]) -> S:
@@ -184,12 +187,12 @@ def without_replaced(values: dict[str, Any], changed: Collection[str]) -> None:
         without_coupling(values, values)
     for name, part in parts_of(values):
         for table, key, replaces, *_ in EXPERIMENTS:
-            place = f"{place_of(name)}{table}"
+            place = f"{region_prefix(name)}{table}"
             if f"{place}.{key}" in changed and f"{place}.{replaces}" not in changed:
                 part[table].pop(replaces, None)
 
 
-def place_of(name: str) -> str:
+def region_prefix(name: str) -> str:
     """Return the prefix of a region's keys, for any name."""
     return in_region(name and quoted(str(name)))
 

@@ -31,12 +31,12 @@ from remodel_fenicsx.schema.settings import (
     in_region,
     laws_with_a_target,
 )
-from remodel_fenicsx.schema.tables import Faults, listed, named, quoted, shown
+from remodel_fenicsx.schema.tables import Faults, listed, join_names, quoted, format_value
 
 
 def _shapes(kind: type, mark: str = ", ") -> str:
     """Return the names of the shapes of a kind."""
-    return named(SHAPES, lambda shape: issubclass(shape, kind)).replace(", ", mark)
+    return join_names(SHAPES, lambda shape: issubclass(shape, kind)).replace(", ", mark)
 
 
 def named_regions(scene: Scene) -> Faults:
@@ -59,18 +59,18 @@ def tissue_of_regions(scene: Scene) -> Faults:
     for name, (material, cells, kappa) in scene.properties().items():
         region, length = in_region(name), cells.end_to_end_length
         if CHAINS[material.chain].locks and length >= material.contour_length:
-            rule = f"must be smaller than {region}material.contour_length = {shown(material.contour_length)}"
+            rule = f"must be smaller than {region}material.contour_length = {format_value(material.contour_length)}"
             yield rule, f"{region}cells.end_to_end_length", length
-        if (words := cells.fault_of_length()) is not None:
+        if (words := cells.length_problem()) is not None:
             yield words, f"{region}cells.initial", cells.initial
         if cells.initial == MEASURED_CELLS and cells.fibres is None:
             yield "needs cells.fibres, the name of a file", f"{region}cells.initial", cells.initial
-        are_apart = material.tells_volume_apart and scene.material.tells_volume_apart
+        are_apart = material.has_volumetric_split and scene.material.has_volumetric_split
         if material.matrix != scene.material.matrix and not are_apart:
             rule = f"must be {scene.material.matrix!r}, or both need a volumetric part (Matrix)"
             yield rule, f"{region}material.matrix", material.matrix
         plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
-        if kappa != plain and law.remodels and not law.asks_kappa:
+        if kappa != plain and law.remodels and not law.stops_at_zero_kappa:
             key, value = ("remodeling.kappa", kappa) if material.chain_density else ("material.chain_density", 0.0)
             yield f"the law {scene.remodeling.law!r} has no kappa", f"{region}{key}", value
         if not turnover.is_on:
@@ -79,7 +79,7 @@ def tissue_of_regions(scene: Scene) -> Faults:
             yield f"needs chains: {region}material.chain_density above 0", "remodeling.turnover", None
         longest = material.contour_length / length
         if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
-            rule = f"must be smaller than {region}contour_length / end_to_end_length = {shown(longest)}"
+            rule = f"must be smaller than {region}contour_length / end_to_end_length = {format_value(longest)}"
             yield rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch
 
 
@@ -94,7 +94,7 @@ def meshed_body(scene: Scene) -> Faults:
 def loads_beside_others(scene: Scene) -> Faults:
     """Check that no two loads exclude each other."""
     for name, load in scene.loads.items():
-        if (other := scene.load_kinds[name].instead_of) in scene.loads:
+        if (other := scene.load_kinds[name].replaces) in scene.loads:
             yield f"not allowed together with loads.{other}", f"loads.{name}", load.value
 
 
@@ -143,7 +143,7 @@ def directions_of_matrices(scene: Scene) -> Faults:
 def parts_of_the_energy(scene: Scene) -> Faults:
     """Check that a split formulation has a matrix with a volumetric part."""
     name, matrix = scene.mesh.formulation, scene.material.matrix
-    if name != AUTO and FORMULATIONS[name].takes_parts and not scene.material.tells_volume_apart:
+    if name != AUTO and FORMULATIONS[name].splits_energy and not scene.material.has_volumetric_split:
         rule = f"needs a material.matrix with a volumetric part (Matrix); {matrix!r} has none"
         yield rule, "mesh.formulation", name
 
@@ -199,7 +199,7 @@ def measured_natural_state(scene: Scene) -> Faults:
 def natural_state(scene: Scene) -> Faults:
     """Check that shape, formulation and cells allow residual stress."""
     natural, shape, able, none = scene.natural, scene.geometry, Walled, "none"
-    if natural.is_of_the_mesh or natural.fibres:
+    if natural.is_trivial or natural.fibres:
         return
     value: float
     key, value = "natural.layers", len(natural.layers)
@@ -228,11 +228,13 @@ def loads_of_the_body(scene: Scene) -> Faults:
             yield rule, f"{key}.value", load.value
         for index, (moment, factor) in enumerate(load.ramp):
             if not time.is_equilibrium and moment <= time.end:
-                time.check_hit(moment, f"{key}.ramp[{index}][0]")
+                time.check_step_time(moment, f"{key}.ramp[{index}][0]")
             for case in scene.each_case():
                 full = case.loads[name].value * factor
                 if full <= least:
-                    words = f"with the factor {shown(full / load.value if load.value else factor)} it is {full:.6g}"
+                    words = (
+                        f"with the factor {format_value(full / load.value if load.value else factor)} it is {full:.6g}"
+                    )
                     yield f"must be greater than {least:g} at every time; {words}", f"{key}.value", load.value
 
 
@@ -259,7 +261,7 @@ def coupling_and_mean(scene: Scene) -> Faults:
     if MEANS_OF_CASES[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
         yield f"needs a remodeling.law with a target: {laws_with_a_target()}", "remodeling.mean", remodeling.mean
     if scene.cases[1:] and not coupling.takes_cases:
-        able = named(COUPLINGS, lambda kind: kind.takes_cases)
+        able = join_names(COUPLINGS, lambda kind: kind.takes_cases)
         yield f"must be one of {able} with [[cases]]", "remodeling.coupling", remodeling.coupling
 
 
@@ -283,9 +285,9 @@ def growth(scene: Scene) -> Faults:
     elif start and time.is_equilibrium:
         yield "must be 0 or 'rest' with time.end = 'equilibrium', which has no times", key, start
     elif start and start > time.end:
-        yield f"must be at most time.end = {shown(time.end)}", key, start
+        yield f"must be at most time.end = {format_value(time.end)}", key, start
     elif start:
-        time.check_hit(start, key)
+        time.check_step_time(start, key)
 
 
 def equilibrium(scene: Scene) -> Faults:
@@ -294,7 +296,7 @@ def equilibrium(scene: Scene) -> Faults:
     if not scene.time.is_equilibrium:
         return
     if not LAWS[law].has_limit:
-        laws = named(LAWS, lambda law: law.has_limit)
+        laws = join_names(LAWS, lambda law: law.has_limit)
         rule = f"remodeling.law = {law!r} has no unique steady state; laws with one: {laws}"
         yield rule, key, end
     bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
@@ -320,8 +322,8 @@ def times_of_output(scene: Scene) -> Faults:
         if scene.time.is_equilibrium:
             yield "not allowed with time.end = 'equilibrium', which has no times", key, moment
         if moment > scene.time.end:
-            yield f"must be at most time.end = {shown(scene.time.end)}", key, moment
-        scene.time.check_hit(moment, key)
+            yield f"must be at most time.end = {format_value(scene.time.end)}", key, moment
+        scene.time.check_step_time(moment, key)
 
 
 def fields_of_the_body(scene: Scene) -> Faults:

@@ -18,6 +18,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, Field, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, choice
 from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
@@ -65,12 +66,12 @@ from remodel_fenicsx.schema.tables import (
     VariantOf,
     allowed,
     choices,
-    fault,
+    validation_error,
     is_number,
     quoted,
-    shown,
+    format_value,
 )
-from remodel_fenicsx.schema.text import merged, parse_override, put, read_toml, toml_text
+from remodel_fenicsx.schema.text import merge_nested, parse_override, set_nested, read_toml, toml_text
 from remodel_fenicsx.schema.units import (
     FORCE,
     LENGTH_UNIT,
@@ -103,17 +104,17 @@ def doubts(
     unit, pascal, density = material.stress_unit, STRESS_UNITS[material.stress_unit], material.chain_density
     network = chain_stress(material, end_to_end_length)
     ratio, stiffness = network / material.lame_mu, material.lame_mu + network
-    if network and (way := _beyond(ratio, NETWORK)):
+    if network and (way := _outside_decades(ratio, NETWORK)):
         of_pascal = (
             f" ({density:g} in a scene in Pa corresponds to {density * pascal:g} in {unit})" if pascal > 1 else ""
         )
         yield (
             f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} "
-            f"{unit}) is {_times(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix "
+            f"{unit}) is {_format_factor(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix "
             f"(lame_mu = {material.lame_mu:.4g} {unit}); check its unit, which is 1/m^3{of_pascal}"
         )
     for key, words, ratio, decades in geometry.proportions:
-        if _beyond(ratio, decades):
+        if _outside_decades(ratio, decades):
             one = "check the units, all lengths are in geometry.length_unit"
             yield f"geometry.{key} = {getattr(geometry, key):g}: {words} is {ratio:.3g}; {one}"
     for name, load in loads.items():
@@ -121,9 +122,9 @@ def doubts(
         if words := convention_doubt(name, value):
             yield f"{key}: {words}"
         stress = abs(largest_stress(kind, value, geometry) or 0.0)
-        if stress and (way := _beyond(stress / stiffness, LOAD)):
+        if stress and (way := _outside_decades(stress / stiffness, LOAD)):
             yield (
-                f"{key}: the largest stress, {stress:.3g} {unit}, is {_times(stress / stiffness)} "
+                f"{key}: the largest stress, {stress:.3g} {unit}, is {_format_factor(stress / stiffness)} "
                 f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network "
                 f"(lame_mu + c g(r0) r0^2 = {stiffness:.3g} {unit}); check material.stress_unit"
             )
@@ -191,12 +192,12 @@ def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | Non
     return value if kind.dimension == STRESS else None
 
 
-def _beyond(ratio: float, decades: tuple[float, float]) -> int:
+def _outside_decades(ratio: float, decades: tuple[float, float]) -> int:
     """Return -1 below the range, 1 above it, and 0 inside."""
     return (ratio > 10.0 ** decades[1]) - (ratio < 10.0 ** decades[0])
 
 
-def _times(ratio: float) -> str:
+def _format_factor(ratio: float) -> str:
     """Format a ratio's distance from one: a factor with two digits, and decades."""
     factor = max(ratio, 1 / ratio)
     return f"{float(f'{factor:.2g}'):g} times ({math.log10(factor):.1f} decades)"
@@ -205,18 +206,19 @@ def _times(ratio: float) -> str:
 # components that may bring keys of [material]
 PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}
 FORMAT = 2  # format of recorded scenes; increased if earlier versions could not read them
-COLUMNS_THAT_WENT = ("held_points",)  # columns of earlier versions
+REMOVED_COLUMNS = ("held_points",)  # columns of earlier versions
 # per kind of table; each table is checked against all others and has its own columns
 MOST_TABLES = 200
 # value of k a below which a wall with turnover takes more than about 5 T for a factor of e
 SLOW_REST = 3.0
 # times 1/kappa: no trace of the start is left, also in cells below a hundredth of a tension
-FORGOTTEN_AFTER = 1000.0
+STEADY_STATE_TIME = 1000.0
 
 
 # ---------------------------------------------------------------- the scene
 
 
+@with_old_names
 class Scene(Table):
     """A scene: its top-level keys and its tables.
 
@@ -292,7 +294,7 @@ class Scene(Table):
         own = _with_measured_cells(_in_present_format(_plain(values)))
         for name in ("regions", "loads", "cases", "supports"):
             if isinstance(found := own.get(name), dict | list | tuple) and len(found) > MOST_TABLES:
-                raise fault(f"has {len(found)} tables; must have at most {MOST_TABLES}", name, None)
+                raise validation_error(f"has {len(found)} tables; must have at most {MOST_TABLES}", name, None)
         presets.check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
@@ -301,18 +303,18 @@ class Scene(Table):
         _check_load_names(shape, own.get("loads"))
         base = SHAPES[shape].defaults_of(own)
         if preset is None:
-            base = merged(base, presets.default_method(own))
+            base = merge_nested(base, presets.default_method(own))
         else:
             if shape not in presets.PRESETS[preset]:
                 known = ", ".join(map(repr, presets.PRESETS[preset]))
-                raise fault(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
-            base = merged(base, presets.PRESETS[preset][shape])
+                raise validation_error(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
+            base = merge_nested(base, presets.PRESETS[preset][shape])
         presets.without_coupling(base, own)
 
         def made(settings: Mapping[str, object]) -> Scene:
-            values = merged(merged(base, presets.nested(settings)), own)
+            values = merge_nested(merge_nested(base, presets.nested(settings)), own)
             if large := [item for item in leaves(values) if is_number(item[1]) and abs(item[1]) > LARGEST_NUMBER]:
-                raise fault(NUMBER_TOO_LARGE, *large[0])
+                raise validation_error(NUMBER_TOO_LARGE, *large[0])
             with scene_units(_units(values, SHAPES[shape])):
                 return handler(_with_numbers_of_loads(values, SHAPES[shape]))
 
@@ -341,27 +343,27 @@ class Scene(Table):
         """The formulation that is set, or the one that "auto" resolves to."""
         if self.mesh.formulation != AUTO:
             return self.mesh.formulation
-        return "displacement" if not self._bulk_is_stiff or self.needs_all_points() else NOT_LOCKING
+        return "displacement" if not self._bulk_is_stiff or self.displacement_reason() else NOT_LOCKING
 
     @property
     def _bulk_is_stiff(self) -> bool:
-        return self._stiffness_ratio > FORMULATIONS[NOT_LOCKING].pays_above(self.mesh.element, self.mesh.degree)
+        return self._stiffness_ratio > FORMULATIONS[NOT_LOCKING].auto_threshold(self.mesh.element, self.mesh.degree)
 
-    def needs_all_points(self) -> str:
+    def displacement_reason(self) -> str:
         """Return why "auto" cannot use the locking-free formulation, or an empty string."""
         if COUPLINGS[self.remodeling.coupling].solves_cells:
             return f"remodeling.coupling = {self.remodeling.coupling!r}"
-        if not self.natural.is_of_the_mesh:
+        if not self.natural.is_trivial:
             return "[natural]"
         if self.remodeling.turnover.grows:
             return "remodeling.turnover.volume above 0"
-        if not self.material.tells_volume_apart:
+        if not self.material.has_volumetric_split:
             return f"material.matrix = {self.material.matrix!r}"
         return "homogeneous deformation" if KINEMATICS[choice(self).name].homogeneous else ""
 
-    def formulation_in_words(self) -> str:
+    def describe_formulation(self) -> str:
         """Describe the resolved formulation and its reason."""
-        needs = self.needs_all_points() if self._bulk_is_stiff else ""
+        needs = self.displacement_reason() if self._bulk_is_stiff else ""
         ratio = f"lambda/mu = {self._stiffness_ratio:.4g}"
         return f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
 
@@ -394,7 +396,7 @@ class Scene(Table):
             return float(self.time.end)
         rates = [properties.kappa for properties in self.properties().values()]
         rates += [1 / self.remodeling.turnover.time] if self.remodeling.turnover.time else []
-        return self.end_of_ramps + FORGOTTEN_AFTER / min(rates)
+        return self.end_of_ramps + STEADY_STATE_TIME / min(rates)
 
     def each_case(self) -> list[Scene]:
         """Return a scene for each load case with its loads; the scene itself if it has no cases."""
@@ -429,7 +431,7 @@ class Scene(Table):
         return any(properties.cells.initial == "random" for properties in self.properties().values())
 
     @property
-    def jumps_by_rank(self) -> bool:
+    def has_order_jumps(self) -> bool:
         """Whether the law is ranked and the lengths of cells vary, so that their order can jump."""
         return LAWS[self.remodeling.law].is_ranked and (self.has_random_cells or bool(self.measured_cells))
 
@@ -475,7 +477,7 @@ class Scene(Table):
     @property
     def lacking_fields(self) -> dict[str, str]:
         """Fields that the body does not have, each with the reason."""
-        turnover, same = self.remodeling.turnover, self.natural.is_of_the_mesh
+        turnover, same = self.remodeling.turnover, self.natural.is_trivial
         stress_free = "the mesh is stress-free ([natural]): 'fibre_angle' is the angle in the unloaded body"
         reasons: list[tuple[bool, Sequence[str], str]] = [
             (not self.regions, (REGION,), "the scene has no regions"),
@@ -490,8 +492,8 @@ class Scene(Table):
     def has_free_length(self) -> bool:
         """Whether the body's length is an unknown."""
         kinds, shape = self.load_kinds, self.geometry
-        return (self.supports.ends in shape.ends and shape.ends[self.supports.ends].frees_length) or any(
-            kinds[name].frees_length for name in self.loads
+        return (self.supports.ends in shape.ends and shape.ends[self.supports.ends].makes_length_unknown) or any(
+            kinds[name].makes_length_unknown for name in self.loads
         )
 
     def summary(self) -> str:
@@ -520,7 +522,7 @@ class Scene(Table):
         """
         found: dict[str, None] = {}
         properties = self.properties()
-        if self.geometry.fills(self.regions):
+        if self.geometry.covers_body(self.regions):
             properties.pop("", None)  # The entry holds nowhere.
         for name, (material, cells, _) in properties.items():
             for case in self.each_case():
@@ -531,9 +533,9 @@ class Scene(Table):
         found |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
         tables = self.model_dump(exclude={"loads", "cases"})
         found |= dict.fromkeys(_doubted_keys(tables))
-        return [*found, *self.turned_away(), *self._of_turnover(), *self.remodeling.warnings()]
+        return [*found, *self.loaded_shape_warnings(), *self._turnover_warnings(), *self.remodeling.warnings()]
 
-    def turned_away(self) -> list[str]:
+    def loaded_shape_warnings(self) -> list[str]:
         """Return a warning if the cells reorient, so that rows leave the loaded geometry."""
         turns = LAWS[self.remodeling.law].remodels and any(one.kappa for one in self.properties().values())
         if not (self.geometry.is_loaded and turns and self.natural.cells == AS_GIVEN):
@@ -549,13 +551,13 @@ class Scene(Table):
             f"cells reorient while and after the loads rise, so rows differ from it; {way}"
         ]
 
-    def _of_turnover(self) -> Iterator[str]:
+    def _turnover_warnings(self) -> Iterator[str]:
         """Yield warnings on gains without stable or fast equilibrium, and on large steps."""
         turnover, step = self.remodeling.turnover, self.time.step
         if turnover.time is None:
             return
         for name, properties in self.properties().items():
-            power, slowly = turnover.rule.rest(properties.tissue)
+            power, slowly = turnover.rule.gain_and_recovery_time(properties.tissue)
             says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
             if power <= 2:
                 least = 2 * turnover.gain / power if turnover.gain else math.inf
@@ -592,8 +594,8 @@ class Scene(Table):
         values = self._values()
         for key, value in changes.items():
             if not isinstance(key, str):
-                raise SceneError(f"{shown(key)} = {shown(value)}: a key must be text, as in 'cells.seed'")
-            put(values, key, value)
+                raise SceneError(f"{format_value(key)} = {format_value(value)}: a key must be text, as in 'cells.seed'")
+            set_nested(values, key, value)
         _follow(values, changes, is_whole=True)
         return type(self)(**values)
 
@@ -618,13 +620,15 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
         return dict(values)  # The field's own error describes a wrong value.
     if written > FORMAT:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
-        raise fault(rule, "format", written)
+        raise validation_error(rule, "format", written)
     values = {**values, "format": FORMAT}
     turnover, columns = presets.said(values, "remodeling", "turnover"), presets.said(values, "output", "columns")
     if isinstance(turnover, Mapping) and "time" in turnover:  # defaults of version 0.3.0
-        values = merged({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
+        values = merge_nested({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
     if isinstance(columns, list | tuple):
-        values = merged(values, {"output": {"columns": [name for name in columns if name not in COLUMNS_THAT_WENT]}})
+        values = merge_nested(
+            values, {"output": {"columns": [name for name in columns if name not in REMOVED_COLUMNS]}}
+        )
     return values
 
 
@@ -633,9 +637,9 @@ def _with_measured_cells(values: dict[str, object]) -> dict[str, Any]:
     for name, part in presets.parts_of(values):
         fibres, initial = (presets.said(part, "cells", key) for key in ("fibres", "initial"))
         if fibres is not None and initial not in (None, MEASURED_CELLS):
-            place = f"{presets.place_of(name)}cells"
-            raise fault(
-                f"{place}.initial = {shown(initial)} is also set; set only one of them",
+            place = f"{presets.region_prefix(name)}cells"
+            raise validation_error(
+                f"{place}.initial = {format_value(initial)} is also set; set only one of them",
                 f"{place}.fibres",
                 fibres,
             )
@@ -672,15 +676,15 @@ def _follow(values: dict[str, Any], changed: Mapping[str, object], is_whole: boo
 
 def _check_name(key: str, name: object, names: Iterable[str]) -> None:
     if not isinstance(name, str) or name not in names:
-        raise fault("must be one of " + ", ".join(map(repr, names)), key, name)
+        raise validation_error("must be one of " + ", ".join(map(repr, names)), key, name)
 
 
 def _known_shape(geometry: object) -> str:
     """Return the shape. Check it first: preset, loads and units depend on it."""
     if not isinstance(geometry, Mapping):
-        raise fault("must be a table", "geometry", geometry)
+        raise validation_error("must be a table", "geometry", geometry)
     if "shape" not in geometry:
-        raise fault("missing; must be one of " + ", ".join(map(repr, SHAPES)), "geometry.shape", None)
+        raise validation_error("missing; must be one of " + ", ".join(map(repr, SHAPES)), "geometry.shape", None)
     _check_name("geometry.shape", geometry["shape"], SHAPES)
     return str(geometry["shape"])
 
@@ -692,7 +696,7 @@ def _units(values: Mapping[str, object], shape: type[Shape]) -> dict[str, str | 
         table, name = key.split(".")
         field, chosen = kind.model_fields[name], presets.said(values, table, name)
         if chosen not in (*choices(field), None):
-            raise fault(allowed(field), key, chosen)
+            raise validation_error(allowed(field), key, chosen)
         units[key] = field.default if chosen is None else chosen
     return units
 
@@ -719,17 +723,19 @@ def _check_load_names(shape: str, loads: object) -> None:
             _check_load_on_face(kind, str(name), load)
         elif name not in names:
             key, listed = f"loads.{quoted(str(name))}", ", ".join(f"loads.{known}" for known in names)
-            raise fault(f"a {shape} has no such load; allowed: {listed}", key, load)
+            raise validation_error(f"a {shape} has no such load; allowed: {listed}", key, load)
 
 
 def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object]) -> None:
     key = f"loads.{quoted(name)}"
     if not isinstance(load.get("face"), str):
-        raise fault("missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face"))
+        raise validation_error("missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face"))
     if name in shape.loads:
-        raise fault(f"{shape.loads[name].meaning}; rename the load to use another face", f"{key}.face", load["face"])
+        raise validation_error(
+            f"{shape.loads[name].meaning}; rename the load to use another face", f"{key}.face", load["face"]
+        )
     if not re.fullmatch(NAME, name) or name in {column.name for column in columns_of(shape)}:
-        raise fault(
+        raise validation_error(
             "its name must be a letter, then letters, digits and _, at most 40 in all, and not the name of a column",
             key,
             None,
@@ -750,7 +756,7 @@ def _plain(value: object) -> Any:
 def scene_from_dict(values: Mapping[str, Any]) -> Scene:
     """Make a scene from nested dicts with the keys of a scene file."""
     if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
-        raise SceneError(f"scene = {shown(values)}: must be a table")
+        raise SceneError(f"scene = {format_value(values)}: must be a table")
     return Scene(**values)
 
 
@@ -829,9 +835,9 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     chosen = set(CHOSEN_BY_RUNS) - set(changes) if changes and "format" in read else set()
 
     def made(settings: Mapping[str, object]) -> Scene:
-        values = merged(read, presets.nested(settings))
+        values = merge_nested(read, presets.nested(settings))
         for key, value in changes.items():
-            put(values, key, value)
+            set_nested(values, key, value)
         _follow(values, changes, is_whole="format" in values)
         return _chosen_anew(_beside(values, Path(path).parent), chosen)
 
@@ -851,9 +857,9 @@ def _chosen_anew(values: dict[str, object], chosen: set[str]) -> Scene:
         key = str(error).partition(" ")[0]
         if key not in chosen:
             raise
-        scene = _chosen_anew(merged(values, presets.nested({key: AUTO})), chosen - {key})
+        scene = _chosen_anew(merge_nested(values, presets.nested({key: AUTO})), chosen - {key})
         if is_first_rank():
-            log.warning("%s; using %s instead", error, shown(AUTO))
+            log.warning("%s; using %s instead", error, format_value(AUTO))
         return scene
 
 
@@ -869,28 +875,28 @@ def _with_profile(name: str, made: Callable[[Mapping[str, object]], Scene]) -> S
 
 # Keys that may change: they determine no result of the steps done, or only how these were solved.
 # Of a mesh file only the contents matter (geometry.sha256).
-FREE = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end", "geometry.file")
+RESUMABLE_KEYS = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end", "geometry.file")
 SAME_LOAD = 1e-12  # relative difference below which two loads are equal
 
 
 def check_continuation(old: Scene, new: Scene, time: float) -> None:
     """Check that a scene has the physics of the recorded run until `time`."""
     rule = f"a resumed run may change time.end, output, solver, and loads after its checkpoint at {time:g}"
-    before, now = (dict(leaves(scene.model_dump(mode="json"), FREE)) for scene in (old, new))
+    before, now = (dict(leaves(scene.model_dump(mode="json"), RESUMABLE_KEYS)) for scene in (old, new))
     for key in [*before, *(key for key in now if key not in before)]:
         if before.get(key) != now.get(key):
-            was = shown(before[key]) if key in before else "not set"
-            raise SceneError(f"{key} = {shown(now.get(key))}: was {was}; {rule}")
+            was = format_value(before[key]) if key in before else "not set"
+            raise SceneError(f"{key} = {format_value(now.get(key))}: was {was}; {rule}")
     for name in {**old.load_kinds, **new.load_kinds}:
         first, second = old.loads.get(name), new.loads.get(name)
         if first and second and first.face != second.face:
-            raise SceneError(f"loads.{name}.face = {shown(second.face)}: was {shown(first.face)}; {rule}")
+            raise SceneError(f"loads.{name}.face = {format_value(second.face)}: was {format_value(first.face)}; {rule}")
         for moment in sorted({0.0, time, *_ramp_times(first), *_ramp_times(second)}):
             old_value, value = (0.0 if one is None else one.value * one.factor(moment) for one in (first, second))
             if moment <= time and abs(old_value - value) > SAME_LOAD * max(abs(old_value), abs(value)):
                 raise SceneError(f"loads.{name} = {value:g} at time {moment:g}: was {old_value:g}; {rule}")
     if new.last_time < time:
-        raise SceneError(f"time.end = {shown(new.time.end)}: must be at least {time:g}, the checkpoint's time")
+        raise SceneError(f"time.end = {format_value(new.time.end)}: must be at least {time:g}, the checkpoint's time")
 
 
 def _ramp_times(load: Load | None) -> list[float]:

@@ -19,17 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, create_model
 
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import resolved
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import (
     AUTO,
-    LARGE,
+    MIN_MULTIGRID,
     REMOVED,
-    SMALL_BODY,
-    SMALL_REDUCTION,
+    MAX_DIRECT_3D,
+    MAX_DIRECT_REDUCED,
     SOLVER_METHODS,
-    fault_of_option,
+    option_problem,
 )
 from remodel_fenicsx.model.axes import AXES, GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
@@ -44,10 +45,10 @@ from remodel_fenicsx.schema.tables import (
     OneOf,
     SceneError,
     Table,
-    fault,
-    named,
+    validation_error,
+    join_names,
     quoted,
-    shown,
+    format_value,
     with_key,
 )
 from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
@@ -106,8 +107,8 @@ class Mesh(Table):
 
     def _faults(self) -> Faults:
         pair = self.element, self.degree
-        if self.formulation != AUTO and not FORMULATIONS[self.formulation].has(*pair):
-            able = named(FORMULATIONS, lambda formulation: formulation.has(*pair))
+        if self.formulation != AUTO and not FORMULATIONS[self.formulation].applies_to(*pair):
+            able = join_names(FORMULATIONS, lambda formulation: formulation.applies_to(*pair))
             rule = f"must be {able} for elements {self.element!r} of degree {self.degree}"
             yield rule, "formulation", self.formulation
 
@@ -174,6 +175,7 @@ class Supports(Table):
 # ---------------------------------------------------------------- tissue and cells
 
 
+@with_old_names
 class Material(Table):
     """Tissue: an isotropic matrix (Lame constants) with a network of collagen chains.
 
@@ -232,7 +234,7 @@ class Material(Table):
     """Unit of every stress of the scene. Forces are in this unit times the unit of length squared."""
 
     @property
-    def tells_volume_apart(self) -> bool:
+    def has_volumetric_split(self) -> bool:
         """Whether the matrix energy has a separate volumetric part."""
         return isinstance(MATRICES[self.matrix], Matrix)
 
@@ -264,7 +266,7 @@ class Material(Table):
     def _part(self, part: Any) -> Any:
         """Return a part with the values of its own parameters."""
         own = getattr(part, "parameters", None)
-        return part.of({name: getattr(self, name, own[name].default) for name in own}) if own else part
+        return part.with_parameters({name: getattr(self, name, own[name].default) for name in own}) if own else part
 
     def summary(self, loads: Mapping[str, float]) -> str:
         """Return the moduli of network and matrix and the loads, in one unit and on one line.
@@ -322,7 +324,7 @@ class NaturalLayer(_From):  # type: ignore[misc]
     def _faults(self) -> Faults:
         low, high = self.share
         if not low < high:
-            yield f"must be smaller than to = {shown(high)}", "from", low
+            yield f"must be smaller than to = {format_value(high)}", "from", low
         if self.region is not None and self.share != (0.0, 1.0):
             yield "must not be set together with from or to", "region", self.region
 
@@ -359,7 +361,7 @@ class Natural(Table):
     is not set."""
 
     @property
-    def is_of_the_mesh(self) -> bool:
+    def is_trivial(self) -> bool:
         """Whether the tissue of the mesh is stress-free."""
         return self.opening_angle == 0.0 and not self.layers and not self.fibres
 
@@ -375,7 +377,7 @@ class Natural(Table):
 
 # Size of a group of antithetic seeds. Over the three cyclic permutations of l_1, l_2, l_3 the mean
 # of A is isotropic in each element.
-SAME_DRAWS = 3
+ANTITHETIC_GROUP = 3
 
 
 _Length = Annotated[float, Field(ge=0)]
@@ -438,15 +440,15 @@ class Cells(Table):
     energy while the cells remodel."""
 
     def _faults(self) -> Faults:
-        if (rule := self.fault_of_length()) is not None:
+        if (rule := self.length_problem()) is not None:
             yield rule, "initial", self.initial
 
-    def fault_of_length(self) -> str | None:
+    def length_problem(self) -> str | None:
         """Return why `initial` contradicts `end_to_end_length`, or None if it does not."""
         length = self.end_to_end_length if isinstance(self.initial, str) else math.hypot(*self.initial)
         if abs(length - self.end_to_end_length) <= 1e-6 * self.end_to_end_length:
             return None
-        r0 = shown(self.end_to_end_length)
+        r0 = format_value(self.end_to_end_length)
         return f"root of the sum of squares is {length:.7g}; must be cells.end_to_end_length = {r0}"
 
     def dimensions(self, number_of_elements: int) -> NDArray[np.float64]:
@@ -458,7 +460,7 @@ class Cells(Table):
         """
         r0 = self.end_to_end_length
         if self.initial == "random":
-            seed, turn = divmod(self.seed + 2, SAME_DRAWS) if self.antithetic else (self.seed, 0)
+            seed, turn = divmod(self.seed + 2, ANTITHETIC_GROUP) if self.antithetic else (self.seed, 0)
             draws = np.abs(np.random.default_rng(seed).standard_normal((number_of_elements, 3)))
             draws = np.roll(draws, turn, axis=1)
             return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
@@ -470,6 +472,7 @@ class Cells(Table):
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
+@with_old_names
 @dataclass(frozen=True)
 class CouplingKind:
     """Registry entry of a coupling of equilibrium and remodeling in one step.
@@ -481,7 +484,7 @@ class CouplingKind:
     coupling
         The class of the `Coupling`, or its dotted name. Scenes are read without dolfinx, which the
         class needs.
-    makes_a_share
+    relaxes
         Whether a pass makes only the fraction `relaxation_factor` of its change.
     takes_cases
         Whether the coupling solves several load cases with the same cells.
@@ -514,7 +517,7 @@ class CouplingKind:
 
     meaning: str
     coupling: Callable[..., Any] | str
-    makes_a_share: bool = False
+    relaxes: bool = False
     needs_a_target: bool = False
     takes_cases: bool = False
     takes_turnover: bool = False
@@ -547,7 +550,7 @@ COUPLINGS = {
         "as 'staggered', but each pass makes only the fraction relaxation_factor of its change; "
         "for drivers with which 'staggered' overshoots",
         "remodel_fenicsx.evolution.coupling:Staggered",
-        makes_a_share=True,
+        relaxes=True,
         takes_cases=True,
         takes_turnover=True,
     ),
@@ -739,7 +742,7 @@ class Remodeling(Table):
     def warnings(self) -> list[str]:
         """Return a warning if the coupling relaxes a law and thereby slows it down."""
         law, share = LAWS[self.law], self.relaxation_factor
-        if not COUPLINGS[self.coupling].makes_a_share or share == 1 or not law.remodels or law.of_absolute_time:
+        if not COUPLINGS[self.coupling].relaxes or share == 1 or not law.remodels or law.depends_on_absolute_time:
             return []
         return [
             f"remodeling.coupling = {self.coupling!r} makes {share:g} of each pass, which the law "
@@ -774,17 +777,17 @@ class Remodeling(Table):
 
     def _faults(self) -> Faults:
         law, driver, coupling = LAWS[self.law], DRIVERS[self.driver], COUPLINGS[self.coupling]
-        able = named(LAWS, lambda law: law.takes_set_points)
+        able = join_names(LAWS, lambda law: law.takes_set_points)
         for key, plain in (("exponent", 2), ("threshold", 0)):
             if getattr(self, key) != plain and not law.takes_set_points:
                 yield f"must be {plain} unless remodeling.law is {able}", key, getattr(self, key)
         if self.threshold and not driver.is_stress:
-            drivers = named(DRIVERS, lambda driver: driver.is_stress)
+            drivers = join_names(DRIVERS, lambda driver: driver.is_stress)
             yield f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold
         if self.turnover.is_on and not law.takes_set_points:
             yield f"needs remodeling.law = {able}", "turnover", None
         if self.turnover.is_on and not coupling.takes_turnover:
-            able = named(COUPLINGS, lambda kind: kind.takes_turnover)
+            able = join_names(COUPLINGS, lambda kind: kind.takes_turnover)
             yield f"must be one of {able} with remodeling.turnover", "coupling", self.coupling
         if coupling.needs_a_target and law.target is None:
             rule = f"needs a remodeling.law with a target that can be extrapolated: {laws_with_a_target()}"
@@ -793,7 +796,7 @@ class Remodeling(Table):
 
 def laws_with_a_target() -> str:
     """Return the names of laws with a target, for an error message."""
-    return named(LAWS, lambda law: law.target is not None)
+    return join_names(LAWS, lambda law: law.target is not None)
 
 
 # ---------------------------------------------------------------- regions
@@ -918,11 +921,11 @@ class Load(Table):
             if time < 0:
                 yield "must be at least 0, the start of the simulation", f"ramp[{index}][0]", time
             if index and time <= self.ramp[index - 1][0]:
-                rule = f"must exceed the previous entry's {shown(self.ramp[index - 1][0])}"
+                rule = f"must exceed the previous entry's {format_value(self.ramp[index - 1][0])}"
                 yield rule, f"ramp[{index}][0]", time
         for given, missing in (("kind", "face"), ("face", "kind")):
             if getattr(self, given) is not None and getattr(self, missing) is None:
-                yield f"missing; {given} = {shown(getattr(self, given))} needs it", missing, None
+                yield f"missing; {given} = {format_value(getattr(self, given))} needs it", missing, None
 
     def factor(self, time: float) -> float:
         """Return the load factor at a time: piecewise linear, constant outside the ramp."""
@@ -931,7 +934,7 @@ class Load(Table):
         return float(np.interp(hits[0] if hits else time, times, factors))
 
     @property
-    def falls(self) -> bool:
+    def decreases(self) -> bool:
         """Whether the load's magnitude ever decreases, or its sign changes."""
         factors = [0.0, *(factor for _, factor in self.ramp)]
         return any(abs(new) < abs(old) or new * old < 0 for old, new in itertools.pairwise(factors))
@@ -1008,23 +1011,23 @@ class Time(Table):
         if self.is_equilibrium:
             return
         if self.step > self.end:
-            yield f"must be at most time.end = {shown(self.end)}", "step", self.step
+            yield f"must be at most time.end = {format_value(self.end)}", "step", self.step
         if self.end / self.step > MOST_STEPS:
             rule = f"must be at least time.end / {MOST_STEPS} = {self.end / MOST_STEPS:.6g}"
             yield rule, "step", self.step
-        self.check_hit(self.end, "end")
+        self.check_step_time(self.end, "end")
 
-    def is_hit(self, time: float) -> bool:
+    def is_step_time(self, time: float) -> bool:
         """Return whether a step ends at a time, or may end there."""
         return self.tolerance is not None or math.isclose(time, round(time / self.step) * self.step)
 
-    def check_hit(self, time: float, key: str) -> None:
+    def check_step_time(self, time: float, key: str) -> None:
         """Check that a step may end at a time."""
-        if not self.is_hit(time):
+        if not self.is_step_time(time):
             below = math.floor(time / self.step)
             nearest = f"{below * self.step:.12g} and {(below + 1) * self.step:.12g}"
-            rule = f"must be a multiple of time.step = {shown(self.step)}; the nearest are {nearest}"
-            raise fault(rule, key, time)
+            rule = f"must be a multiple of time.step = {format_value(self.step)}; the nearest are {nearest}"
+            raise validation_error(rule, key, time)
 
     @property
     def is_equilibrium(self) -> bool:
@@ -1037,13 +1040,13 @@ class Time(Table):
         return 1 if self.is_equilibrium else round(self.end / self.step)
 
     @property
-    def chooses(self) -> bool:
+    def is_adaptive(self) -> bool:
         """Whether step sizes adapt to the tolerance, so that the number of steps is not known."""
         return self.tolerance is not None and not self.is_equilibrium
 
     def progress(self, number: int, time: float) -> float:
         """Return how many of `number_of_steps` are done; with adaptive steps by time."""
-        return time / self.step if self.chooses else number
+        return time / self.step if self.is_adaptive else number
 
     def in_words(self) -> str:
         """Describe the division into steps."""
@@ -1080,8 +1083,8 @@ class Solver(Table):
 
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
-        description=f"Solver of each step's equations. 'auto' takes 'direct' up to {SMALL_BODY} "
-        f"unknowns ({SMALL_REDUCTION} of a reduction), then 'lagged', and above {LARGE} 'iterative'. "
+        description=f"Solver of each step's equations. 'auto' takes 'direct' up to {MAX_DIRECT_3D} "
+        f"unknowns ({MAX_DIRECT_REDUCED} of a reduction), then 'lagged', and above {MIN_MULTIGRID} 'iterative'. "
         f"{meanings(SOLVER_METHODS)} "
         "(docs/speed_and_accuracy.md).",
     )
@@ -1115,7 +1118,7 @@ class Solver(Table):
                 yield "not a PETSc option; write its name without the leading '-'", key, value
             if name in ("snes_rtol", "snes_atol", "snes_stol"):
                 yield "has no effect; use solver.relative_tolerance, solver.absolute_tolerance", key, value
-            if refused := fault_of_option(name, value):
+            if refused := option_problem(name, value):
                 yield refused, key, value
         if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
             yield "must be greater than 0 if absolute_tolerance is 0", "relative_tolerance", 0.0

@@ -102,7 +102,7 @@ class Table(BaseModel):
     @model_validator(mode="after")
     def _has_none(self) -> Self:
         for broken in self._faults():
-            raise fault(*broken)
+            raise validation_error(*broken)
         return self
 
     @classmethod
@@ -177,7 +177,7 @@ class OneOf(Before):
     def seen(self, source: type, value: object) -> object:
         """Return the value, or raise if it is not one of the choices."""
         if isinstance(value, str) and value in (self.removed or ()) and value not in self.registry:
-            raise fault((self.removed or {})[value])
+            raise validation_error((self.removed or {})[value])
         if value is not None and value not in (*self.also, *self.registry):
             raise ValueError("not registered")
         return value
@@ -223,7 +223,7 @@ class OwnNumber(Protocol):
     """Protocol of a part's numerical parameter."""
 
     default: float
-    above: float | None
+    exclusive_minimum: float | None
     meaning: str
 
 
@@ -246,7 +246,7 @@ class KeysOfParts(Before):
         own |= {name: part.table for name, part in self.tables.items() if name not in table.model_fields}
         if not own:
             return value
-        wide = _widened(table, tuple(own.items()), self.optional)
+        wide = _extended_table(table, tuple(own.items()), self.optional)
         try:
             return wide.model_validate(dict(value))
         except ValidationError as error:
@@ -257,11 +257,16 @@ Own = tuple[tuple[str, OwnNumber | type[Table]], ...]
 
 
 @functools.cache
-def _widened(table: type[Table], own: Own, optional: bool) -> type[Table]:
+def _extended_table(table: type[Table], own: Own, optional: bool) -> type[Table]:
     """Create a table with further numbers and tables, cached so that such scenes compare equal."""
     kind = float | None if optional else float
     fields: dict[str, Any] = {
-        name: (kind, Field(default=None if optional else number.default, gt=number.above, description=number.meaning))
+        name: (
+            kind,
+            Field(
+                default=None if optional else number.default, gt=number.exclusive_minimum, description=number.meaning
+            ),
+        )
         for name, number in own
         if not isinstance(number, type)
     }
@@ -269,13 +274,13 @@ def _widened(table: type[Table], own: Own, optional: bool) -> type[Table]:
     return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
 
 
-def fault(rule: str, key: str = "", value: object = _MISSING) -> PydanticCustomError:
+def validation_error(rule: str, key: str = "", value: object = _MISSING) -> PydanticCustomError:
     """Return the error that a validator raises."""
     context = {"rule": rule, "key": key} | ({} if value is _MISSING else {"value": value})
     return PydanticCustomError("fault", "{rule}", context)
 
 
-def named(registry: Mapping[str, T], fits: Callable[[T], object]) -> str:
+def join_names(registry: Mapping[str, T], fits: Callable[[T], object]) -> str:
     """Return the names of the parts of a registry that fit, for an error message."""
     return ", ".join(repr(name) for name, part in registry.items() if fits(part))
 
@@ -317,13 +322,13 @@ def _describe(detail: ErrorDetails, table: type[Table]) -> str:
     if kind == "fault":
         key, rule = _joined(key, context["key"]), context["rule"]
         value = context.get("value", value)
-        return f"{key}: {rule}" if value is None else f"{key} = {shown(value)}: {rule}"
+        return f"{key}: {rule}" if value is None else f"{key} = {format_value(value)}: {rule}"
     if kind == "worded":
         return _joined(key, context["text"])
     if kind == "extra_forbidden":
-        return f"{key} = {shown(value)}: unknown key; {_suggestion(key, owner, table)}"
+        return f"{key} = {format_value(value)}: unknown key; {_suggestion(key, owner, table)}"
     rule = detail["msg"] if field is None else allowed(field)
-    return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {shown(value)}: {rule}"
+    return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {format_value(value)}: {rule}"
 
 
 def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, type[Table], FieldInfo | None]:
@@ -365,10 +370,10 @@ def _joined(key: str, rest: str) -> str:
 
 def quoted(key: str) -> str:
     """Return a key as TOML writes it: bare, or in quotes."""
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else shown(key)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else format_value(key)
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """Format a value as in a scene, on one line, truncated to `LONGEST_VALUE` characters."""
     try:
         text = _toml_text(value)
@@ -446,7 +451,7 @@ def _kind(field: FieldInfo) -> object:
 def allowed(field: FieldInfo) -> str:
     """Describe the values that a field allows, for errors and the reference of keys."""
     if listed := choices(field):
-        return f"must be {'one of ' if len(listed) > 1 else ''}" + ", ".join(map(shown, listed))
+        return f"must be {'one of ' if len(listed) > 1 else ''}" + ", ".join(map(format_value, listed))
     if isinstance(field.json_schema_extra, dict):
         return f"must be {field.json_schema_extra['allowed']}"
     if is_table(field.annotation) or get_origin(field.annotation) is dict:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from remodel_fenicsx.errors import UnreadableFile, printable
-from remodel_fenicsx.schema.tables import SceneError, listed, quoted, shown
+from remodel_fenicsx.schema.tables import SceneError, listed, quoted, format_value
 from remodel_fenicsx.schema.units import is_quantity
 from remodel_fenicsx.system.files import read_regular
 
@@ -79,11 +79,11 @@ def parse_override(text: str) -> tuple[str, object]:
     """Parse "KEY=VALUE"; VALUE is TOML, a bare word or a number with a unit."""
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals:
-        raise SceneError(f"--set {shown(text)}: must be KEY=VALUE, as in cells.seed=2")
+        raise SceneError(f"--set {format_value(text)}: must be KEY=VALUE, as in cells.seed=2")
     if len(key.split(".")) > MOST_PARTS:
-        raise SceneError(f"--set {shown(text)}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
+        raise SceneError(f"--set {format_value(text)}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
     if not all(key.split(".")):
-        raise SceneError(f"--set {shown(text)}: the key must be a dotted path, as in cells.seed=2")
+        raise SceneError(f"--set {format_value(text)}: the key must be a dotted path, as in cells.seed=2")
     try:
         parsed = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):
@@ -92,27 +92,29 @@ def parse_override(text: str) -> tuple[str, object]:
         return key, parsed["value"]
     if re.fullmatch(r"[\w.+/:-]+", value) or is_quantity(value):
         return key, value
-    raise SceneError(f"--set {key} = {shown(value)}: must be a TOML value or a bare word{_marks(value)}")
+    raise SceneError(f"--set {key} = {format_value(value)}: must be a TOML value or a bare word{_marks(value)}")
 
 
-def put(values: dict[str, object], key: str, value: object) -> None:
+def set_nested(values: dict[str, object], key: str, value: object) -> None:
     """Set a value at a dotted key and create the tables that contain it."""
     *parents, name = (part.strip() for part in key.split("."))
     for depth, parent in enumerate(parents):
         table = values.setdefault(parent, {})
         if not isinstance(table, dict):
             place = ".".join(parents[: depth + 1])
-            raise SceneError(f"{key} = {shown(value)}: {place} = {shown(table)} is a value, not a table")
+            raise SceneError(f"{key} = {format_value(value)}: {place} = {format_value(table)} is a value, not a table")
         values = table
     values[name] = value
 
 
-def merged(base: Mapping[str, object], over: Mapping[str, object]) -> dict[str, Any]:
+def merge_nested(base: Mapping[str, object], over: Mapping[str, object]) -> dict[str, Any]:
     """Merge nested dicts table by table; a list or value of `over` replaces that of `base`."""
     result = dict(base)
     for name, value in over.items():
         below = result.get(name)
-        result[name] = merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+        result[name] = (
+            merge_nested(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+        )
     return result
 
 
@@ -170,7 +172,7 @@ def read_columns(
     if unknown := [name for name, found in zip(names, head, strict=True) if not found]:
         if all(_number(name, ".") is not None for name in names):
             raise UnreadableFile("begins with a row of numbers; the first row must have the names of the columns")
-        raise UnreadableFile(f"unknown column {shown(unknown[0])}; allowed: {listed(allowed, unknown[0])}")
+        raise UnreadableFile(f"unknown column {format_value(unknown[0])}; allowed: {listed(allowed, unknown[0])}")
     if twice := [name for number, name in enumerate(head) if name in head[:number]]:
         raise UnreadableFile(f"duplicate column {twice[0]}")
     mark = "," if any("," in cell for row in rows for cell in row) else "."
@@ -181,7 +183,7 @@ def read_columns(
         for place, cell in enumerate(row):
             if (value := _number(cell, mark)) is None:
                 more = " (others have decimal commas)" if mark == "," and "." in cell else ""
-                raise UnreadableFile(f"row {number + 1}, {head[place]}: {shown(cell)} is not a number{more}")
+                raise UnreadableFile(f"row {number + 1}, {head[place]}: {format_value(cell)} is not a number{more}")
             values[number, place] = value
     used = {name: column for name, column in zip(head, values.T, strict=True) if name not in unused}
     words = [f"{written} between columns", *(["decimal commas"] if mark == "," else [])]

@@ -23,7 +23,7 @@ from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from remodel_fenicsx.schema.tables import OneOf, fault, shown
+from remodel_fenicsx.schema.tables import OneOf, validation_error, format_value
 
 if TYPE_CHECKING:  # importing pint takes half a second, and most scenes have no units
     from pydantic.json_schema import JsonSchemaValue
@@ -110,22 +110,22 @@ class Dimension:
         units = _UNITS.get()
         if not isinstance(value, str) or units is None:
             return value
-        rule, found = f"a unit of {self.name} as in {shown(self.example)}", _QUANTITY.fullmatch(value.strip())
+        rule, found = f"a unit of {self.name} as in {format_value(self.example)}", _QUANTITY.fullmatch(value.strip())
         if found is None:
-            raise fault(f"must be a number, or one with {rule}", key, value)
+            raise validation_error(f"must be a number, or one with {rule}", key, value)
         source = _unit(found[2])
         powers = {units.get(name, name): power for name, power in self.powers}
         # The metre replaces a unit of length that is not set, so that a wrong dimension is reported
         # first.
         target = _unit(" * ".join(f"{unit or 'm'}**{power}" for unit, power in powers.items()))
         if source is None or target is None or source.dimensionality != target.dimensionality:
-            raise fault(f"{shown(found[2])} is no unit of {self.name}; must be {rule}", key, value)
+            raise validation_error(f"{format_value(found[2])} is no unit of {self.name}; must be {rule}", key, value)
         if unset := [name for name, _ in self.powers if units.get(name, name) is None]:
             remedy = f"set {unset[0]} (m, cm, mm or um), or omit the unit"
-            raise fault(f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value)
+            raise validation_error(f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value)
         number = float(found[1])  # rejects exponents that would make a fraction of a billion digits
         if abs(number) > LARGEST_NUMBER:
-            raise fault(NUMBER_TOO_LARGE, key, value)
+            raise validation_error(NUMBER_TOO_LARGE, key, value)
         return float(_registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:

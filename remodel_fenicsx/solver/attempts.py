@@ -27,7 +27,7 @@ FROM_EXPECTED = Attempt(
 FROM_LAST = Attempt("from the last displacement", "Staggered", "solving in substeps")
 MADE_ANEW = Attempt(
     "in each solve: again, with a new factorisation or new multigrid levels in every iteration",
-    "EveryTangent.second_try",
+    "FullNewton.fallback",
     "Newton failed; retrying",
 )
 IN_PARTS = Attempt("in substeps: first the remodeled cells, then the loads; a failed substep is halved", "Change")

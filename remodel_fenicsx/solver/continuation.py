@@ -15,21 +15,21 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import allreduce
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import attempted
-from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension
-from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, Counted, GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, Refusal, diagnosed
-from remodel_fenicsx.state import Numbers, State
+from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits
+from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, SolverCounts, GuardedNewton, Solution, SolveFailure
+from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, FailureCause, diagnose_failure
+from remodel_fenicsx.state import StateNumbers, State
 
 log = logging.getLogger(__name__)
 
-FAR = 2.0
-"""`Solution.reach` above which a step is repeated in substeps. The paper's bodies have at most
+MAX_DISPLACEMENT_RATIO = 2.0
+"""`Solution.displacement_ratio` above which a step is repeated in substeps. The paper's bodies have at most
 1.25. A tube without chains that approaches its largest pressure in one step has 2.9, a jump over a
 limit point 3.9 and more."""
 # A reach below CLOSE after more than MANY iterations (or tangents of a whole step) may be a jump.
@@ -41,8 +41,8 @@ SAME_SOLUTION = 1e-4
 # Ratio of the displacement to that of the substep before that may be a jump. Towards a limit point
 # the last of equal substeps moves up to 3 times as far.
 FASTER = 4.0
-WAYS_END = (LIMIT_POINT.kind, BIFURCATION.kind)  # causes of failure for which no smaller step helps
-PROOF = 8  # number of halvings needed to distinguish a jump from a step that is too large
+END_OF_PATH = (LIMIT_POINT.kind, BIFURCATION.kind)  # causes of failure for which no smaller step helps
+MIN_HALVINGS_FOR_JUMP = 8  # number of halvings needed to distinguish a jump from a step that is too large
 # Number of jumps in a run that are checked, each by about 25 solves. A body that collapses jumps in
 # every step.
 MOST_JUMPS = 3
@@ -50,13 +50,13 @@ KEPT_RESERVE = 0.2  # fraction of 1 - r/L that a remodeling substep leaves at ev
 
 
 @dataclass
-class Work(Counted):
+class Work(SolverCounts):
     """Solver work of one step, including failed attempts."""
 
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
     # Of the last solution, if evaluated with the cells of the row.
-    extension: Extension | None = None
+    extension: StateLimits | None = None
     last: Solution | None = None
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
@@ -108,7 +108,7 @@ class StepFailure(RemodelError, RuntimeError):
 
     exit_code = SOLVE_FAILED
 
-    def __init__(self, time: float, text: str, refusal: Refusal):
+    def __init__(self, time: float, text: str, refusal: FailureCause):
         super().__init__(text)
         self.time, self.refusal, self.kept = time, refusal, "every finished step is kept"
 
@@ -134,7 +134,7 @@ def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) 
 
 
 @dataclass
-class Change:
+class Continuation:
     """Change of cells or loads that can be applied in substeps."""
 
     time: float
@@ -144,8 +144,8 @@ class Change:
     solves: Callable[[], GuardedNewton]  # called for substeps only, which few steps need
     maximum_halvings: int
     largest_part: Callable[[float], float] = lambda done: 1.0
-    roughly: bool = False
-    refusal: Refusal | None = field(default=None, init=False)  # cause of a jump in the change
+    loose_tolerance: bool = False
+    refusal: FailureCause | None = field(default=None, init=False)  # cause of a jump in the change
     # Rate of the unknowns in the last substep.
     _direction: NDArray[np.float64] | None = field(default=None, init=False)
 
@@ -161,7 +161,7 @@ class Change:
         # continues beyond the jump.
         done, attempts = 0.0, 0
         if failure is not None:
-            part = self._halved(part, done, failure, work)
+            part = self._bisect(part, done, failure, work)
         while done < 1.0:
             attempts += 1
             self.state.tell(
@@ -171,25 +171,27 @@ class Change:
             part = min(part, 1.0 - done, self.largest_part(done))
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
-            solution = attempted(partial(self.newton.solve, before, self.roughly and not is_last), SolveFailure)
+            solution = attempted(partial(self.newton.solve, before, self.loose_tolerance and not is_last), SolveFailure)
             work.add(solution)
             if isinstance(solution, SolveFailure):
                 self.state.unknown.x.array[:] = before
-                part = self._halved(part, done, solution, work)
+                part = self._bisect(part, done, solution, work)
             else:
                 expected = 0.0 if self._direction is None else part * self._size(self._direction)
                 moved = self._size(self.state.unknown.x.array - before)
-                if self.is_another_branch(solution, moved, expected) and self._looks():
+                if self.is_another_branch(solution, moved, expected) and self._may_check_jumps():
                     solved, self.state.unknown.x.array[:] = self.state.unknown.x.array.copy(), before
                     if part / 2 >= self._smallest:
                         log.debug(
-                            "%s: far from the last substep, %.3g of the first Newton step", self.stage, solution.reach
+                            "%s: far from the last substep, %.3g of the first Newton step",
+                            self.stage,
+                            solution.displacement_ratio,
                         )
                         part /= 2
                         continue
                     self.set_fraction(done)
-                    refusal = diagnosed(self.newton, None, self._direction)
-                    self._jumped(solved, refusal if refusal.kind else SEVERAL_SOLUTIONS)
+                    refusal = diagnose_failure(self.newton, None, self._direction)
+                    self._warn_of_jump(solved, refusal if refusal.kind else SEVERAL_SOLUTIONS)
                     self.set_fraction(1.0 if is_last else done + part)
                     self.state.unknown.x.array[:] = solved
                 done = 1.0 if is_last else done + part
@@ -197,20 +199,20 @@ class Change:
                 part *= 2
                 work.substeps += 1
 
-    def look_back(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
+    def check_for_jump(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
         """Repeat a step in substeps if it may have jumped. Return whether it was. Collective."""
         # `again`: the same step was solved before, with other cells.
         unknown, jumps = self.state.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
-        looked = self.is_another_branch(work.last, moved, expected, tangents) and self._looks()
+        looked = self.is_another_branch(work.last, moved, expected, tangents) and self._may_check_jumps()
         if looked:
-            self.confirm(before, work)
+            self.repeat_in_substeps(before, work)
             moved = self._size(unknown - before)
         jumps["moved"] = max(moved, last) if again else moved
         return looked
 
-    def confirm(self, before: NDArray[np.float64], work: Work) -> None:
+    def repeat_in_substeps(self, before: NDArray[np.float64], work: Work) -> None:
         """Repeat a step in substeps from the unknowns before it. Collective."""
         # The solution stays if the substeps fail, with a warning if the branch ends there. If they
         # lead to another solution, that one is used, because the body reaches it.
@@ -220,8 +222,8 @@ class Change:
         failure = attempted(lambda: self.advance(parts, part=0.5), StepFailure)
         leads_on = failure is None and self.refusal is None
         if failure is not None:
-            if self.refusal is None and failure.refusal.kind in WAYS_END:
-                self._jumped(found, failure.refusal)
+            if self.refusal is None and failure.refusal.kind in END_OF_PATH:
+                self._warn_of_jump(found, failure.refusal)
             log.info(
                 "time %g: solution far from the tangent's prediction, and its substeps failed: %s",
                 self.time,
@@ -248,22 +250,24 @@ class Change:
             return True
         if solution is None:
             return False
-        return solution.reach > FAR or (0.0 < solution.reach < CLOSE and solution.newton_iterations > MANY)
+        return solution.displacement_ratio > MAX_DISPLACEMENT_RATIO or (
+            0.0 < solution.displacement_ratio < CLOSE and solution.newton_iterations > MANY
+        )
 
     def _size(self, change: NDArray[np.float64]) -> float:
         """Return the largest change of an unknown over all ranks. Collective."""
-        return float(over_ranks(self.state.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
+        return float(allreduce(self.state.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
 
-    def _looks(self) -> bool:
+    def _may_check_jumps(self) -> bool:
         """Return whether a possible jump is checked."""
-        enough = self.maximum_halvings >= PROOF
+        enough = self.maximum_halvings >= MIN_HALVINGS_FOR_JUMP
         return enough and self.refusal is None and self._jumps["found"] < MOST_JUMPS
 
     @property
-    def _jumps(self) -> Numbers:
-        return Numbers(self.state, "jumps", {"found": 0, "moved": 0})
+    def _jumps(self) -> StateNumbers:
+        return StateNumbers(self.state, "jumps", {"found": 0, "moved": 0})
 
-    def _jumped(self, solved: NDArray[np.float64], refusal: Refusal) -> None:
+    def _warn_of_jump(self, solved: NDArray[np.float64], refusal: FailureCause) -> None:
         """Warn of a jump from the end of a branch, the present state, to `solved`. Collective."""
         self.refusal = refusal
         self._jumps["found"] += 1
@@ -276,18 +280,18 @@ class Change:
                 self.time, far, loads or "the start", refusal,
             )  # fmt: skip
 
-    def _halved(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
+    def _bisect(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
         if part / 2 < self._smallest:
             text = self.state.label + failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last solved state
-            found = diagnosed(self.newton, failure, self._direction)
+            found = diagnose_failure(self.newton, failure, self._direction)
             refusal = found if found.kind or self.refusal is None else self.refusal
             raise StepFailure(self.time, text, refusal) from failure
         log.debug("%s: %s; next substep %g", self.stage, failure.reason, part / 2)
         return part / 2
 
 
-class Blend:
+class CellHomotopy:
     """Equilibrium with (1 - theta) old + theta new cells in r^2 and in W_rep."""
 
     # At theta = 0 and 1 it is the model with the old and with the new cells. Few runs need it, and
@@ -306,7 +310,7 @@ class Blend:
         def at_points() -> list[UnitCell]:
             return shares(old.point_cells, new.point_cells, float(np.real(self.theta.value)))
 
-        return Equilibrium(self.state, self.tissue, shares(old.ufl_cell, new.ufl_cell, self.theta), at_points)
+        return Equilibrium(self.state, self.tissue, shares(old.symbolic_cell, new.symbolic_cell, self.theta), at_points)
 
     @functools.cached_property
     def newton(self) -> GuardedNewton:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.linear import KeptFactor, uneven
+from remodel_fenicsx.solver.linear import LaggedFactorisation, fill_asymmetric
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class Inertia:
         self._factorised: PETSc.Mat | None = None
         self._factorisation: PETSc.PC | None = None
         self._is_unsymmetric = False
-        self._definite = KeptFactor()
+        self._definite = LaggedFactorisation()
 
     def close(self) -> None:
         """Free PETSc's objects; the next call makes new ones."""
@@ -76,7 +76,7 @@ class Inertia:
         # CHOLMOD takes half of MUMPS's time.
         if self.equilibrium.comm.size == 1 and self._definite.is_definite(self._symmetric):
             return 0
-        number = self._negative_of(self._symmetric)
+        number = self._count_eigenvalues_below(self._symmetric)
         if number == 0 or not self._is_unsymmetric:
             return number
         wanted = 1
@@ -117,7 +117,7 @@ class Inertia:
         linear.getPC().setType("lu" if unsymmetric else "cholesky")
         linear.getPC().setFactorSolverType("mumps")
         # The same start on any number of ranks.
-        solver.setInitialSpace(uneven(matrix.createVecRight()))
+        solver.setInitialSpace(fill_asymmetric(matrix.createVecRight()))
         solver.solve()
         if solver.getConverged() < number:
             raise FactorisationFailed("the lowest eigenvalues of the tangent did not converge")
@@ -151,7 +151,7 @@ class Inertia:
         self._symmetric.axpy(2.0, self._tangent, same)
         self._symmetric.scale(0.5)
 
-    def _negative_of(self, matrix: PETSc.Mat, shift: float = 0.0) -> int:
+    def _count_eigenvalues_below(self, matrix: PETSc.Mat, shift: float = 0.0) -> int:
         """Count the eigenvalues below `shift` of a matrix with the pattern of the tangent."""
         if self._factorised is None:
             self._factorised = matrix.copy()
@@ -190,13 +190,13 @@ class Inertia:
 
     def _lower_bound(self, matrix: PETSc.Mat) -> float:
         """Return a close lower bound of all eigenvalues, or zero if none is negative."""
-        if self._negative_of(matrix) == 0:
+        if self._count_eigenvalues_below(matrix) == 0:
             return 0.0
         diagonal = matrix.getDiagonal()
         shift = -FIRST_SHIFT * float(np.abs(diagonal.min()[1]))
         diagonal.destroy()
         for _ in range(MOST_SHIFTS):
-            if self._negative_of(matrix, shift) == 0:
+            if self._count_eigenvalues_below(matrix, shift) == 0:
                 return shift
             shift *= SHIFT_FACTOR
         raise FactorisationFailed("no lower bound of the eigenvalues")
@@ -216,7 +216,7 @@ class Inertia:
         return Mode(eigenvalue, place, function.x.array.copy())
 
 
-def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
+def inertia_without_loads(inertia: Inertia) -> tuple[int, float]:
     """Return negative eigenvalues (number, lowest) of the unloaded body with initial cells."""
     state = inertia.equilibrium.state
     cells = state.cells
@@ -224,7 +224,7 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
         state.unknown.x.array[:] = 0.0
         state.loading.set(dict.fromkeys(state.loading.values, 0.0))
         cells.set(cells.initial_dimensions, cells.initial_axes())
-        state.settle_cells()
+        state.mark_cells_in_equilibrium()
         return inertia.negative_eigenvalues(), inertia.lowest().eigenvalue
 
 
@@ -233,15 +233,15 @@ def of_the_unloaded_body(inertia: Inertia) -> tuple[int, float]:
 
 NEARLY_LOCKED = 0.98  # r/L of locking chains under a prescribed motion
 LOCKED = 0.999  # r/L of locking chains under any load
-CRUSHED = 0.02  # J of collapsed elements
+COLLAPSED_JACOBIAN = 0.02  # J of collapsed elements
 NEARLY_CRITICAL = 0.1  # lowest eigenvalue over its unloaded value
 ALONG_THE_MODE = 0.5  # cosine between the last change of the displacement and the mode
 NEARLY_SOLVED = 1e3  # largest residual over tolerance that is attributed to the tolerance
-LOOSEST = 1e-4  # largest relative_tolerance that a message recommends
+MAX_ADVISED_TOLERANCE = 1e-4  # largest relative_tolerance that a message recommends
 
 
 @dataclass(frozen=True)
-class Refusal:
+class FailureCause:
     """Cause of a failed step, with advice and evidence."""
 
     kind: str
@@ -254,38 +254,38 @@ class Refusal:
         return f"{self.kind} ({self.finding}): {self.advice}" if self.finding else f"{self.kind}: {self.advice}"
 
 
-TOO_LARGE = Refusal("", "try a smaller time.step, a slower ramp or lower loads")
-LIMIT_POINT = Refusal(
+TOO_LARGE = FailureCause("", "try a smaller time.step, a slower ramp or lower loads")
+LIMIT_POINT = FailureCause(
     "limit point",
     "the load approaches the largest that the body can carry; " "lower it, or prescribe a displacement instead",
 )
-BIFURCATION = Refusal(
+BIFURCATION = FailureCause(
     "bifurcation",
     "the body buckles or loses its symmetry; lower the load, add supports, "
     'or stop before it with solver.unstable = "stop"',
 )
-CHAIN_LOCKING = Refusal(
+CHAIN_LOCKING = FailureCause(
     "chain locking",
     "chains cannot exceed material.contour_length; prescribe less elongation, or load more slowly",
 )
-KINEMATIC_LOCKING = Refusal(
+KINEMATIC_LOCKING = FailureCause(
     "kinematic locking",
     "supports and loads reduce the volume of elements to almost zero; "
     "prescribe a smaller motion, or refine the mesh",
 )
-SOLVER_TOLERANCE = Refusal(
+SOLVER_TOLERANCE = FailureCause(
     "solver tolerance",
     "the residual does not fall below the tolerance; " "try a larger solver.maximum_iterations, or a smaller time.step",
 )
-SEVERAL_SOLUTIONS = Refusal(
+SEVERAL_SOLUTIONS = FailureCause(
     "several solutions", "this solution does not continue the previous branch; try a slower ramp, or lower loads"
 )
-UNSTABLE = Refusal("lost stability", 'lower the load, or continue beyond it with solver.unstable = "warn"')
+UNSTABLE = FailureCause("lost stability", 'lower the load, or continue beyond it with solver.unstable = "warn"')
 
 
-def diagnosed(
+def diagnose_failure(
     newton: GuardedNewton, failure: SolveFailure | None, direction: NDArray[np.float64] | None = None
-) -> Refusal:
+) -> FailureCause:
     """Return the cause of a failure, from the last solved state. Collective."""
     extension = newton.equilibrium.extension()
     if not extension.admissible:
@@ -295,7 +295,7 @@ def diagnosed(
     if longest > (NEARLY_LOCKED if moved else LOCKED):
         place = ", ".join(f"{c:.4g}" for c in extension.worst_point)
         return replace(CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last solved state")
-    if extension.min_jacobian < CRUSHED:
+    if extension.min_jacobian < COLLAPSED_JACOBIAN:
         return replace(KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last solved state")
     inertia = Inertia(newton.equilibrium)
     try:
@@ -311,14 +311,14 @@ def diagnosed(
         inertia.close()
 
 
-def _of_the_tolerance(failure: SolveFailure) -> Refusal | None:
+def _of_the_tolerance(failure: SolveFailure) -> FailureCause | None:
     """Return advice on the tolerance if the residual is close to it, otherwise None."""
     if not 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
         return None
     found = replace(
         SOLVER_TOLERANCE, finding=f"the residual is {failure.residual_over_tolerance:.3g} times the tolerance"
     )
-    if failure.relative_residual > LOOSEST:
+    if failure.relative_residual > MAX_ADVISED_TOLERANCE:
         return found
     # Twice, because it varies between iterations.
     enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))
@@ -328,9 +328,9 @@ def _of_the_tolerance(failure: SolveFailure) -> Refusal | None:
     return replace(found, advice=f"{found.advice}; {key} would accept this state")
 
 
-def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> Refusal:
+def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> FailureCause:
     negative, mode = inertia.negative_eigenvalues(), inertia.lowest()
-    at_start, unloaded = of_the_unloaded_body(inertia)
+    at_start, unloaded = inertia_without_loads(inertia)
     place = ", ".join(f"{c:.4g}" for c in mode.place)
     finding = f"the lowest eigenvalue of the tangent is {mode.eigenvalue:.3g} "
     finding += f"(unloaded body: {unloaded:.3g}); its mode is largest at ({place})"

@@ -16,17 +16,17 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import (
-    Remembered,
+    CachedValue,
     assemble_matrix,
     create_matrix,
-    of_all_ranks,
-    over_ranks,
+    allgather,
+    allreduce,
     second_derivative,
 )
 from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, whole_structure_tensor
-from remodel_fenicsx.model.tensors import MANDEL, det, passes_through_zero
+from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, total_structure_tensor
+from remodel_fenicsx.model.tensors import MANDEL, det, determinant_changes_sign
 from remodel_fenicsx.state import State
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ class PointwiseRepulsion:
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         of_cells = [ufl.as_ufl(part) for cell in cells for part in cell]
         of_stress = [state.kinematics.elastic_gradient(state.unknown), *of_cells, *self.tissue.parameters.values()]
-        self._structure: Remembered[Array] = Remembered(None, *of_cells)
-        self._stresses, self._stiffnesses = (Remembered[None](None, *of_stress) for _ in range(2))
+        self._structure: CachedValue[Array] = CachedValue(None, *of_cells)
+        self._stresses, self._stiffnesses = (CachedValue[None](None, *of_stress) for _ in range(2))
 
     def update(self, stiffness: bool = False) -> None:
         """Update the stress, and the stiffness on request, if unknowns or cells have changed."""
@@ -65,7 +65,7 @@ class PointwiseRepulsion:
         derivatives = self.tissue.repulsion.derivatives
         assert derivatives is not None
         F, modulus = self.state.elastic_gradient(), self._modulus()
-        A = self._structure(lambda: whole_structure_tensor(self.shares()))
+        A = self._structure(lambda: total_structure_tensor(self.shares()))
         first, second = derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
         shape = self.quadrature.shape
         # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
@@ -102,9 +102,11 @@ class PointStresses:
     """UFL stresses of the residual at the quadrature points, with formulation and repulsion."""
 
     def __init__(self, state: State, tissue: Tissue):
-        self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(state, tissue, [state.cells.ufl_cell])
+        self._dilatation, self._repulsion = state.dilatation, pointwise_repulsion(
+            state, tissue, [state.cells.symbolic_cell]
+        )
         F = state.kinematics.elastic_gradient(state.unknown)
-        self.ufl: Stresses = state.dilatation.stresses(tissue, F, [state.cells.ufl_cell])
+        self.ufl: Stresses = state.dilatation.stresses(tissue, F, [state.cells.symbolic_cell])
         if self._repulsion is not None:
             self.ufl = self.ufl.plus(F, self._repulsion.stress)
         kinematics = state.kinematics
@@ -134,7 +136,7 @@ def pointwise_repulsion(
 
 
 @dataclass(frozen=True)
-class Extension:
+class StateLimits:
     """Limits of a state: largest r/L with its reference position, and smallest J."""
 
     max_chain_extension: float
@@ -148,10 +150,10 @@ class Extension:
         return self.max_chain_extension < 1.0 and self.min_jacobian > 0.0
 
 
-class Look(NamedTuple):
+class PointState(NamedTuple):
     """State at this rank's own points: limits; r/L and J, (elements, points); F, (n, 3, 3)."""
 
-    extension: Extension
+    extension: StateLimits
     stretches: Array
     jacobians: Array
     gradients: Array
@@ -172,7 +174,7 @@ class Equilibrium:
         self.comm = mesh.comm
         self.parameters = state.parameters(tissue)
         self.tissue, self._point_shares = self.parameters.tissue, point_shares
-        u, shares, loading = state.unknown, shares or [state.cells.ufl_cell], state.loading
+        u, shares, loading = state.unknown, shares or [state.cells.symbolic_cell], state.loading
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.elastic_gradient(u)
         self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.stress_free_weight(mesh))
@@ -192,22 +194,22 @@ class Equilibrium:
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         chains = [] if self.tissue.chain is None else [part for cell in shares for part in cell]
         length = 0.0 if self.tissue.locking_length is None else self.tissue.locking_length
-        self._known: Remembered[Look] = Remembered(self.comm, F, *map(ufl.as_ufl, [*chains, length]))
+        self._known: CachedValue[PointState] = CachedValue(self.comm, F, *map(ufl.as_ufl, [*chains, length]))
         self._energy_forms: list[dolfinx.fem.Form] = []
 
     # ------------------------------------------------------------ state and limits
-    def extension(self) -> Extension:
+    def extension(self) -> StateLimits:
         """Return largest r/L and smallest J of the present unknowns over all ranks. Collective."""
-        return self.look().extension
+        return self.evaluate().extension
 
-    def look(self) -> Look:
+    def evaluate(self) -> PointState:
         """Return limits, r/L, J and F of the present unknowns, cached for a state. Collective."""
         look = self._known(self._look)
         if look.extension.stop_signal:
             self._known.forget()  # the stop request may be withdrawn
         return look
 
-    def _look(self) -> Look:
+    def _look(self) -> PointState:
         quadrature = self.quadrature
         squares, lengths = quadrature.owned(self.squared_lengths()), quadrature.owned(self.locking_length())
         gradients = self.state.elastic_gradient()[: squares.size]
@@ -220,12 +222,12 @@ class Equilibrium:
         if stretches.size:
             worst = int(np.argmax(stretches))
             local = stretches.item(worst), tuple(quadrature.coordinates.reshape(-1, 3)[worst].tolist())
-        ranks = of_all_ranks(self.comm, (*local, smallest, self.state.stop_signal()))
+        ranks = allgather(self.comm, (*local, smallest, self.state.stop_signal()))
         largest, worst_point, _, _ = max(ranks, key=lambda rank: rank[0])
-        extension = Extension(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
-        return Look(extension, stretches, jacobians, gradients)
+        extension = StateLimits(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
+        return PointState(extension, stretches, jacobians, gradients)
 
-    def keeps_reserve(
+    def keeps_margin(
         self,
         before: Array,
         after: Array,
@@ -234,25 +236,25 @@ class Equilibrium:
     ) -> bool:
         """Return whether every point keeps a fraction of its 1 - r/L. Collective."""
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
-        return not over_ranks(self.comm, lost, MPI.LOR)
+        return not allreduce(self.comm, lost, MPI.LOR)
 
-    def turns_inside_out(self, before: Look, after: Look) -> bool:
+    def inverts_between(self, before: PointState, after: PointState) -> bool:
         """Return whether J vanishes on the straight path between two states. Collective."""
         # |F^-1| <= F:F / (2 det F), and no matrix within 1 / |F^-1| of F is singular. So few points
         # need the exact check.
         F, G, J = before.gradients, after.gradients, before.jacobians.ravel()
         change, own = (np.einsum("nij,nij->n", each, each) for each in (G - F, F))
         at = np.flatnonzero((J <= 0.0) | (np.sqrt(change) * own >= 2.0 * J))
-        turns = at.size > 0 and bool(passes_through_zero(F[at], G[at]).any())
-        return bool(over_ranks(self.comm, turns, MPI.LOR))
+        turns = at.size > 0 and bool(determinant_changes_sign(F[at], G[at]).any())
+        return bool(allreduce(self.comm, turns, MPI.LOR))
 
     def room(self, far: float) -> float:
         """Return the largest |dF| with J > 0 and r/L < `far` at all points. Collective."""
-        look, lengths = self.look(), self.state.cells.dimension_values
+        look, lengths = self.evaluate(), self.state.cells.dimension_values
         chains = np.sqrt((lengths**2).sum(axis=-1)) / self.locking_length()
         volume = 2.0 * look.jacobians.ravel() / np.einsum("nij,nij->n", look.gradients, look.gradients)
         length = (far - look.stretches) / np.maximum(self.quadrature.owned(chains), 1e-300)
-        return float(over_ranks(self.comm, np.minimum(volume, length.ravel()).min(initial=np.inf), MPI.MIN))
+        return float(allreduce(self.comm, np.minimum(volume, length.ravel()).min(initial=np.inf), MPI.MIN))
 
     def squared_lengths(self) -> Array:
         """Return r^2 in squared link lengths, (elements, points); 0 without chains."""
@@ -274,10 +276,10 @@ class Equilibrium:
             self.compile_energy()
         local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
         pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
-        return float(over_ranks(self.comm, local, MPI.SUM)) + pointwise
+        return float(allreduce(self.comm, local, MPI.SUM)) + pointwise
 
     def compile_energy(self) -> None:
-        """Compile `stored_energy`, which `continuation.Blend` does not need. Collective."""
+        """Compile `stored_energy`, which `continuation.CellHomotopy` does not need. Collective."""
         self._energy_forms = [jit.form(energy) for energy in self.energies]
 
     # ------------------------------------------------------------ vectors and matrices
@@ -332,7 +334,7 @@ class Equilibrium:
     def prescribed_gap(self) -> float:
         """Return the largest difference of an unknown from its prescribed value. Collective."""
         gap = np.abs(self.prescribed_values() - self.state.unknown.x.array)
-        return float(over_ranks(self.comm, float(np.nanmax(gap, initial=0.0)), MPI.MAX))
+        return float(allreduce(self.comm, float(np.nanmax(gap, initial=0.0)), MPI.MAX))
 
 
 def _smallest(values: Array) -> float:

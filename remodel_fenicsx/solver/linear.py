@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx import kernels
-from remodel_fenicsx.fem.assembly import DegreeOne, degree_one, over_ranks, rigid_motions
+from remodel_fenicsx._renamed import with_old_names
+from remodel_fenicsx.fem.assembly import PMultigrid, degree_one, allreduce, rigid_body_modes
 from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
@@ -32,7 +33,7 @@ REMEMBERED_PAIRS = 20  # number of stored pairs
 CURVED = 1e-8  # smallest cosine between a step and the change of the residual for a pair
 
 
-class Secants:
+class LimitedMemoryUpdate:
     """L-BFGS update of a lagged factorisation, from the residuals of earlier steps."""
 
     def __init__(self, comm: MPI.Intracomm) -> None:
@@ -56,7 +57,7 @@ class Secants:
         now = np.array([x.array_r, residual.array_r, step.array_r])
         if self._last is not None:
             pair = now - self._last
-            products = over_ranks(self._comm, pair[:2] @ pair[:2].T, MPI.SUM)
+            products = allreduce(self._comm, pair[:2] @ pair[:2].T, MPI.SUM)
             if products[0, 1] > CURVED * np.sqrt(products[0, 0] * products[1, 1]):
                 self._pairs.append((pair, products[0, 1]))
         self._last = now.copy()
@@ -73,13 +74,13 @@ class Secants:
         return bool(weights)
 
     def _product(self, one: Array, other: Array) -> float:
-        return float(over_ranks(self._comm, one @ other, MPI.SUM))
+        return float(allreduce(self._comm, one @ other, MPI.SUM))
 
 
 log = logging.getLogger(__name__)
 
 UNSYMMETRIC = 1e-10  # largest unsymmetric part of a symmetric tangent, relative to the largest row
-OVER = 3  # number of iterations for the rate of convergence, except for the first iteration
+RATE_WINDOW = 3  # number of iterations for the rate of convergence, except for the first iteration
 # Iterations of a step, relative to `worth`, after which the next step factorises first.
 SLOW_STEP = 2 / 3
 # Relative error for the softest mode that is accepted in single precision. An error of 0.36
@@ -95,14 +96,14 @@ MOST_RENEWALS = 6
 LAST, SURELY = 1e-5, 0.3
 
 
-def worth(unknowns: int) -> float:
+def refactorisation_cost(unknowns: int) -> float:
     """Return the number of iterations that cost about as much as a factorisation."""
     # Smaller bodies gain nothing from a lower number: 150 steps of 1,881 unknowns take the same
     # time from 9 to 16.
     return 12.0 * max(1.0, unknowns / 5616) ** 0.4
 
 
-class KeptFactor:
+class LaggedFactorisation:
     """Lagged factorisation of an earlier tangent, a Python preconditioner of PETSc."""
 
     comm: Comm = PETSc.COMM_SELF
@@ -111,9 +112,9 @@ class KeptFactor:
         self.preconditioner: PETSc.PC = None
         self._options: ProblemOptions | None = None
         self._kind = ""
-        self._takes_single = kernels.is_available()
-        self._single: kernels.SingleFactor | None = None
-        self._soft: PETSc.Vec = None  # the softest known mode, of norm one
+        self._takes_single = kernels.has_single_precision()
+        self._single: kernels.SinglePrecisionFactor | None = None
+        self._softest_mode: PETSc.Vec = None  # the softest known mode, of norm one
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """Apply the lagged factorisation: y = K^-1 x; NaN without one, and the solve fails."""
@@ -132,7 +133,7 @@ class KeptFactor:
         if symmetric and self._was_indefinite():
             kinds.remove(DEFINITE)  # most likely fails again
         elif symmetric and self._takes_single:
-            answers = self._answers_in_single(matrix)
+            answers = self._is_accurate_in_single(matrix)
             if answers:
                 return
             if refused := answers is None:
@@ -151,13 +152,13 @@ class KeptFactor:
 
     def close(self) -> None:
         """Free the objects of PETSc and CHOLMOD."""
-        self._let_go()
+        self._free_factor()
         if self._single is not None:
             self._single.close()
-            self._soft.destroy()
-        self._single = self._soft = None
+            self._softest_mode.destroy()
+        self._single = self._softest_mode = None
 
-    def _let_go(self) -> None:
+    def _free_factor(self) -> None:
         """Free PETSc's factorisation."""
         if self.preconditioner is not None:
             self.preconditioner.destroy()
@@ -165,27 +166,29 @@ class KeptFactor:
             self._options.close()
         self.preconditioner, self._options, self._kind = None, None, ""
 
-    def _answers_in_single(self, matrix: Mat) -> bool | None:
+    def _is_accurate_in_single(self, matrix: Mat) -> bool | None:
         """Factorise in single precision. Return whether it is accurate, or None on failure."""
         starts, columns, values = matrix.getValuesCSR()
         looks = 1
         if self._single is None:
-            self._single, self._soft = kernels.SingleFactor(starts, columns), uneven(matrix.createVecRight())
+            self._single, self._softest_mode = kernels.SinglePrecisionFactor(starts, columns), fill_asymmetric(
+                matrix.createVecRight()
+            )
             looks = 2
         if not self._single.renew(values):
             log.info("%s failed, the tangent is probably indefinite; " "using LDL^T in double precision", SINGLE)
             return None
-        self._let_go()
+        self._free_factor()
         self._kind = SINGLE
-        answer, back = self._soft.duplicate(), self._soft.duplicate()
+        answer, back = self._softest_mode.duplicate(), self._softest_mode.duplicate()
         # Inverse iterations lead to softer modes, for which rounding errors are largest.
         for _ in range(looks):
-            self.apply(None, self._soft, answer)
+            self.apply(None, self._softest_mode, answer)
             matrix.mult(answer, back)
-            back.axpy(-1.0, self._soft)
-            error = back.norm() / self._soft.norm()
-            answer.copy(self._soft)
-            self._soft.normalize()
+            back.axpy(-1.0, self._softest_mode)
+            error = back.norm() / self._softest_mode.norm()
+            answer.copy(self._softest_mode)
+            self._softest_mode.normalize()
         answer.destroy()
         back.destroy()
         if error < SINGLE_ERROR:
@@ -195,7 +198,7 @@ class KeptFactor:
             "(limit %g); using double precision", error, SINGLE_ERROR,
         )  # fmt: skip
         self._kind = ""
-        uneven(self._soft)
+        fill_asymmetric(self._softest_mode)
         return False
 
     def _was_indefinite(self) -> bool:
@@ -204,7 +207,7 @@ class KeptFactor:
 
     def _factorised(self, kind: str, matrix: Mat) -> bool:
         if self._kind != kind:
-            self._let_go()
+            self._free_factor()
             self._options = ProblemOptions(factor_options(kind), {})
             self.preconditioner, self._kind = PETSc.PC().create(self.comm), kind
             self._options.apply(self.preconditioner)
@@ -219,7 +222,7 @@ class KeptFactor:
             failed = True
         if failed:
             log.info("%s of the tangent failed", kind)
-            self._let_go()
+            self._free_factor()
         return not failed
 
 
@@ -227,7 +230,7 @@ class GatheredFactor:
     """Lagged factorisation on several ranks: the first one has the whole tangent. Collective."""
 
     def __init__(self, comm: Comm):
-        self.comm, self.first = comm, KeptFactor()
+        self.comm, self.first = comm, LaggedFactorisation()
         # A matrix of all ranks; the first rank owns all rows and columns.
         self._whole: PETSc.Mat = None
         self._scatter: PETSc.Scatter = None
@@ -235,14 +238,14 @@ class GatheredFactor:
         self._answer: PETSc.Vec = None
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
-        """Apply the factorisation, see `KeptFactor.apply`. Collective."""
+        """Apply the factorisation, see `LaggedFactorisation.apply`. Collective."""
         self._scatter.scatter(x, self._right, mode=PETSc.ScatterMode.FORWARD)
         if self.comm.rank == 0:
             self.first.apply(_, self._right, self._answer)
         self._scatter.scatter(self._answer, y, mode=PETSc.ScatterMode.REVERSE)
 
     def renew(self, matrix: Mat) -> None:
-        """Factorise a tangent, see `KeptFactor.renew`. Collective."""
+        """Factorise a tangent, see `LaggedFactorisation.renew`. Collective."""
         if self._scatter is None:
             template = matrix.createVecRight()
             self._scatter, self._right = PETSc.Scatter.toZero(template)
@@ -263,12 +266,13 @@ class GatheredFactor:
         self._whole = self._scatter = self._right = self._answer = None
 
 
-def kept_factor(comm: Comm) -> KeptFactor | GatheredFactor:
+def kept_factor(comm: Comm) -> LaggedFactorisation | GatheredFactor:
     """Return a lagged factorisation for matrices of these ranks."""
-    return KeptFactor() if comm.size == 1 else GatheredFactor(comm)
+    return LaggedFactorisation() if comm.size == 1 else GatheredFactor(comm)
 
 
-class EveryTangent:
+@with_old_names
+class FullNewton:
     """Full Newton: linear solves with the tangent of every iteration, by PETSc's options.
 
     Parameters
@@ -285,19 +289,19 @@ class EveryTangent:
     A solver that counts its tangents (see `SolverMethod`):
 
     >>> from remodel_fenicsx import Simulation, preset_scene
-    >>> from remodel_fenicsx.extend import SOLVER_METHODS, EveryTangent, SolverMethod
-    >>> class Counted(EveryTangent):
+    >>> from remodel_fenicsx.extend import SOLVER_METHODS, FullNewton, SolverMethod
+    >>> class SolverCounts(FullNewton):
     ...     tangents = 0
     ...
     ...     def renew(self):
     ...         super().renew()
-    ...         Counted.tangents += 1
+    ...         SolverCounts.tangents += 1
     >>> direct = SOLVER_METHODS["direct"].options
-    >>> SOLVER_METHODS["counted"] = SolverMethod(direct, "direct, counted", Counted)
+    >>> SOLVER_METHODS["counted"] = SolverMethod(direct, "direct, counted", SolverCounts)
     >>> scene = preset_scene("kuhl-holzapfel-2007", "cube")
     >>> scene = scene.with_values({"solver.method": "counted", "time.end": 2.0})
     >>> iterations = [step.row["newton_iterations"] for step in Simulation(scene).steps()]
-    >>> Counted.tangents == sum(iterations)
+    >>> SolverCounts.tangents == sum(iterations)
     True
     >>> del SOLVER_METHODS["counted"]
     """
@@ -340,15 +344,15 @@ class EveryTangent:
     def ended(self, iterations: int) -> None:
         """Record a successful solve and its number of iterations."""
 
-    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
+    def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
         """Return a slower and safer fallback for a failed solve, with its description, or None."""
         return None
 
-    def keep_nothing(self) -> None:
+    def disable_reuse(self) -> None:
         """Reuse no factorisation between solves from now on."""
 
     @property
-    def more_iterations(self) -> int:
+    def iteration_factor(self) -> int:
         """Factor on solver.maximum_iterations."""
         return 1
 
@@ -378,25 +382,25 @@ class EveryTangent:
         """Free all objects of PETSc."""
 
 
-class Multigrid(EveryTangent):
+class Multigrid(FullNewton):
     """GMRES with multigrid: new levels per tangent below degree 2, otherwise by PETSc's options."""
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
         self._solver, self._space = snes.getKSP(), equilibrium.state.unknown.function_space
         self._far = self._solver.getTolerances()[0]  # tolerance far from the solution
-        self._below: DegreeOne | None = None
+        self._below: PMultigrid | None = None
         if equilibrium.state.kinematics.reduced:
             return
         given = {name.split("_")[0] for name in options.given}
         self._chooses = "ksp" not in given and "snes_ksp_ew" not in options.given
         if self._space.ufl_element().degree > 1 and not given & {"pc", "mg"}:
-            self._below = DegreeOne(self._solver.getPC(), degree_one(self._space), matrix, elastic=True)
+            self._below = PMultigrid(self._solver.getPC(), degree_one(self._space), matrix, elastic=True)
             if self._chooses:
                 # The tolerance is then that of the residual itself.
                 self._solver.setPCSide(PETSc.PC.Side.RIGHT)
         else:
-            matrix.setNearNullSpace(rigid_motions(self._space, matrix))
+            matrix.setNearNullSpace(rigid_body_modes(self._space, matrix))
 
     def tangent(self, norm: float, tolerance: float) -> None:
         super().tangent(norm, tolerance)
@@ -411,7 +415,7 @@ class Multigrid(EveryTangent):
         if self._below is not None or self._always:
             self._set_up()
 
-    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
+    def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
         if self._below is None:
             return "with new multigrid levels in every iteration", self._anew()
         if self.snes.getConvergedReason() != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
@@ -420,7 +424,7 @@ class Multigrid(EveryTangent):
         # by them.
         self.close()
         self._solver.getPC().setFromOptions()
-        self.matrix.setNearNullSpace(rigid_motions(self._space, self.matrix))
+        self.matrix.setNearNullSpace(rigid_body_modes(self._space, self.matrix))
         if self._chooses:
             self._solver.setPCSide(PETSc.PC.Side.LEFT)
             self._solver.setNormType(PETSc.KSP.NormType.PRECONDITIONED)
@@ -433,7 +437,7 @@ class Multigrid(EveryTangent):
         self._below = None
 
 
-class Lagged(EveryTangent):
+class Lagged(FullNewton):
     """Modified Newton with L-BFGS: the tangent is renewed if more iterations would cost more."""
 
     keeps = True
@@ -448,20 +452,20 @@ class Lagged(EveryTangent):
             preconditioner = snes.getKSP().getPC()
             preconditioner.setType(PETSc.PC.Type.PYTHON)
             preconditioner.setPythonContext(self.factor)
-        self.secants = Secants(equilibrium.comm)
+        self.secants = LimitedMemoryUpdate(equilibrium.comm)
         self._before = 0  # number of tangents before the solve
         # Norms of the residual in this solve since the tangent was renewed.
         self._norms: list[float] = []
         self._due = True
-        self.worth = worth(matrix.getSize()[0])
+        self.worth = refactorisation_cost(matrix.getSize()[0])
         # Iterations, including the cost of the factorisation, and solves since then.
         self._spent, self._solves = 0.0, 0
 
     @property
-    def more_iterations(self) -> int:
+    def iteration_factor(self) -> int:
         return 1 if self._always or self._begins_anew else 3
 
-    def keep_nothing(self) -> None:
+    def disable_reuse(self) -> None:
         self._begins_anew = True
 
     def begin(self) -> None:
@@ -503,7 +507,7 @@ class Lagged(EveryTangent):
         self._spent, self._solves = self._spent + iterations, self._solves + 1
         self._due = self._always or iterations > SLOW_STEP * self.worth or iterations * self._solves > self._spent
 
-    def second_try(self) -> tuple[str, AbstractContextManager[None]] | None:
+    def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
         return None if self._always else ("with a new factorisation in every iteration", self._anew())
 
     def _costs_more(self, tolerance: float) -> bool:
@@ -512,9 +516,9 @@ class Lagged(EveryTangent):
         # second is often worse, and L-BFGS makes up for it. So the next estimate needs three
         # iterations.
         since = len(self._norms) - 1
-        if since == 0 or (1 < since < OVER and not self._begins_anew):
+        if since == 0 or (1 < since < RATE_WINDOW and not self._begins_anew):
             return False
-        over = 1 if self._begins_anew else min(since, OVER)
+        over = 1 if self._begins_anew else min(since, RATE_WINDOW)
         rate = (self._norms[-1] / self._norms[-1 - over]) ** (1 / over)
         return bool(not rate < 1 or np.log(tolerance / self._norms[-1]) / np.log(rate) > self.worth)
 
@@ -528,7 +532,7 @@ class Lagged(EveryTangent):
         self.secants.forget()
 
 
-def uneven(vector: Vec) -> Vec:
+def fill_asymmetric(vector: Vec) -> Vec:
     """Fill a vector with values that no symmetry leaves unchanged, and return it."""
     first, last = vector.getOwnershipRange()
     vector.array[:] = np.sin(1.0 + np.arange(first, last) * np.sqrt(2.0))

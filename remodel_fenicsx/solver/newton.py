@@ -11,20 +11,20 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import allreduce
 from remodel_fenicsx.fem.solver_methods import (
     AUTO,
     LAGGED,
     ProblemOptions,
     SOLVER_METHODS,
-    chosen,
+    resolve_auto,
     is_small,
     method_options,
 )
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import MADE_ANEW, attempted, say
-from remodel_fenicsx.solver.equilibrium import Equilibrium, Extension, Look
-from remodel_fenicsx.solver.linear import EveryTangent
+from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits, PointState
+from remodel_fenicsx.solver.linear import FullNewton
 from remodel_fenicsx.state import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
@@ -112,7 +112,7 @@ class Convergence:
 
 # A Newton step that ends above this r/L keeps this fraction of 1 - r/L.
 NEAR_LIMIT, RESERVE = 0.95, 0.3
-NOWHERE = Extension(0.0, 1.0, (np.nan,) * 3)
+NOWHERE = StateLimits(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
 # Smallest displacement of a jump, relative to the body's size: 1 % of the radius of a tube of this
 # length.
@@ -120,14 +120,14 @@ POSSIBLE_JUMP = 1e-3
 
 
 @dataclass(eq=False)
-class Counted:
+class SolverCounts:
     """Work of the solver: iterations and tangents."""
 
     newton_iterations: int = 0
     linear_iterations: int = 0
     tangents: int = 0  # number of assembled tangents
 
-    def count(self, other: Counted) -> None:
+    def count(self, other: SolverCounts) -> None:
         """Add the work of another solve."""
         self.newton_iterations += other.newton_iterations
         self.linear_iterations += other.linear_iterations
@@ -135,16 +135,16 @@ class Counted:
 
 
 @dataclass
-class Solution(Counted):
+class Solution(SolverCounts):
     """Result of a successful solve."""
 
     residual: float = 0.0
-    extension: Extension = NOWHERE
+    extension: StateLimits = NOWHERE
     # Distance from the origin over that of the first iterate; 0 for small distances.
-    reach: float = 0.0
+    displacement_ratio: float = 0.0
 
 
-class SolveFailure(RuntimeError, Counted):
+class SolveFailure(RuntimeError, SolverCounts):
     """Failure of SNES to find an admissible equilibrium; the unknowns before it are restored."""
 
     def __init__(
@@ -182,14 +182,14 @@ SNES_REASONS = {
     -6: "the line search did not reduce the residual",
     -9: "the residual diverged",
 }
-MOST_ITERATIONS = -5
+DIVERGED_MAX_IT = -5
 
 
-def failure_text(reason: int, iterations: int, extension: Extension) -> str:
+def failure_text(reason: int, iterations: int, extension: StateLimits) -> str:
     """Return why SNES has failed; if it has converged, the state is not admissible."""
     if reason >= 0:
         return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
-    if reason == MOST_ITERATIONS:
+    if reason == DIVERGED_MAX_IT:
         return f"no equilibrium within {iterations} Newton iterations"
     return SNES_REASONS.get(reason, f"SNES stopped with reason {reason}")
 
@@ -213,7 +213,7 @@ class GuardedNewton:
         """Create PETSc's objects of the method, which serve all steps."""
         equilibrium, settings, kinematics = self.equilibrium, self.settings, self.equilibrium.state.kinematics
         unknowns, ranks, narrow = self._x.getSize(), equilibrium.comm.size, not kinematics.three_dimensional
-        self.method = method = chosen(settings.method, unknowns, narrow, kinematics.suits_multigrid)
+        self.method = method = resolve_auto(settings.method, unknowns, narrow, kinematics.suits_multigrid)
         # In three dimensions a named method is not replaced, so that results do not depend on the
         # size.
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
@@ -230,9 +230,9 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]
         snes.setConvergenceTest(self._converged)
         self._snes: PETSc.SNES = snes
-        self._linear: EveryTangent = SOLVER_METHODS[method].make_linear(equilibrium, snes, self._matrix, self._options)
+        self._linear: FullNewton = SOLVER_METHODS[method].make_linear(equilibrium, snes, self._matrix, self._options)
         if self._robust:
-            self._linear.keep_nothing()
+            self._linear.disable_reuse()
 
     def close(self) -> None:
         """Free PETSc's objects and options. Further calls have no effect."""
@@ -245,13 +245,13 @@ class GuardedNewton:
             thing.destroy()
         self._snes = None
 
-    def solve(self, origin: Array | None = None, roughly: bool = False) -> Solution:
-        """Solve from the present unknowns, and set them; `roughly`: more substeps follow."""
-        self.convergence.intermediate = roughly
-        first = attempted(lambda: self._attempt(origin, self._linear.more_iterations), SolveFailure)
+    def solve(self, origin: Array | None = None, loose_tolerance: bool = False) -> Solution:
+        """Solve from the present unknowns, and set them; `loose_tolerance`: more substeps follow."""
+        self.convergence.intermediate = loose_tolerance
+        first = attempted(lambda: self._attempt(origin, self._linear.iteration_factor), SolveFailure)
         if isinstance(first, Solution):
             return first
-        second = self._linear.second_try()
+        second = self._linear.fallback()
         if second is None:
             raise first
         words, other_way = second
@@ -263,29 +263,29 @@ class GuardedNewton:
             raise again
         return again
 
-    def may_start(self, last_extension: float) -> bool:
+    def is_admissible_start(self, last_extension: float) -> bool:
         """Return whether a solve may start here: admissible, and not too near to locking."""
         extension, least = self.equilibrium.extension(), RESERVE * (1 - last_extension)
         near = extension.max_chain_extension > NEAR_LIMIT and 1 - extension.max_chain_extension < least
         return extension.admissible and not near
 
-    def _attempt(self, origin: Array | None, more_iterations: int = 1) -> Solution:
+    def _attempt(self, origin: Array | None, iteration_factor: int = 1) -> Solution:
         start, tangents = self._values.copy(), self._linear.tangents
-        self._snes.setTolerances(max_it=more_iterations * self._most_iterations)
+        self._snes.setTolerances(max_it=iteration_factor * self._most_iterations)
         self.convergence.begin()
-        self._pull(self._x)
+        self._to_petsc(self._x)
         self._present = _Solve(start if origin is None else origin)
         self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
-        self._push(self._x)
+        self._from_petsc(self._x)
         extension, norm = self.equilibrium.extension(), float(self._snes.getFunctionNorm())
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
         found = Solution(newton, linear, self._linear.tangents - tangents, norm, extension)
         if reason >= 0 and not self._present.inadmissible and extension.admissible:
             self._linear.ended(newton)
-            found.reach = self._reach()
+            found.displacement_ratio = self._reach()
             return found
         self._values[:] = start
         if extension.stop_signal:
@@ -296,22 +296,22 @@ class GuardedNewton:
         raise SolveFailure(text, found, left, relative, norm > STAGNATION * self._present.previous)
 
     def _reach(self) -> float:
-        """Return `Solution.reach` of the present unknowns. Collective."""
+        """Return `Solution.displacement_ratio` of the present unknowns. Collective."""
         comm, state, present = self.equilibrium.comm, self.equilibrium.state, self._present
         change = self._values - present.origin
-        largest = over_ranks(comm, np.abs(change).max(initial=0.0), MPI.MAX)
+        largest = allreduce(comm, np.abs(change).max(initial=0.0), MPI.MAX)
         if not present.first_iterate or largest < POSSIBLE_JUMP * state.loading.domain.size:
             return 0.0
         return self._length(change[: state.number_of_owned_unknowns]) / present.first_iterate
 
     def _length(self, change: Array) -> float:
         """Return the norm of a change of the unknowns that this rank owns. Collective."""
-        return float(np.sqrt(over_ranks(self.equilibrium.comm, float(change @ change), MPI.SUM)))
+        return float(np.sqrt(allreduce(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
     def answer(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Solve one linear system for the change that balances `equilibrium`. Collective."""
         # `tangents` is the number assembled for that state. Without any a new one is assembled.
-        self._pull(self._x)
+        self._to_petsc(self._x)
         equilibrium.assemble_internal(self._residual)
         equilibrium.assemble_external(self._external)
         self._residual.axpy(1.0, self._external)
@@ -341,12 +341,12 @@ class GuardedNewton:
             log.warning("solver.petsc_options: without effect (misspelt?): %s", ", ".join(unused))
 
     # ------------------------------------------------------------ SNES
-    def _pull(self, x: PETSc.Vec) -> None:
+    def _to_petsc(self, x: PETSc.Vec) -> None:
         """Copy the unknowns into a PETSc vector."""
         with x.localForm() as local:
             local.array[:] = self._values
 
-    def _push(self, x: PETSc.Vec) -> None:
+    def _from_petsc(self, x: PETSc.Vec) -> None:
         """Copy a PETSc vector into the unknowns, ghosts included."""
         if self.equilibrium.comm.size == 1:
             self._values[:] = x.array_r
@@ -359,7 +359,7 @@ class GuardedNewton:
         """Assemble R = internal forces - loads, zero for prescribed displacements that are met."""
         # R is NaN if the state is not admissible. Line searches that handle NaN shorten their step,
         # others stop.
-        self._push(x)
+        self._from_petsc(x)
         equilibrium, loading = self.equilibrium, self.equilibrium.state.loading
         equilibrium.assemble_internal(residual)
         equilibrium.assemble_external(self._external)
@@ -375,7 +375,7 @@ class GuardedNewton:
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
         present = self._present
         if present.is_certain:
-            present.inadmissible = over_ranks(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
+            present.inadmissible = allreduce(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
         else:
             extension = equilibrium.extension()
             present.inadmissible = not extension.admissible or extension.stop_signal > 0
@@ -404,12 +404,12 @@ class GuardedNewton:
         present.is_certain = present.room > 0.0
         if present.is_certain:
             return improved
-        self._push(x)
-        before, trial = self.equilibrium.look(), self._trial
+        self._from_petsc(x)
+        before, trial = self.equilibrium.evaluate(), self._trial
         for halving in range(LINE_SEARCH_HALVINGS + 1):
             trial.waxpy(-1.0, step, x)
-            self._push(trial)
-            after = self.equilibrium.look()
+            self._from_petsc(trial)
+            after = self.equilibrium.evaluate()
             if after.extension.stop_signal or self._allows(before, after):
                 break
             step.scale(0.5)
@@ -419,14 +419,14 @@ class GuardedNewton:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
 
-    def _allows(self, before: Look, after: Look) -> bool:
+    def _allows(self, before: PointState, after: PointState) -> bool:
         """Return whether a step is admissible: its end, a margin near L, and J > 0 on its path."""
         near, equilibrium = after.extension.max_chain_extension > NEAR_LIMIT, self.equilibrium
         if not after.extension.admissible:
             return False
-        if near and not equilibrium.keeps_reserve(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
+        if near and not equilibrium.keeps_margin(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
             return False
-        return not equilibrium.turns_inside_out(before, after)
+        return not equilibrium.inverts_between(before, after)
 
     def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
         """Return the SNES reason after an iteration, from `Convergence` and the iteration limit."""

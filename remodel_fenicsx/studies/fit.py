@@ -23,23 +23,23 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.body.reductions import explained
+from remodel_fenicsx.body.reductions import describe_choice
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, SOLVE_FAILED, RemodelError, UnreadableFile
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.units import convention_doubt
-from remodel_fenicsx.schema.tables import Table, fault, shown
+from remodel_fenicsx.schema.tables import Table, validation_error, format_value
 from remodel_fenicsx.schema.text import read_columns, read_toml
 from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
-from remodel_fenicsx.initial import with_choices
-from remodel_fenicsx.simulation import Simulation, begin_again
+from remodel_fenicsx.initial import resolve_auto_settings
+from remodel_fenicsx.simulation import Simulation, reset_simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.studies.study import (
     COLOURS,
-    Answer,
+    StudyResult,
     Page,
     Run,
     Study,
@@ -50,7 +50,7 @@ from remodel_fenicsx.studies.study import (
 )
 from remodel_fenicsx.system.children import PART, Worker
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
-from remodel_fenicsx.system.terminal import hold_log, open_log, unsaid
+from remodel_fenicsx.system.terminal import buffer_log, open_log, muted_warnings
 from remodel_fenicsx.unloading import PASSIVE
 from remodel_fenicsx.watch.warnings import WarnsOnce
 
@@ -90,9 +90,9 @@ class Unknown(Table):
     def _go_together(self) -> Unknown:
         lower, upper = self.bounds
         if not lower <= self.start <= upper or lower == upper:
-            raise fault(f"must lie between lower {lower:g} and upper {upper:g}", "start", self.start)
+            raise validation_error(f"must lie between lower {lower:g} and upper {upper:g}", "start", self.start)
         if (self.prior is None) != (self.prior_sd is None):
-            raise fault("prior and prior_sd (of the logarithm) go together", "prior", self.prior)
+            raise validation_error("prior and prior_sd (of the logarithm) go together", "prior", self.prior)
         return self
 
     @property
@@ -115,7 +115,9 @@ class MeasuredTable(Table):
     @model_validator(mode="after")
     def _go_together(self) -> MeasuredTable:
         if (self.time is not None) != (self.state == "after"):
-            raise fault("goes with state = 'after', and is the time until which the tissue remodels", "time", self.time)
+            raise validation_error(
+                "goes with state = 'after', and is the time until which the tissue remodels", "time", self.time
+            )
         return self
 
 
@@ -212,7 +214,7 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
 def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> Measured:
     if table.state == "after" and scene.remodeling.turnover.is_on:
         raise SceneError(f"{place}.state = 'after': takes cells alone, not what remodeling.turnover has changed")
-    file = f"{place}.file = {shown(table.file)}"
+    file = f"{place}.file = {format_value(table.file)}"
     columns = _read_columns(folder / table.file, file, scene)
     loads = _prescribed(columns, table, scene, place)
     _check_columns(columns, loads, table.state, file, scene)
@@ -221,7 +223,7 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
             if name not in columns or (name == "time" and key != "units"):
                 raise SceneError(f"{place}.{key}.{name}: no such column is measured; the file has {', '.join(columns)}")
     units = {
-        name: (unit, _factor(name, unit, scene, f"{place}.units.{name} = {shown(unit)}"))
+        name: (unit, _factor(name, unit, scene, f"{place}.units.{name} = {format_value(unit)}"))
         for name, unit in table.units.items()
     }
     columns |= {name: columns[name] * factor for name, (_, factor) in units.items()}
@@ -240,11 +242,11 @@ def _prescribed(columns: Columns, table: MeasuredTable, scene: Scene, place: str
     for name in table.drive:
         if name not in columns or name not in kinds:
             known = ", ".join(one for one in columns if one in kinds)
-            raise SceneError(f"{place}.drive = {shown(name)}: allowed are the columns of loads: {known}")
+            raise SceneError(f"{place}.drive = {format_value(name)}: allowed are the columns of loads: {known}")
     if table.drive:
         return table.drive
-    loads = [name for name in columns if name in scene.loads or (name in kinds and kinds[name].instead_of)]
-    return tuple(name for name in loads if kinds[name].dimension is None or kinds[name].instead_of not in loads)
+    loads = [name for name in columns if name in scene.loads or (name in kinds and kinds[name].replaces)]
+    return tuple(name for name in loads if kinds[name].dimension is None or kinds[name].replaces not in loads)
 
 
 def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
@@ -291,7 +293,7 @@ def _check_columns(columns: Columns, loads: tuple[str, ...], state: str, place: 
 WALL = ("wall_thickness", "inner_radius")
 
 
-def doubts(tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene) -> Iterator[str]:
+def data_warnings(tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene) -> Iterator[str]:
     """Lines on measured columns that may be in another convention, beside the model at the start."""
     units = dimensions(scene)
     for table, model in zip(tables, modelled, strict=True):
@@ -306,17 +308,19 @@ def doubts(tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene
 
 
 # ---------------------------------------------------------------- what a scene says where a table has measurements
-# keys whose numbers a simulation takes that is built already (`begin_again`)
+# keys whose numbers a simulation takes that is built already (`reset_simulation`)
 TISSUE, OTHERS = r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))", r"loads\.\w+\.value|natural\.\w+"
 CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
 # what differences of runs divide by a small change is rounding alone
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
 
-def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], kept: Kept | None = None) -> Columns:
+def model_of(
+    scene: Scene, table: Measured, scales: Mapping[str, float], kept: SimulationCache | None = None
+) -> Columns:
     """What a scene says where a table has measurements, by column, (rows,)."""
     changes = PRECISE | {"output.columns": [*table.sd], "output.times": [], "output.fields": False}
-    scene = with_choices(scene.with_values(changes))
+    scene = resolve_auto_settings(scene.with_values(changes))
     if table.state == "history":
         measured, step = table.columns["time"], scene.time.step
         end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
@@ -331,7 +335,7 @@ def model_of(scene: Scene, table: Measured, scales: Mapping[str, float], kept: K
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
-    replaced = {scene.load_kinds[name].instead_of for name in table.loads}  # cannot be beside those of the table
+    replaced = {scene.load_kinds[name].replaces for name in table.loads}  # cannot be beside those of the table
     loads = {}
     for name in [name for name in dict.fromkeys((*scene.loads, *table.loads)) if name not in replaced]:
         if name in table.loads:
@@ -345,7 +349,7 @@ def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scen
     return scene.model_copy(update={"loads": loads}).with_values(changes)
 
 
-class Kept(dict[object, tuple[Simulation, Snapshot]]):
+class SimulationCache(dict[object, tuple[Simulation, Snapshot]]):
     """Simulations on the way, which nobody hears: they stay, and get other numbers where a scene differs in no more."""
 
     def __init__(self, keys: tuple[str, ...]):
@@ -353,13 +357,13 @@ class Kept(dict[object, tuple[Simulation, Snapshot]]):
         self.keys_of_scene = keys
 
     def __reduce__(self) -> tuple[object, ...]:
-        return Kept, (self.keys_of_scene,)  # another process builds its own
+        return SimulationCache, (self.keys_of_scene,)  # another process builds its own
 
     def simulation(self, scene: Scene, table: Measured, has_own_cells: bool) -> Simulation:
         """At t = 0."""
         use = id(table), has_own_cells, scene.model.kinematics, scene.mesh.formulation
         if use in self:
-            if all(re.fullmatch(CAN_BE_SET, key) for key in self.keys_of_scene) and begin_again(*self[use], scene):
+            if all(re.fullmatch(CAN_BE_SET, key) for key in self.keys_of_scene) and reset_simulation(*self[use], scene):
                 return self[use][0]
             self.pop(use)[0].close()
         made = Simulation(scene, MPI.COMM_SELF)
@@ -370,7 +374,7 @@ class Kept(dict[object, tuple[Simulation, Snapshot]]):
 
 
 def _run(
-    scene: Scene, table: Measured, kept: Kept | None = None, start: tuple[Array, Array] | None = None
+    scene: Scene, table: Measured, kept: SimulationCache | None = None, start: tuple[Array, Array] | None = None
 ) -> tuple[Columns, tuple[Array, Array]]:
     """Columns and `time` of all steps; dimensions and axes of the cells at the end."""
     simulation = Simulation(scene, MPI.COMM_SELF) if kept is None else kept.simulation(scene, table, start is None)
@@ -378,7 +382,7 @@ def _run(
     try:
         if start is not None:
             cells.set(*start)
-            simulation.state.settle_cells()
+            simulation.state.mark_cells_in_equilibrium()
         rows = [step.row for step in simulation.steps()]
         end = cells.dimension_values.copy(), cells.axis_values.copy()
     finally:
@@ -419,16 +423,22 @@ def fingerprint(problem: Problem) -> str:
 
 # ---------------------------------------------------------------- least squares
 LOGARITHM_CHANGE = 1e-4  # of a logarithm: central differences err by 1e-8, those to one side by 1e-4
-BLIND = 1e-7  # smallest singular value over the largest, below which the data say nothing: what differences err by
+SINGULAR_TOLERANCE = (
+    1e-7  # smallest singular value over the largest, below which the data say nothing: what differences err by
+)
 NAMED = 0.1  # share of a blind direction from which on an unknown is named
-UNSOLVED = 1e3  # standard deviations, of all rows of a state that has no equilibrium
+FAILED_RUN_RESIDUAL = 1e3  # standard deviations, of all rows of a state that has no equilibrium
 START_SPREAD = np.log(2.0)  # of further starts, to both sides
 SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
-ENOUGH = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
+FIT_TOLERANCE = (
+    1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
+)
 TELLING = 0.5  # of a change of the residuals: where a Jacobian misses more, the next is made by differences
 CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
 PROFILE_STEPS = (-4, -2.5, -1.5, 0, 1.5, 2.5, 4)  # standard deviations of the straight line
-ROUGHLY = 1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
+PROFILE_TOLERANCE = (
+    1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
+)
 LIMITED_BY_MODEL = 1.5  # standard deviations that a model is off: the noise of ten rows alone is below 1.35 at 95 %
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
@@ -441,7 +451,7 @@ class Problem:
         self.bounds = np.log([unknown.bounds for unknown in unknowns.values()])
         self.known: dict[Point, Array] = {}
         self.journal: Path | None = None
-        self.kept = Kept(tuple(unknowns))
+        self.kept = SimulationCache(tuple(unknowns))
 
     def begin(self, folder: Path, mark: str) -> None:
         """Keep what is evaluated in the folder, from now on and before; a line that was cut off goes."""
@@ -461,7 +471,7 @@ class Problem:
     def _numbers(self, logarithms: Array) -> zip[tuple[str, float]]:
         return zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
 
-    def models(self, logarithms: Array, kept: Kept | None = None) -> list[Columns]:
+    def predictions(self, logarithms: Array, kept: SimulationCache | None = None) -> list[Columns]:
         """What the model says of each table."""
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
         return [model_of(scene, table, scales, kept) for table in self.tables]
@@ -470,7 +480,7 @@ class Problem:
         """Model less measurement over standard deviation, table by table; then the priors."""
         key = tuple(map(float, logarithms))
         if key not in self.known:
-            with unsaid():
+            with muted_warnings():
                 self.known[key] = self._evaluated(np.array(logarithms))
             if self.journal is not None:
                 with self.journal.open("a", encoding="utf-8") as file:
@@ -480,11 +490,11 @@ class Problem:
     def _evaluated(self, x: Array) -> Array:
         scales, models = self.scales_of(x), list[Columns]()
         with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
-            models = self.models(x, self.kept)
+            models = self.predictions(x, self.kept)
         parts: list[ArrayLike] = []
         for table, model in zip_longest(self.tables, models):
             for name, sd in table.sd.items():
-                off = model[name] - scales.get(name, 1.0) * table.columns[name] if model else UNSOLVED * sd
+                off = model[name] - scales.get(name, 1.0) * table.columns[name] if model else FAILED_RUN_RESIDUAL * sd
                 parts.append(np.full(table.rows, off / sd))
         for unknown, value in zip(self.unknowns.values(), x, strict=True):
             if unknown.prior is not None:
@@ -501,10 +511,10 @@ class Problem:
             columns.append((self.residuals(ahead) - self.residuals(behind)) / (ahead[k] - behind[k]))
         return np.transpose(columns)
 
-    def check_tells_apart(self, jacobian: Array) -> None:
+    def check_identifiable(self, jacobian: Array) -> None:
         """Refuse unknowns of which the data say nothing."""
         _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-        if singular[-1] > BLIND * singular[0]:
+        if singular[-1] > SINGULAR_TOLERANCE * singular[0]:
             return
         blind = directions[-1] * np.sign(directions[-1][np.abs(directions[-1]).argmax()])
         pairs = [(key, part) for key, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
@@ -517,7 +527,7 @@ class Problem:
         )
 
 
-class NoStart(RemodelError):  # noqa: N818
+class InfeasibleStart(RemodelError):  # noqa: N818
     """A fit starts where the scene has no equilibrium."""
 
     exit_code = SOLVE_FAILED
@@ -544,14 +554,14 @@ class Part(Run):
 
     def begin(self, worker: Worker) -> None:
         """Begin it."""
-        file = self.beside(".pickle")
+        file = self.sibling_path(".pickle")
         file.write_bytes(pickle.dumps(self.work))
-        worker.begin([PART, str(file)], self.beside(".txt"))
+        worker.begin([PART, str(file)], self.sibling_path(".txt"))
 
     @property
     def answer(self) -> OptimizeResult:
         """What its process has left."""
-        return pickle.loads(self.beside(".pickle").read_bytes())
+        return pickle.loads(self.sibling_path(".pickle").read_bytes())
 
 
 class _FitStudy(Study):
@@ -561,11 +571,11 @@ class _FitStudy(Study):
         """What the tasks make of the problem, which then knows what was evaluated for them."""
         parts = [Part(name, self.scene, self.folder / name, (problem, task)) for name, task in tasks.items()]
         self.runs = [*parts]
-        self.do()
+        self.run_all()
         problem.known |= read_journal(place)[1]
         return [part.answer for part in parts]
 
-    def learn(self) -> None:
+    def update(self) -> None:
         """End it with the first part that fails."""
         for name, words in self.failed.items():
             raise LostProcess(
@@ -592,18 +602,18 @@ def fit(
     """Fit numbers of a scene to measurements."""
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
-    with hold_log(quiet=quiet) as held:
+    with buffer_log(quiet=quiet) as held:
         problem = Problem(scene, *read_measurements(Path(data), scene))
         mark = fingerprint(problem)
         place, problem.known = _place(folder, f"{scene.name}-fit", mark)
-        for words in (*explained(scene), scene.formulation_in_words()):
+        for words in (*describe_choice(scene), scene.describe_formulation()):
             log.info("%s", words)
         first, jacobian = _begun(problem)
     with RunLock(place), open_log(place / "fit.log", quiet=quiet, held=held), TemporaryDirectory() as parts:
         problem.begin(place, mark)
         random = np.random.default_rng(1)
         points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
-        rough = partial(minimised, near=(first, jacobian), enough=ROUGHLY)
+        rough = partial(minimised, near=(first, jacobian), enough=PROFILE_TOLERANCE)
         with closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)) as study:
             on_cores = partial(study.answers, problem, place)
             found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
@@ -626,13 +636,13 @@ def _begun(problem: Problem) -> tuple[Array, Array]:
     for words in problem.scene_of(first).warnings():
         log.warning("%s", words)
     try:
-        at_start = problem.models(first)
+        at_start = problem.predictions(first)
     except StepFailure as failure:
-        raise NoStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
-    for doubt in doubts(problem.tables, at_start, problem.scene):
+        raise InfeasibleStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
+    for doubt in data_warnings(problem.tables, at_start, problem.scene):
         log.warning("%s", doubt)
     jacobian = problem.jacobian(first, central=True)
-    problem.check_tells_apart(jacobian)
+    problem.check_identifiable(jacobian)
     return first, jacobian
 
 
@@ -652,7 +662,7 @@ def minimised(
     start: Array,
     held: int | None = None,
     near: tuple[Array, Array] | None = None,
-    enough: float = ENOUGH,
+    enough: float = FIT_TOLERANCE,
 ) -> OptimizeResult:
     """SciPy's least squares from a start, logarithms."""
     # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells what
@@ -688,10 +698,10 @@ def result_of(problem: Problem, found: Sequence[OptimizeResult]) -> Fit:
     """The best of several minima, with bands."""
     logarithms: Array = min(found, key=lambda one: float(one.cost)).x
     jacobian = problem.jacobian(logarithms, central=True)
-    problem.check_tells_apart(jacobian)
+    problem.check_identifiable(jacobian)
     misfit = float(np.sqrt(np.mean(problem.residuals(logarithms) ** 2)))
     covariance, minima = np.asarray(np.linalg.inv(jacobian.T @ jacobian)), [2 * float(one.cost) for one in found]
-    scene, models = problem.scene_of(logarithms), problem.models(logarithms)
+    scene, models = problem.scene_of(logarithms), problem.predictions(logarithms)
     return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
 
 
@@ -704,7 +714,7 @@ def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str,
     points = np.clip(best + np.multiply.outer(PROFILE_STEPS, ways), *ends)  # (steps, chosen, unknowns)
     tasks = {
         f"profile of {found.keys[held]} at {steps:+g}": partial(
-            minimised, start=x, held=int(held), near=near, enough=ROUGHLY
+            minimised, start=x, held=int(held), near=near, enough=PROFILE_TOLERANCE
         )
         for steps, row in zip(PROFILE_STEPS, points, strict=True)
         for held, x in zip(chosen, row, strict=True)
@@ -721,7 +731,7 @@ def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str,
 
 # ---------------------------------------------------------------- the answer
 @dataclass(frozen=True)
-class Fit(Answer):
+class Fit(StudyResult):
     """What a fit has found."""
 
     scene: Scene

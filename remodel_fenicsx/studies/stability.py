@@ -22,7 +22,7 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.newton import SolveFailure
-from remodel_fenicsx.studies.study import COLOURS, Answer
+from remodel_fenicsx.studies.study import COLOURS, StudyResult
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def pass_factor(stepper: Stepper, step: Step) -> float:
             if not (largest := quadrature.maximum(relative.reshape(quadrature.shape))):
                 return 0.0
             change *= SIZE / largest
-            squared, axes = spectral.continued(tensor + change, cells.axes)
+            squared, axes = spectral.principal_by_continuity(tensor + change, cells.axes)
             state.cells.set(np.sqrt(np.maximum(squared, 0.0)), axes)
             newton.solve()
             before, change = change, passed() - undisturbed
@@ -103,7 +103,7 @@ def stability(
         raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")
     if scene.cases[1:]:
         raise SceneError("cases: the analysis takes one load case; leave out [[cases]]")
-    if scene.time.chooses:
+    if scene.time.is_adaptive:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; leave it out")
     place = chosen_folder(folder, f"{scene.name}-stability", comm)
     steps, made = scene.time.number_of_steps, list[FactorWatcher]()
@@ -127,7 +127,7 @@ def stability(
 
 # ---------------------------------------------------------------- the answer
 @dataclass(frozen=True)
-class Analysis(Answer):
+class Analysis(StudyResult):
     """Factors of the passes, of which the coupling makes a share, by time; NaN where none was found."""
 
     scene: Scene

@@ -38,12 +38,12 @@ from remodel_fenicsx.results.recording import (
     read_history,
     unit_of,
     words,
-    writer,
+    lock_holder,
 )
-from remodel_fenicsx.running import with_files_kept
+from remodel_fenicsx.running import with_stored_files
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
-from remodel_fenicsx.initial import with_choices
+from remodel_fenicsx.initial import resolve_auto_settings
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.children import Worker, cores, wait_for_one
 from remodel_fenicsx.system.files import check_no_link, make_own_folder, refusal_in_words, write_whole
@@ -94,7 +94,7 @@ class Page:
         write_whole(path, content)
 
 
-class Answer(ABC):
+class StudyResult(ABC):
     """What a study has found: `verdict` says it in a sentence, and stands over the picture and below the table."""
 
     name: str  # of its files
@@ -220,7 +220,7 @@ def read_notes(folder: Path, name: str) -> dict[str, list[str]]:
 
 
 # ---------------------------------------------------------------- one of the runs
-Found = TypeVar("Found", bound=Answer)
+Found = TypeVar("Found", bound=StudyResult)
 
 POLL = 0.1  # seconds
 FEWEST_RUNS = 2  # runs, or settings, without which nothing is compared
@@ -242,7 +242,7 @@ class Run:
     scene: Scene
     folder: Path
 
-    def beside(self, ending: str) -> Path:
+    def sibling_path(self, ending: str) -> Path:
         """A file beside its folder, of the same name: names have dots of their own (`step-0.5`)."""
         return self.folder.with_name(f"{self.folder.name}{ending}")
 
@@ -272,11 +272,11 @@ class Run:
         """Begin it, or go on with what is there of it."""
         make_own_folder(self.folder.parent)
         check_no_link(self.folder)
-        scene, words = self.beside(".toml"), ["--resume", str(self.folder)]
+        scene, words = self.sibling_path(".toml"), ["--resume", str(self.folder)]
         if not (self.folder / SCENE).exists():
             write_whole(scene, self.scene.to_toml().encode())
             words = [str(scene), "-o", str(self.folder)]
-        worker.begin(["run", *words, "-q", "--no-report"], self.beside(".txt"))
+        worker.begin(["run", *words, "-q", "--no-report"], self.sibling_path(".txt"))
 
 
 def _same(recording: RecordedRun, wanted: Scene) -> bool:
@@ -284,12 +284,12 @@ def _same(recording: RecordedRun, wanted: Scene) -> bool:
     if recording.scene == wanted:
         return True
     try:
-        kept, _ = with_files_kept(recording.scene)
+        kept, _ = with_stored_files(recording.scene)
     except (SceneError, OSError) as error:
         words = refusal_in_words(error) if isinstance(error, OSError) else error
         raise RecordingError(f"{recording.path}: {words}") from error
     with as_unloaded(wanted, MPI.COMM_SELF) as found:
-        return kept == with_files_kept(with_choices(found))[0]
+        return kept == with_stored_files(resolve_auto_settings(found))[0]
 
 
 # ---------------------------------------------------------------- all of them
@@ -321,10 +321,10 @@ class Study:
         for worker in [*self._running, *self._idle]:
             worker.stop()
 
-    def answered(self, answer: Callable[[], Found]) -> tuple[Path, Found]:
+    def run_and_write(self, answer: Callable[[], Found]) -> tuple[Path, Found]:
         """The folder, and what the runs say once they are done, which is written there."""
         with RunLock(self.folder), closing(self):
-            self.do()
+            self.run_all()
             found = answer()
             found.write(self.folder)
         return self.folder, found
@@ -333,13 +333,13 @@ class Study:
         """Of all that have not failed, by name."""
         return {run.name: run.history() for run in self.runs if run.name not in self.failed}
 
-    def learn(self) -> None:
+    def update(self) -> None:
         """Do what is to be done whenever a run has ended."""
 
-    def do(self) -> None:
+    def run_all(self) -> None:
         """Run what is not complete; `failed` then has the last words of those that have failed, or are damaged."""
         self._waiting = [run for run in self.runs if self._is_left(run)]
-        self.learn()
+        self.update()
         pausing = False
         with StopRequest() as stop, Line(f"{self.scene.name} {self.name}", self.quiet) as line:
             while (self._waiting or self._running) and clock.monotonic() < self.deadline:
@@ -370,7 +370,7 @@ class Study:
             if len(self._running) >= self.jobs:
                 return
             # by another command, or one that was killed and is ending
-            if run.folder.is_dir() and writer(run.folder)[1]:
+            if run.folder.is_dir() and lock_holder(run.folder)[1]:
                 continue
             self._waiting.remove(run)
             if self._is_left(run):
@@ -387,10 +387,10 @@ class Study:
                 continue
             del self._running[worker]
             if code != 0 and not (pausing and code in (PAUSED, -PAUSE)):  # the latter before Python minds the signal
-                self.failed[run.name] = worker.last_words()
+                self.failed[run.name] = worker.last_output()
             if worker.is_alive:
                 self._idle.append(worker)
-            self.learn()
+            self.update()
 
     def _progress(self) -> str:
         """How many runs are behind, and which are under way."""

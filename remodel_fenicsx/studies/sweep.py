@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 from remodel_fenicsx.body.reductions import only_for_means
 from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema.tables import shown
+from remodel_fenicsx.schema.tables import format_value
 from remodel_fenicsx.studies.study import (
     COLOURS,
     FEWEST_RUNS,
-    Answer,
+    StudyResult,
     Study,
     TooFewRuns,
     aligned,
@@ -84,12 +84,12 @@ def _axis(text: str, is_range: bool) -> tuple[str, list[Number]]:
     else:
         fits = len(numbers) > 0
     if not fits or not re.fullmatch(r"[\w-]+(\.[\w-]+)+", key):
-        raise SceneError(f"sweep {shown(text)}: {RANGE_RULE if is_range else RULE}")
+        raise SceneError(f"sweep {format_value(text)}: {RANGE_RULE if is_range else RULE}")
     if has_ends and not is_range:
         spaced = np.linspace(numbers[0], numbers[1], int(numbers[2]))
         numbers = [_number(f"{number:.6g}" if number % 1 else f"{number:.0f}") for number in spaced]
     if len(set(numbers)) < len(numbers):
-        raise SceneError(f"sweep {shown(text)}: a number is there twice")
+        raise SceneError(f"sweep {format_value(text)}: a number is there twice")
     return key, numbers
 
 
@@ -105,7 +105,7 @@ PANEL_COLUMNS, PANEL_KEYS = 5, 3  # of the picture: what fits on a page
 
 
 @dataclass(frozen=True)
-class Sweep(Answer):
+class Sweep(StudyResult):
     """Numbers by key and histories of the runs; one that has failed has no history."""
 
     scene: Scene
@@ -216,7 +216,7 @@ def _answered(
             raise TooFewRuns(f"{reached} of {len(points)} runs reached the end", study.failed)
         return kind(study.scene, points, histories, study.failed)
 
-    return study.answered(answer)
+    return study.run_and_write(answer)
 
 
 def _changed(scene: Scene, point: Point) -> Scene:
@@ -304,7 +304,7 @@ def ensemble(
         raise SceneError(f"--seeds {seeds}: allowed is a whole number at least {FEWEST_RUNS}")
     if not scene.has_random_cells:
         raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells")
-    if scene.time.chooses:
+    if scene.time.is_adaptive:
         raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
     first = scene.cells.seed
     points = {f"seed-{n}": {"cells.seed": n} for n in range(first, first + seeds)}

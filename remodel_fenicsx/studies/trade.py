@@ -21,7 +21,7 @@ from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.scene.presets import PROFILES, profile_for
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.studies.study import COLOURS, FEWEST_RUNS, Answer, Study, TooFewRuns
+from remodel_fenicsx.studies.study import COLOURS, FEWEST_RUNS, StudyResult, Study, TooFewRuns
 from remodel_fenicsx.system.files import make_own_folder, write_whole
 
 log = logging.getLogger(__name__)
@@ -152,7 +152,7 @@ class Row(NamedTuple):
     on_front: bool = False
 
 
-def typical(values: Array) -> float:
+def nanrms(values: Array) -> float:
     """Root mean square of what is known."""
     return float(np.sqrt(np.nanmean(values**2)))
 
@@ -179,8 +179,8 @@ def _row(result: Result, finest: Result) -> Row:
     if result is finest:
         return Row(setting, np.nan, np.nan, result.seconds, "the others are compared with it")
     apart = result.angles - finest.angles  # seed by seed: steps are compared on the same cells
-    noise = typical(np.std(apart, axis=0, ddof=1)) / seeds**0.5 if seeds > 1 else 0.0
-    error, ratio = typical(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
+    noise = nanrms(np.std(apart, axis=0, ddof=1)) / seeds**0.5 if seeds > 1 else 0.0
+    error, ratio = nanrms(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
     sizes = {"steps": (setting.step, finest.setting.step)}
     if not KINEMATICS[setting.scene.model.kinematics].homogeneous:
         sizes["elements"] = setting.element, finest.setting.element
@@ -201,7 +201,7 @@ def trade(
 ) -> tuple[Path, Trade]:
     """Run a scene with a ladder of settings, within a budget of seconds, and compare each with the finest."""
     study = _TradeStudy(scene, folder, budget, jobs, quiet)
-    return study.answered(study.answer)
+    return study.run_and_write(study.answer)
 
 
 class _TradeStudy(Study):
@@ -231,7 +231,7 @@ class _TradeStudy(Study):
         notes = [f"left out, over the budget: {names}"] if names else []
         return Trade(self.scene, compared([*self._results.values()]), notes, self.failed)
 
-    def learn(self) -> None:
+    def update(self) -> None:
         """Read what is new."""
         for setting in self.left:
             runs = [run for run in self.runs if self.settings[run.name] is setting]
@@ -257,7 +257,7 @@ WANTED = 1.0  # degrees of error, which the verdict asks for: less than what ran
 
 
 @dataclass(frozen=True)
-class Trade(Answer):
+class Trade(StudyResult):
     """The table."""
 
     scene: Scene

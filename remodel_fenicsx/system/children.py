@@ -72,7 +72,7 @@ class Worker:
         """Whether the worker accepts another command."""
         return self.process.poll() is None
 
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """Return the last line of the command's output, or the signal that killed the process."""
         code = self.process.poll()
         if code is not None and code < 0:

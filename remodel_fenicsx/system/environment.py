@@ -19,7 +19,7 @@ from pathlib import Path
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, RemodelError
 from remodel_fenicsx.system.files import read_regular, refusal_in_words
-from remodel_fenicsx.system.interrupts import take_back_signals
+from remodel_fenicsx.system.interrupts import restore_signal_handlers
 
 OLDEST_DOLFINX = (0, 9)
 KERNELS = "REMODEL_FENICSX_KERNELS"  # kernels at the points: C, or numpy for a debugger
@@ -61,7 +61,7 @@ def versions() -> dict[str, str]:
         "MPI": MPI.Get_library_version().split(",")[0].strip(),
         "BLAS": blas_library(),
         "system": platform.platform(),
-    } | extensions()
+    } | extension_hashes()
 
 
 def kernels() -> str:
@@ -81,7 +81,7 @@ def gmsh_version() -> str:
     return re.findall(r'^GMSH_API_VERSION = "(.+)"$', head, re.MULTILINE)[0]
 
 
-def reason_unusable() -> str | None:
+def environment_problem() -> str | None:
     """Return why this environment cannot run a scene, or None."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
@@ -89,7 +89,7 @@ def reason_unusable() -> str | None:
     if not any(shutil.which(name) for name in (os.environ.get("CC", "cc").split()[0], "gcc", "clang")):
         return "there is no C compiler"
     try:
-        take_back_signals()
+        restore_signal_handlers()
         import dolfinx
         import numpy
         from mpi4py import MPI
@@ -110,7 +110,7 @@ def reason_unusable() -> str | None:
     return None
 
 
-def reason_undrawable() -> str | None:
+def drawing_problem() -> str | None:
     """Return why this environment cannot draw, or None."""
     missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
     return f"no {missing[0]}" if missing else None
@@ -187,7 +187,7 @@ def blamed(error: BaseException) -> str:
     return ""
 
 
-def extensions() -> dict[str, str]:
+def extension_hashes() -> dict[str, str]:
     """Return the hashes of the loaded extensions by name."""
     return {name: found for name, (_, found) in _loaded.items()}
 

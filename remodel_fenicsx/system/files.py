@@ -23,7 +23,7 @@ from remodel_fenicsx.errors import RemodelError
 #  Scenes and run folders are passed around. Opening a pipe would block, and reading a device would
 # never end. A link (symbolic, or a second name of one file) would lead writes out of the folder.
 
-NEVER_WAITING = os.O_NONBLOCK | os.O_CLOEXEC  # Opening a pipe without a writer would block.
+NON_BLOCKING = os.O_NONBLOCK | os.O_CLOEXEC  # Opening a pipe without a writer would block.
 
 NO_FILE = "is a pipe or a device, not a file"
 LINK = "is a link; nothing is written through one"
@@ -97,7 +97,7 @@ def numbered(path: Path) -> Iterator[Path]:
         yield path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
-def part_of(path: Path) -> Path:
+def partial_path(path: Path) -> Path:
     """Return the temporary name of a file that is being written."""
     return path.with_name(f"{path.name}.part")
 
@@ -122,7 +122,7 @@ def write_new(path: Path, data: bytes) -> None:
 @contextmanager
 def _written_beside(path: Path, data: bytes) -> Iterator[Path]:
     """Write and sync a temporary file, yield it, then remove it and sync the folder."""
-    part = part_of(path)
+    part = partial_path(path)
     part.unlink(missing_ok=True)  # left by a killed run
     try:
         with open(open_own(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
@@ -142,7 +142,7 @@ def _written_beside(path: Path, data: bytes) -> Iterator[Path]:
 def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
     """Open a regular file without blocking; return its descriptor and status."""
     try:
-        descriptor = os.open(path, flags | NEVER_WAITING, 0o666)
+        descriptor = os.open(path, flags | NON_BLOCKING, 0o666)
     except ValueError as error:  # A name with a NUL, or not in UTF-8.
         raise ForeignFileError(errno.EINVAL, f"is not a file name: {error}", ascii(str(path))) from None
     except OSError as error:
@@ -194,7 +194,7 @@ def positive(text: str) -> int:
     return number
 
 
-def typed() -> str:
+def command_name() -> str:
     """Return the command name for messages: with the launcher, if it provides the command."""
     launcher = Path(__file__).resolve().parents[2] / "with-fenicsx"
     found = shutil.which("remodel-fenicsx")

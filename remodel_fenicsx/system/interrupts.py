@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 from remodel_fenicsx.errors import PAUSED, RemodelError
-from remodel_fenicsx.system.files import typed
+from remodel_fenicsx.system.files import command_name
 
 # requests to end a process
 SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -64,11 +64,11 @@ class Paused(RemodelError):  # noqa: N818 - no error: a user has stopped the run
 
     def in_words(self) -> str:
         """Describe why and when the run stopped, and the command that resumes it."""
-        way = f"{typed()} run --resume {shlex.quote(str(self.folder))}"
+        way = f"{command_name()} run --resume {shlex.quote(str(self.folder))}"
         return f"{self} at time {self.time:g}; all steps are saved. Resume: {way}"
 
 
-def take_back_signals() -> None:
+def restore_signal_handlers() -> None:
     """Import MPI and PETSc, then restore Python's signal handlers."""
     # The libraries' threads inherit the mask, so that they never receive a signal.
     with blocked(*SIGNALS, PAUSE):
@@ -152,7 +152,7 @@ def end_all_ranks_on_exception() -> None:
 
     Otherwise the remaining ranks would wait forever. (``python3 -m mpi4py`` does not suffice with
     PETSc, whose finalisation is collective and comes first.) On one rank the function only restores
-    Python's signal handlers, which PETSc replaces (`take_back_signals`).
+    Python's signal handlers, which PETSc replaces (`restore_signal_handlers`).
 
     Notes
     -----
@@ -165,7 +165,7 @@ def end_all_ranks_on_exception() -> None:
     """
     from mpi4py import MPI
 
-    take_back_signals()
+    restore_signal_handlers()
     if MPI.COMM_WORLD.size > 1:
         sys.excepthook = _print_and_abort
 
@@ -181,7 +181,7 @@ def _print_and_abort(kind: type[BaseException], error: BaseException, trace: Tra
 # ---------------------------------------------------------------- before a run has results
 
 
-def ending_at_once() -> AbstractContextManager[None]:
+def exit_on_signal() -> AbstractContextManager[None]:
     """End the process on a signal with one line, unless a `StopRequest` handles the signal."""
     nobody = (signal.SIG_DFL, signal.default_int_handler)
     return handled(_end, (*SIGNALS, PAUSE), lambda handler: handler in nobody)
@@ -234,7 +234,7 @@ _requests: list[StopRequest] = []  # active contexts; the last one receives the 
 
 
 @contextmanager
-def stopping_at_once() -> Iterator[None]:
+def raise_on_signal() -> Iterator[None]:
     """Raise Interrupted as soon as a signal arrives while the block runs."""
     if not _requests:
         yield

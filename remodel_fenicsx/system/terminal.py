@@ -122,10 +122,10 @@ def announce(line: str) -> None:
 
 
 @contextmanager
-def hold_log(comm_rank: int = 0, *, quiet: bool = True) -> Iterator[list[logging.LogRecord]]:
+def buffer_log(comm_rank: int = 0, *, quiet: bool = True) -> Iterator[list[logging.LogRecord]]:
     """Buffer log records until the run has a folder (`open_log`); show terminal lines directly."""
     early = MemoryHandler(sys.maxsize, flushLevel=sys.maxsize, flushOnClose=False)
-    with _logged_to([early, _Screen(quiet)], comm_rank):
+    with _logged_to([early, _StderrHandler(quiet)], comm_rank):
         yield early.buffer
 
 
@@ -142,7 +142,7 @@ def open_log(
     if comm_rank == 0:
         file = _LogFile(path, encoding="utf-8")
         file.setFormatter(logging.Formatter(LOG_FORMAT))
-        handlers = [file, _Screen(quiet)]
+        handlers = [file, _StderrHandler(quiet)]
         for record in held:
             file.handle(record)
     with _logged_to(handlers, comm_rank) as logger:
@@ -190,7 +190,7 @@ class _LogFile(logging.FileHandler):
         raise
 
 
-class _Screen(logging.Handler):
+class _StderrHandler(logging.Handler):
     """Handler for the present stderr: while a bar is shown, rich's stream prints above it."""
 
     def __init__(self, quiet: bool):
@@ -212,7 +212,7 @@ def duration(seconds: float) -> str:
 
 
 @contextmanager
-def unsaid() -> Iterator[None]:
+def muted_warnings() -> Iterator[None]:
     """Mute warnings of intermediate runs; the final run repeats them."""
     package = logging.getLogger(LOGGER)
     before = package.level

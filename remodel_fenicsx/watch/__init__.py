@@ -66,13 +66,13 @@ class WatcherKind:
 _WARNINGS = "remodel_fenicsx.watch.warnings:"
 
 WATCHERS = {
-    "over-correction": WatcherKind("remodel_fenicsx.watch.over_correction:OverCorrection.of"),
-    "locking": WatcherKind(_WARNINGS + "LockingWarning.of", each_case=True),
-    "buckling": WatcherKind("remodel_fenicsx.watch.stability:BucklingWarning.of", each_case=True),
-    "volume": WatcherKind(_WARNINGS + "VolumeLoss.of", each_case=True),
-    "pressure-noise": WatcherKind(_WARNINGS + "PressureNoise.of"),
-    "weak-tension": WatcherKind(_WARNINGS + "WeakTension.of"),
-    "radial-chains": WatcherKind(_WARNINGS + "RadialChains.of"),
-    "fronts": WatcherKind(_WARNINGS + "FrontsInLayers.of"),
+    "over-correction": WatcherKind("remodel_fenicsx.watch.over_correction:OverCorrection.for_scene"),
+    "locking": WatcherKind(_WARNINGS + "LockingWarning.for_scene", each_case=True),
+    "buckling": WatcherKind("remodel_fenicsx.watch.stability:BucklingWarning.for_scene", each_case=True),
+    "volume": WatcherKind(_WARNINGS + "VolumeLoss.for_scene", each_case=True),
+    "pressure-noise": WatcherKind(_WARNINGS + "PressureNoise.for_scene"),
+    "weak-tension": WatcherKind(_WARNINGS + "WeakTension.for_scene"),
+    "radial-chains": WatcherKind(_WARNINGS + "RadialChains.for_scene"),
+    "fronts": WatcherKind(_WARNINGS + "FrontsInLayers.for_scene"),
 }
 """Watchers by name, in the order in which they see a step."""

@@ -10,9 +10,9 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
-from remodel_fenicsx.fem.assembly import over_ranks
+from remodel_fenicsx.fem.assembly import allreduce
 from remodel_fenicsx.model.tensors import Array, to_mandel
-from remodel_fenicsx.state import Earlier
+from remodel_fenicsx.state import FieldHistory
 
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
@@ -33,7 +33,7 @@ TOLD_SIZE = 0.02
 RESTED_SHARE = 0.5
 # Largest ratio of two steps of similar size. A jump looks like an oscillation if the steps differ
 # more.
-UNEVEN = 1.5
+MAX_STEP_RATIO = 1.5
 LOAD_JUMP = 1e-3  # largest oscillation of a load, relative to the load
 # RMS over the body of the change of A in one pass after a delay, over r0^2, above which a run
 # warns.
@@ -49,7 +49,7 @@ def _difference(times: Array, values: Array) -> Array:
     return np.tensordot(GAIN * weights / np.abs(weights).sum(), values[: ORDER + 1], 1)
 
 
-class Swing(NamedTuple):
+class Oscillation(NamedTuple):
     """Oscillation from pass to pass: its size, and the factor of the last pass."""
 
     size: float
@@ -64,15 +64,15 @@ class OverCorrection(WarnsOnce):
 
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
-        self.swings: dict[str, Swing] = {}
+        self.swings: dict[str, Oscillation] = {}
         # Histories of previous passes, including the newest one.
         cells = partial(self.quadrature.function, "", (6,))
-        self._cells = Earlier(self.state, "over_correction_cells", cells, ORDER + 1)
-        self._body = Earlier(self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1)
-        self.rested = RestedCells(stepper) if stepper.remodeling.law.of_absolute_time else None
+        self._cells = FieldHistory(self.state, "over_correction_cells", cells, ORDER + 1)
+        self._body = FieldHistory(self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1)
+        self.rested = ReactivatedCells(stepper) if stepper.remodeling.law.depends_on_absolute_time else None
 
     @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> OverCorrection | None:
+    def for_scene(cls, scene: Scene, stepper: Stepper) -> OverCorrection | None:
         return cls(stepper) if stepper.remodeling.law.remodels and not scene.time.is_equilibrium else None
 
     def started(self, step: Step) -> None:
@@ -107,14 +107,14 @@ class OverCorrection(WarnsOnce):
         of_body /= dolfinx.la.norm(self.state.unknown.x) or 1.0
         cells_swing, body_swing = self._swing(times, of_cells), self._swing(times, of_body)
         self.swings = {"growing": cells_swing, "sustained": body_swing}
-        tells, found = self._tells(step, cells, times), False
+        tells, found = self._is_pass_oscillation(step, cells, times), False
         for (name, swing), (factor, passes) in zip(self.swings.items(), (GROWING, SUSTAINED), strict=True):
             self._numbers[name] = self._numbers[name] + 1 if tells and swing.factor < factor else 0
             after_one_more = swing.size * abs(swing.factor)
             found |= self._numbers[name] >= passes and after_one_more >= TOLD_SIZE
-        if found and not self.said:
+        if found and not self.is_reported:
             most = quadrature.shown_place_of_largest(np.linalg.norm(_difference(times, cells), axis=-1))
-            self.find(
+            self.emit(
                 step,
                 "the remodeling pass overshoots: the cells oscillate from pass to pass. "
                 f"The structure tensor A changes by {cells_swing.size:.2g} r0^2 (RMS; maximum at "
@@ -124,20 +124,20 @@ class OverCorrection(WarnsOnce):
                 "(docs/theory.md, Stability of the pass)",
             )
 
-    def _swing(self, times: Array, values: Array) -> Swing:
+    def _swing(self, times: Array, values: Array) -> Oscillation:
         """Return the oscillation of this rank's values (passes, n), in their norm. Collective."""
         changes = np.array([_difference(times, values), _difference(times[1:], values[1:])])
-        products = over_ranks(self.state.comm, changes @ changes.T, MPI.SUM)
-        return Swing(np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf))
+        products = allreduce(self.state.comm, changes @ changes.T, MPI.SUM)
+        return Oscillation(np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf))
 
-    def _tells(self, step: Step, cells: Array, times: Array) -> bool:
+    def _is_pass_oscillation(self, step: Step, cells: Array, times: Array) -> bool:
         """Return whether passes oscillate, not loads, unequal steps or delays. Collective."""
         # At time 0 there are no loads.
         loads = np.array([[*self.stepper.load_values(time).values()] for time in times]) * (times[:, None] > 0)
         lengths, rested = -np.diff(times), (cells[:-1] == cells[1:]).all(axis=-1).astype(np.float64)
         return bool(
             np.all(np.abs(_difference(times, loads)) <= LOAD_JUMP * GAIN * np.abs(loads[0]))
-            and lengths.max() <= UNEVEN * lengths.min()
+            and lengths.max() <= MAX_STEP_RATIO * lengths.min()
             and max(map(self.quadrature.mean, rested)) <= RESTED_SHARE
         )
 
@@ -150,7 +150,7 @@ class OverCorrection(WarnsOnce):
         return f'remodeling.coupling = "relaxed" with a relaxation_factor below {min(stable, share):.2g}'
 
 
-class RestedCells(WarnsOnce):
+class ReactivatedCells(WarnsOnce):
     """Warning that cells make up in one pass for a phase without tension."""
 
     name = "rested_cells"
@@ -158,7 +158,7 @@ class RestedCells(WarnsOnce):
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
         # Number of passes at each point since its cell has changed; 0 before its first change.
-        self._rest = Earlier(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
+        self._rest = FieldHistory(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
 
     def forget(self) -> None:
         """Reset the record of all passes."""
@@ -171,7 +171,7 @@ class RestedCells(WarnsOnce):
         rest = np.reshape(self._rest.values, (self._rest.known, *now.shape)).sum(axis=0)
         self._rest.push(np.where(now, 1.0, rest + (rest > 0)).ravel())
         # A phase without loads is due to the loads, not to the steps.
-        if self.said or not any(self.stepper.load_values(time_before).values()):
+        if self.is_reported or not any(self.stepper.load_values(time_before).values()):
             return
         # |change of A|^2 at the points that make up a delay.
         squares = np.where(now & (rest > 1), np.square(changes).sum(axis=-1), 0.0)
@@ -179,7 +179,7 @@ class RestedCells(WarnsOnce):
         if (change := np.sqrt(self.quadrature.mean(squares)) / r0**2) < RESUMED_CHANGE:
             return
         share = self.quadrature.mean((squares > 0).astype(float))
-        self.find(
+        self.emit(
             step,
             "cells resume remodeling after a phase without tension; an absolute-time law makes up "
             f"the delay in one pass. In {100 * share:.2g} % of the body the structure tensor A "

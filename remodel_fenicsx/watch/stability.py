@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.reductions import Strut
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, WarnsOnce, Watcher
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, of_the_unloaded_body
-from remodel_fenicsx.solver.linear import uneven
-from remodel_fenicsx.state import Earlier, Numbers
+from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, inertia_without_loads
+from remodel_fenicsx.solver.linear import fill_asymmetric
+from remodel_fenicsx.state import FieldHistory, StateNumbers
 
 if TYPE_CHECKING:
     from petsc4py import PETSc
@@ -42,10 +42,10 @@ class EquilibriumStability(Watcher):
         self.stepper, self.state = stepper, stepper.state
         self.stops, self.every_step = unstable == "stop", every_step or unstable == "stop"
         self.inertia = Inertia(stepper.coupling.equilibrium)
-        self._vector = Earlier(self.state, "stability_vector", self.state.unknown.copy, 1)
+        self._vector = FieldHistory(self.state, "stability_vector", self.state.unknown.copy, 1)
         self.unknowns = int(self.state.comm.allreduce(self.state.number_of_owned_unknowns))
         # The last number of negative eigenvalues, and Newton iterations since the last count.
-        self._numbers = Numbers(self.state, "stability", {"known": 0, "iterations": 0})
+        self._numbers = StateNumbers(self.state, "stability", {"known": 0, "iterations": 0})
 
     def close(self) -> None:
         """Free PETSc's objects."""
@@ -69,7 +69,7 @@ class EquilibriumStability(Watcher):
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
             overdue = False
             if step.is_last:
-                self._say(
+                self._log(
                     logging.INFO,
                     f"the stability of equilibria was not checked: with {self.unknowns} unknowns "
                     "that is done only on request, by the column negative_eigenvalues or "
@@ -90,32 +90,32 @@ class EquilibriumStability(Watcher):
         try:
             return self.inertia.negative_eigenvalues()
         except FactorisationFailed as failure:
-            self._say(logging.WARNING, f"the stability of the equilibrium is not known: {failure}")
+            self._log(logging.WARNING, f"the stability of the equilibrium is not known: {failure}")
             return float("nan")
 
     def _judge(self, step: Step, before: int, now: int) -> None:
         if now < before:
-            self._say(logging.INFO, f"{step.moment}: {eigenvalues(now)} of the tangent, {before} before")
+            self._log(logging.INFO, f"{step.label}: {eigenvalues(now)} of the tangent, {before} before")
             return
         unloaded, scale = self._unloaded
         if now <= unloaded:
-            self._say(
+            self._log(
                 logging.INFO,
-                f"{step.moment}: {eigenvalues(now)} of the tangent. The unloaded body has "
+                f"{step.label}: {eigenvalues(now)} of the tangent. The unloaded body has "
                 f"{unloaded}, from the stress of its initial cells: the equilibrium is not lost",
             )
             return
         text = f"{eigenvalues(now)} of the tangent (before: {before}); " f"{described(self.inertia.lowest(), scale)}"
         if self.stops:
-            raise StepFailure(step.time, f"the equilibrium at {step.moment} is unstable: {text}", UNSTABLE)
-        unstable = f"{step.moment}: unstable equilibrium: {text}. A perturbed body would leave this state"
-        self._say(logging.WARNING, unstable)
+            raise StepFailure(step.time, f"the equilibrium at {step.label} is unstable: {text}", UNSTABLE)
+        unstable = f"{step.label}: unstable equilibrium: {text}. A perturbed body would leave this state"
+        self._log(logging.WARNING, unstable)
 
     @cached_property
     def _unloaded(self) -> tuple[int, float]:
-        return of_the_unloaded_body(self.inertia)
+        return inertia_without_loads(self.inertia)
 
-    def _say(self, level: int, text: str) -> None:
+    def _log(self, level: int, text: str) -> None:
         if self.state.comm.rank == 0:
             log.log(level, "%s", text)
 
@@ -124,7 +124,7 @@ class EquilibriumStability(Watcher):
         vector, image = factorisation.getOperators()[0].createVecs()
         first = not self._vector.known
         if first:
-            uneven(vector)
+            fill_asymmetric(vector)
             free = np.isnan(self.inertia.equilibrium.prescribed_values()[: vector.getLocalSize()])
             vector.array[:] *= free  # prescribed unknowns have an eigenvalue of one
         else:
@@ -180,11 +180,11 @@ class BucklingWarning(WarnsOnce):
         self._directions = strut.directions(self._places)
 
     @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> BucklingWarning | None:
+    def for_scene(cls, scene: Scene, stepper: Stepper) -> BucklingWarning | None:
         strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
         return None if strut is None else cls(stepper, strut)  # full kinematics show buckling
 
-    def look(self, step: Step | None = None) -> str:
+    def check(self, step: Step | None = None) -> str:
         """Compare the present thrust with Euler's load. Collective."""
         share = self.thrust() / self.euler_load()
         if not share > WARNED_LOAD:

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 # Missing fraction of the displacement above which a run warns. docs/what_may_go_wrong.md has the
 # estimate and its error. The paper's bodies have at most 3.6 % (artery with random cells, t = 5).
-WARNED_SHARE = 0.05
+MAX_MISSING_FRACTION = 0.05
 # Work over the energy of the matrix. With less work the cells deform the body, not the loads.
 # Elastic tubes have at least 0.93 (up to 0.9 of the pressure that bursts them), the paper's bodies
 # 1.4.
@@ -39,7 +39,7 @@ JUMPS = 4.0
 # the matrix's energy. By the tangent it is 1.6 to 3.3 (tubes, elongation 0.1, lambda/mu 8.8 to
 # 250).
 HELD_BACK = 2.5
-TURNED_BY_NOISE = 2.0
+MAX_NOISE_ROTATION_DEGREES = 2.0
 """Angle in degrees between principal tensions with and without pressure noise, above which a run
 warns. Of 150 random tubes with lambda/mu from 50 to 10,000 (benchmarks/fuzz.py) 108 had errors of 1
 degree in angles or 0.5 % in radii. All of these had 2.4 degrees or more; 5 of the remaining tubes
@@ -50,7 +50,7 @@ REMEDY = f"set mesh.element = 'hexahedron' and mesh.formulation = {NOT_LOCKING!r
 
 def remedy(scene: Scene) -> str:
     """Return a remedy for locking elements as text, with the scene's keys."""
-    if needs := scene.needs_all_points():
+    if needs := scene.displacement_reason():
         return (
             "set mesh.degree = 2 or a larger mesh.refinement, "
             f"because {needs} needs mesh.formulation = 'displacement'"
@@ -58,7 +58,7 @@ def remedy(scene: Scene) -> str:
     return REMEDY
 
 
-class Missing(NamedTuple):
+class MissingDeformation(NamedTuple):
     """Missing fraction of the deformation, by changes of volume and of shape inside elements."""
 
     volume: float
@@ -85,22 +85,26 @@ class LockingWarning(ElementWarning):
         self.locks = locks
 
     @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> LockingWarning | None:
+    def for_scene(cls, scene: Scene, stepper: Stepper) -> LockingWarning | None:
         if stepper.state.kinematics.homogeneous:  # uniform strain has no spurious stiffness
             return None
         return cls(stepper, FORMULATIONS[scene.mesh.formulation].locks, remedy(scene))
 
-    def missing(self) -> Missing:
+    def missing_deformation(self) -> MissingDeformation:
         """Return the missing deformation; zero if only the cells deform the body. Collective."""
         energy, volume, shape = self.energies()
         work, free_work = self.work()
-        driven = Missing(volume / work, shape / work) if work > DRIVEN * energy > 0 else Missing(0.0, 0.0)
+        driven = (
+            MissingDeformation(volume / work, shape / work)
+            if work > DRIVEN * energy > 0
+            else MissingDeformation(0.0, 0.0)
+        )
         if not max(free_work, 0.0) + self._energy_of_elongation() > DRIVEN * energy > 0:
             return driven
         # The work of a prescribed elongation hides that of the motion across, which is
         # underestimated.
         across = min(HELD_BACK * volume / energy, volume / free_work if free_work > 0 else np.inf)
-        return max(driven, Missing(across, 0.0), key=sum)
+        return max(driven, MissingDeformation(across, 0.0), key=sum)
 
     def _energy_of_elongation(self) -> float:
         """Return the energy 3/2 mu e^2 of a prescribed isochoric elongation. Collective."""
@@ -110,12 +114,12 @@ class LockingWarning(ElementWarning):
     def energies(self) -> tuple[float, float, float]:
         """Return energies: with mean J per element, of varying J, twice varying F. Collective."""
         quadrature, (stiffness, shear) = self.quadrature, self.stiffnesses
-        look = self.stepper.coupling.equilibrium.look()
+        look = self.stepper.coupling.equilibrium.evaluate()
         logarithm, F = np.log(look.jacobians), look.gradients.reshape(*stiffness.shape, 9)
-        inside = quadrature.beyond(0, logarithm[..., None])[..., 0]
+        inside = quadrature.polynomial_residual(0, logarithm[..., None])[..., 0]
         matrix = stiffness * (logarithm - inside) ** 2 + shear * (np.square(F).sum(axis=-1) - 3 - 2 * logarithm)
         volume = stiffness * np.square(inside) * self.locks
-        shape = 2 * shear * np.square(quadrature.beyond(quadrature.element_degree - 1, F)).sum(axis=-1)
+        shape = 2 * shear * np.square(quadrature.polynomial_residual(quadrature.element_degree - 1, F)).sum(axis=-1)
         shape *= self._followed(shape, F)[:, None]
         weights = quadrature.owned(quadrature.volumes) / 2
         local = np.array([float((part * weights).sum()) for part in (matrix, volume, shape)])
@@ -150,12 +154,12 @@ class LockingWarning(ElementWarning):
         whole, of_forces = state.comm.allreduce(local).tolist()
         return whole / 2, of_forces / 2
 
-    def look(self, step: Step) -> str:
+    def check(self, step: Step) -> str:
         """Return a warning if too much of the deformation is missing. Collective."""
-        missing = self.missing()
-        return self.in_words(missing) if sum(missing) > WARNED_SHARE else ""
+        missing = self.missing_deformation()
+        return self.in_words(missing) if sum(missing) > MAX_MISSING_FRACTION else ""
 
-    def in_words(self, missing: Missing) -> str:
+    def in_words(self, missing: MissingDeformation) -> str:
         """Return cause, size and remedy of the missing deformation as text."""
         lacks = f"displacements too small by about {100 * min(sum(missing), 1.0):.2g} %"
         if missing.volume >= missing.shape:
@@ -175,7 +179,7 @@ class PressureNoise(ElementWarning):
     name = "pressure_noise"
 
     @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> PressureNoise | None:
+    def for_scene(cls, scene: Scene, stepper: Stepper) -> PressureNoise | None:
         remodeling, locks = stepper.remodeling, FORMULATIONS[scene.mesh.formulation].locks
         turns = remodeling.law.remodels and remodeling.driver.is_stress and not stepper.state.kinematics.homogeneous
         return cls(stepper, remedy(scene)) if locks and turns else None
@@ -186,7 +190,9 @@ class PressureNoise(ElementWarning):
         F, tensor = (values[: stiffness.size] for values in self.stepper.remodeling.driving_tensor())
         J = np.linalg.det(F)
         logarithm = np.log(J).reshape(stiffness.shape)
-        noise = quadrature.beyond(quadrature.element_degree - 1, (stiffness * logarithm)[..., None]).reshape(-1, 1, 1)
+        noise = quadrature.polynomial_residual(
+            quadrature.element_degree - 1, (stiffness * logarithm)[..., None]
+        ).reshape(-1, 1, 1)
         if self.stepper.remodeling.driver.material:
             quiet = tensor - noise * np.linalg.inv(F.swapaxes(1, 2) @ F)
         else:
@@ -198,9 +204,9 @@ class PressureNoise(ElementWarning):
         turned = np.degrees(np.arccos(np.clip(cosine / np.where(lengths > 0, lengths, 1.0), -1.0, 1.0)))
         return quadrature.integral(turned.reshape(stiffness.shape)) / quadrature.volume
 
-    def look(self, step: Step) -> str:
+    def check(self, step: Step) -> str:
         """Return a warning if the mean angle is large. Collective."""
-        if self.ratio <= min(STIFF_BULK.values()) or (turned := self.degrees()) <= TURNED_BY_NOISE:
+        if self.ratio <= min(STIFF_BULK.values()) or (turned := self.degrees()) <= MAX_NOISE_ROTATION_DEGREES:
             return ""
         return (
             f"pressure oscillations change the principal tensions by {turned:.2g} degrees on "
@@ -215,11 +221,11 @@ class PressureNoise(ElementWarning):
 
 # Soft tissues were measured to lose a few per cent of their volume at most; more is due to lambda.
 # The paper's tendon and artery, lambda/mu = 8.8, keep J above 0.92 at every point.
-NOTED = 0.05  # mean loss of volume that the log reports at the end
+REPORTED_VOLUME_LOSS = 0.05  # mean loss of volume that the log reports at the end
 MEAN_LOSS, LEAST_JACOBIAN = 0.2, 0.6  # mean loss and smallest J that are probably not intended
 # Relative threshold of tensions above which a run warns. In the paper's tube with the law "tensor"
 # angles had errors of 0.02 degrees at 0.014, 1.2 at 0.14 and 12 at 1.4.
-WEAK = 0.05
+WARNED_THRESHOLD = 0.05
 RADIAL_SHARE = 0.5  # fraction of chains out of the wall above which the log reports it
 # Degrees between two points of an element at a front, and the fraction of a layer that such
 # elements make up. In the paper's artery angles inside elements differ by up to 14 degrees.
@@ -236,13 +242,13 @@ class VolumeLoss(WarnsOnce):
         """Update the largest loss of volume, also after the warning. Collective."""
         self._measure(step)
         numbers = self._numbers
-        if not self.said and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
-            self.find(step, f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
-        elif step.is_last and 1 - numbers["mean"] >= NOTED:
+        if not self.is_reported and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
+            self.emit(step, f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
+        elif step.is_last and 1 - numbers["mean"] >= REPORTED_VOLUME_LOSS:
             step.findings.append((logging.INFO, self._in_words()))
 
     def _measure(self, step: Step) -> None:
-        numbers, jacobians = self._numbers, self.stepper.coupling.equilibrium.look().jacobians
+        numbers, jacobians = self._numbers, self.stepper.coupling.equilibrium.evaluate().jacobians
         mean = self.quadrature.integral(jacobians) / self.quadrature.volume
         if mean < numbers["mean"]:
             numbers["mean"], numbers["mean_time"] = mean, step.time
@@ -252,7 +258,7 @@ class VolumeLoss(WarnsOnce):
         least = self.quadrature.minimum(jacobians)
         if least < numbers["least"]:
             numbers["least"], numbers["least_time"] = least, step.time
-            for name, value in zip("xyz", self.quadrature.place_of_largest(-jacobians), strict=True):
+            for name, value in zip("xyz", self.quadrature.argmax_position(-jacobians), strict=True):
                 numbers[name] = value
 
     def _in_words(self) -> str:
@@ -271,8 +277,12 @@ class WeakTension(WarnsOnce):
 
     def completed(self, step: Step) -> None:
         """Check the threshold of tensions after the last pass. Collective."""
-        if step.is_last and not self.said and (weakness := self.stepper.remodeling.weakness()) > WEAK:
-            self.find(
+        if (
+            step.is_last
+            and not self.is_reported
+            and (weakness := self.stepper.remodeling.relative_switch_threshold()) > WARNED_THRESHOLD
+        ):
+            self.emit(
                 step,
                 f"loads too small: stresses near the rounding threshold ({weakness:.2g} of the "
                 "largest stress) remodel at half speed or less, so the cells reorient too slowly. "
@@ -288,7 +298,7 @@ class ShapeWarning(WarnsOnce):
         self.shape = shape
 
     @classmethod
-    def of(cls, scene: Scene, stepper: Stepper) -> ShapeWarning | None:
+    def for_scene(cls, scene: Scene, stepper: Stepper) -> ShapeWarning | None:
         return cls(stepper, scene.geometry)
 
 
@@ -297,7 +307,7 @@ class RadialChains(ShapeWarning):
 
     name, level = "radial_chains", NOTICE
 
-    def look(self, step: Step) -> str:
+    def check(self, step: Step) -> str:
         """Return a report if the fraction is large. Collective."""
         cells = self.state.cells
         share = self.quadrature.mean(
@@ -319,7 +329,7 @@ class FrontsInLayers(ShapeWarning):
     def due(self, step: Step) -> bool:
         return step.is_last
 
-    def look(self, step: Step) -> str:
+    def check(self, step: Step) -> str:
         """Return a warning for layers with a front in most elements. Collective."""
         cells, quadrature = self.state.cells, self.quadrature
         if not self.shape.angle_layers:
@@ -333,7 +343,7 @@ class FrontsInLayers(ShapeWarning):
         jump = "is a mean over elements in which the angle jumps from"
         for name, depth in self.shape.angle_layers.items():
             layer = (depths.min(axis=1) <= depth + 1e-6) & (depths.max(axis=1) >= depth - 1e-6)
-            share = quadrature.mean_of_known(np.repeat(has_front[:, None] * 1.0, quadrature.shape[1], axis=1), layer)
+            share = quadrature.nanmean(np.repeat(has_front[:, None] * 1.0, quadrature.shape[1], axis=1), layer)
             if share > FRONT_SHARE:
                 inside = (layer & has_front)[:, None]
                 low = quadrature.minimum(np.where(inside, least[:, None], np.inf))

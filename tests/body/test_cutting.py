@@ -16,7 +16,7 @@ import pytest
 from remodel_fenicsx import Scene, SceneError, preset_scene
 from remodel_fenicsx.extend import MATRICES, UnitCell, neo_hookean
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.residual_stress import Closing, Layer, Loads, Rings, closing, cut, principal_stresses
+from remodel_fenicsx.model.residual_stress import ClosedRing, Layer, Loads, Rings, close_ring, cut, principal_stresses
 from tests.runs import last_row, made
 
 
@@ -37,7 +37,7 @@ RADII = (1.0, 3.0)
 EDGES = np.linspace(*RADII, 17)
 
 
-def rings(closed: Closing, squared: Any) -> Rings:
+def rings(closed: ClosedRing, squared: Any) -> Rings:
     """Three in each of sixteen elements, of cells that depend on the share of the wall."""
     places, weights = np.polynomial.legendre.leggauss(3)
     radius = (EDGES[:-1, None] + np.diff(EDGES)[:, None] * (places + 1) / 2).ravel()
@@ -54,7 +54,7 @@ def isotropic(tissue: Tissue) -> Any:
 def test_what_was_closed_opens_again(opening_angle: float) -> None:
     """From the sector's own shape, and from a ring that knows of no sector, by polynomials of its elements."""
     tissue = scene().properties()[""].tissue
-    closed = closing([Layer(RADII, tissue)], opening_angle)
+    closed = close_ring([Layer(RADII, tissue)], opening_angle)
     for known, close in ((closed, 1e-9), (None, 5e-3)):
         found = cut(tissue, rings(closed, isotropic(tissue)), EDGES, known)
         assert found == pytest.approx(opening_angle, abs=close)
@@ -118,7 +118,7 @@ def test_the_inverse_of_a_directed_matrix_is_the_unloaded_tube(directed: Scene) 
     row = last_row(directed.with_values({"mesh.refinement": 2, "output.columns": []}))
     layer = Layer((row["inner_radius"], row["outer_radius"]), directed.properties()[""].tissue)
     loads = Loads(directed.loads["pressure"].value, None, 1.0 + directed.loads["elongation"].value)
-    assert closing([layer], 0.0, loads).natural_radius(np.array(layer.radii)) == pytest.approx(RADII, abs=1e-4)
+    assert close_ring([layer], 0.0, loads).natural_radius(np.array(layer.radii)) == pytest.approx(RADII, abs=1e-4)
 
 
 def test_directions_that_do_not_follow_the_wall_are_refused(directed: Scene) -> None:
@@ -179,7 +179,7 @@ def test_the_paper_s_law_makes_hardly_any_residual_stress() -> None:
 def test_a_stiffer_inside_changes_the_cut() -> None:
     """Cells that were turned by force: the sector is in balance with the cells that are given."""
     tissue = scene().properties()[""].tissue
-    closed = closing([Layer(RADII, tissue)], 120.0)
+    closed = close_ring([Layer(RADII, tissue)], 120.0)
 
     def cells(share: Any) -> Any:
         inside = 0.9 - 0.85 * share

@@ -240,7 +240,7 @@ def test_a_column(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
             F = m.state.kinematics.deformation_gradient(m.state.unknown)
             return extend.form(ufl.det(F) * m.quadrature.dx)
 
-        return float(dolfinx.fem.assemble_scalar(m.tool("volume", compiled)))
+        return float(dolfinx.fem.assemble_scalar(m.cached("volume", compiled)))
 
     monkeypatch.setitem(
         extend.COLUMNS, "volume", extend.Column("volume", "length^3", "volume of the deformed body", volume)
@@ -355,7 +355,7 @@ def test_a_watcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     class Long(extend.WarnsOnce):
         name = "long"
 
-        def look(self, step: Any) -> str:
+        def check(self, step: Any) -> str:
             return "the cube is long" if step.row["mean_stretch"] > 1.2 else ""
 
     class Times(parts.Watcher):
@@ -365,7 +365,7 @@ def test_a_watcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         def committed(self, step: Any) -> None:
             self.seen.append(step.time)
 
-    monkeypatch.setitem(extend.WATCHERS, "long", extend.WatcherKind(Long.of))
+    monkeypatch.setitem(extend.WATCHERS, "long", extend.WatcherKind(Long.for_scene))
     times = Times()
     folder = run(scene(), tmp_path / "run", MPI.COMM_SELF, watchers=[times])
     rows = Recording(folder).history
@@ -419,7 +419,7 @@ def test_a_solver_method(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its options reach PETSc, and its class solves the systems."""
     made = []
 
-    class Watched(extend.EveryTangent):
+    class Watched(extend.FullNewton):
         def renew(self) -> None:
             super().renew()
             made.append(self)

@@ -16,7 +16,7 @@ import pytest
 from remodel_fenicsx import Scene, SceneError, Simulation, cli, read_scene, run, running
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.model.cells import structure_tensor
-from remodel_fenicsx.model.axes import cells_of, structure_tensors
+from remodel_fenicsx.model.axes import cells_from_tensors, structure_tensors
 from remodel_fenicsx.running import resume
 from tests.conftest import Cases
 from tests.results.test_export import TUBE
@@ -198,7 +198,7 @@ def test_weights_share_out_two_fibres_or_leave_the_rest_to_all_directions() -> N
 def test_cells_have_the_tensor_with_the_longest_side_first() -> None:
     axes = np.stack([local(0.3), np.eye(3)])
     tensors = structure_tensor(np.sqrt([[0.2, 0.7, 0.1], [1 / 3, 1 / 3, 1 / 3]]), axes)
-    lengths, found = cells_of(tensors, 2.0, axes)
+    lengths, found = cells_from_tensors(tensors, 2.0, axes)
     np.testing.assert_allclose(lengths[0], 2.0 * np.sqrt([0.7, 0.2, 0.1]), rtol=1e-12)
     np.testing.assert_allclose(structure_tensor(lengths, found), 4.0 * tensors, atol=1e-12)
     np.testing.assert_allclose(found[1], axes[1], atol=1e-12)  # no direction is its own: those of before

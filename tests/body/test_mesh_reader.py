@@ -58,7 +58,7 @@ def test_the_mesh_is_that_of_gmsh(tmp_path: Path, ending: str, element: str, deg
     places = [sorted_rows(file.points[file.cells].reshape(len(file.cells), -1)) for file in (one, other)]
     assert np.abs(places[0] - places[1]).max() < 1e-12
     assert jacobian_determinants(other).min() > 0 or jacobian_determinants(other).max() < 0
-    for number in mesh_file.distinct(one.facet_groups):
+    for number in mesh_file.unique_in_order(one.facet_groups):
         sides = [file.points[file.facets[file.facet_groups == number]].mean(axis=1) for file in (one, other)]
         assert np.abs(sorted_rows(sides[0].round(9)) - sorted_rows(sides[1].round(9))).max() < 1e-8
 
@@ -197,7 +197,7 @@ def test_refined_it_is_the_same_body(tmp_path: Path, element: str, refinement: i
     for name in groups:
         assert other.area(name) == pytest.approx(one.area(name), rel=1e-12)
         assert len(other.faces) == len(one.faces)
-    assert mesh_file.distinct(found.cell_groups) == mesh_file.distinct(source.cell_groups)
+    assert mesh_file.unique_in_order(found.cell_groups) == mesh_file.unique_in_order(source.cell_groups)
 
 
 def test_a_refined_run_is_nearer_to_a_finer_file(tmp_path: Path) -> None:

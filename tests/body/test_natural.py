@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, preset_scene
-from remodel_fenicsx.model.residual_stress import Closing, Layer, closing
+from remodel_fenicsx.model.residual_stress import ClosedRing, Layer, close_ring
 from remodel_fenicsx.results.columns import Measurement
 from tests.runs import last_row, made, rows_of, simulated
 
@@ -60,7 +60,7 @@ def test_the_sector_of_a_neo_hookean_tube_tends_to_the_incompressible_one() -> N
     tissue = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
     expected, errors = incompressible_radius(160.0), []
     for ratio in (100.0, 1000.0):
-        found = closing([Layer(RADII, replace(tissue, chain=None, lame_lambda=ratio, lame_mu=1.0))], 160.0)
+        found = close_ring([Layer(RADII, replace(tissue, chain=None, lame_lambda=ratio, lame_mu=1.0))], 160.0)
         errors.append(abs(float(found.natural_radius(np.array(1.0))) - expected))
     assert errors[0] < 1e-3
     assert errors[1] < 0.2 * errors[0]
@@ -73,11 +73,11 @@ def test_the_closing_of_a_thick_wall_follows_its_own_error(
     """The axial stretch: as integrated by shooting, for one, and the same with polynomials of another degree."""
     tissue = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
     layers = [Layer((1.0, ratio), tissue)]
-    found = closing(layers, angle)
+    found = close_ring(layers, angle)
     if axial is not None:
         assert found.axial == pytest.approx(axial, abs=1e-7)
     monkeypatch.setattr("remodel_fenicsx.model.residual_stress.DEGREE", 34)
-    again = closing(layers, angle)
+    again = close_ring(layers, angle)
     assert found.axial == pytest.approx(again.axial, abs=1e-7)
     places = np.geomspace(1.0, ratio, 9)
     np.testing.assert_allclose(found.natural_radius(places), again.natural_radius(places), rtol=5e-6)
@@ -208,11 +208,11 @@ def test_stretched_layers_make_a_step_of_the_angle(monkeypatch: pytest.MonkeyPat
     large = {"remodeling.coupling": "extrapolated", "time.step": 5.0}
     rested = [ends_of_layers(axial, **large) for axial in (1.05, 1.2)]
 
-    def held(of: Any, angle: float) -> Closing:
-        alone = closing([layer._replace(prestretch=(1.0, 1.0, 1.0)) for layer in of], angle)
+    def held(of: Any, angle: float) -> ClosedRing:
+        alone = close_ring([layer._replace(prestretch=(1.0, 1.0, 1.0)) for layer in of], angle)
         return alone._replace(layers=tuple(of))
 
-    monkeypatch.setattr("remodel_fenicsx.model.residual_stress.closing", held)
+    monkeypatch.setattr("remodel_fenicsx.model.residual_stress.close_ring", held)
     for axial, here, known in zip((1.05, 1.2), rested, ((19, 36), (18, 76)), strict=True):
         found = ends_of_layers(axial)
         assert found == pytest.approx(known, abs=0.6)
@@ -234,5 +234,5 @@ def test_thin_layers_close_as_far_as_rounding_lets_them() -> None:
         | {"regions": regions}
     )
     tissues = {name: properties.tissue for name, properties in of.properties().items()}
-    found = closing(of.geometry.layers_of_tissue(of.natural, of.regions, tissues), 120.0)
+    found = close_ring(of.geometry.layers_of_tissue(of.natural, of.regions, tissues), 120.0)
     assert found.stretches(np.array([1.139]))[0] == pytest.approx([0.99350, 0.99985, 1.00423], abs=1e-5)

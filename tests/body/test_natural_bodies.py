@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from remodel_fenicsx import SceneError, Simulation
 from remodel_fenicsx.body.tube import whole_tube
-from remodel_fenicsx.model.residual_stress import Layer, closing
+from remodel_fenicsx.model.residual_stress import Layer, close_ring
 from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_layers import write_layers
 from tests.body.test_natural import layers, scene
@@ -73,7 +73,7 @@ def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(two_layers:
     of = scene("radial", **{"natural.layers": layers((0.0, MEDIA))}).natural.layers[0]
     both = [type(of.prestretch)(**stretch).stretches for stretch in stretches]
     parts = [Layer((a, b), tissue, s) for a, b, s in zip(ring, ring[1:], both, strict=False)]
-    closed = closing(parts, 0.0)
+    closed = close_ring(parts, 0.0)
     free = tuple(float(radius) for radius in closed.natural_radius(np.array(ring)))
     assert max(abs(np.array(free) - ring)) > 0.01 and abs(closed.axial - 1) > 0.01
     file = write_layers(tmp_path / "layers.msh", free)

@@ -103,7 +103,7 @@ def scaled() -> Iterator[None]:
         return factor * neo_hookean.distortional(F, lam, mu)
 
     with patch.dict(MATRICES):
-        numbers = {"factor": Parameter(1.0, "Of the energy.", above=0.0)}
+        numbers = {"factor": Parameter(1.0, "Of the energy.", exclusive_minimum=0.0)}
         MATRICES["scaled"] = Matrix(volumetric, others, parameters=numbers)
         MATRICES["whole"] = lambda F, lam, mu: neo_hookean(F, lam, mu)
         yield

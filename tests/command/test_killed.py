@@ -19,7 +19,7 @@ import pytest
 from remodel_fenicsx.results import checkpoint
 from remodel_fenicsx.results.recording import read_history
 from remodel_fenicsx.results.run_folder import FolderTaken, History
-from remodel_fenicsx.results.vtkhdf import PatientFile, TransientGrid
+from remodel_fenicsx.results.vtkhdf import DeferredErrorFile, TransientGrid
 from remodel_fenicsx.running import resume, run
 from tests.forks import forked
 from tests.results.test_resume import LONGER, SELF, assert_same, first_half, half, rows, scene, whole
@@ -53,9 +53,9 @@ class Camera:
     @contextmanager
     def running(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         """Within, it looks."""
-        write, row = PatientFile.write, History._write
+        write, row = DeferredErrorFile.write, History._write
 
-        def half_and_whole(file: PatientFile, data: Any) -> int:
+        def half_and_whole(file: DeferredErrorFile, data: Any) -> int:
             self.look("before a write of fields")
             place = file.tell()
             write(file, bytes(data)[: len(data) // 2])
@@ -79,7 +79,7 @@ class Camera:
             patch.setattr(owner, name, looking)
 
         with monkeypatch.context() as patch:
-            patch.setattr(PatientFile, "write", half_and_whole)
+            patch.setattr(DeferredErrorFile, "write", half_and_whole)
             patch.setattr(History, "_write", half_row)
             for owner, name in ((os, "link"), (os, "fsync"), (Path, "replace"), (Path, "rename"), (Path, "unlink")):
                 before(owner, name)

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from remodel_fenicsx.system import NOTICE, terminal
-from remodel_fenicsx.system.files import typed
-from remodel_fenicsx.system.terminal import Progress, hold_log, open_log
+from remodel_fenicsx.system.files import command_name
+from remodel_fenicsx.system.terminal import Progress, buffer_log, open_log
 from tests.forks import forked
 
 SCRIPT = """
@@ -118,18 +118,18 @@ def test_hints_are_typed_as_the_command_was_found(tmp_path, monkeypatch):
     checkout = Path(__file__).parents[2]
     monkeypatch.setenv("PATH", f"{checkout / 'bin'}:{os.environ['PATH']}")
     monkeypatch.chdir(checkout)
-    assert typed() == "./with-fenicsx remodel-fenicsx"
+    assert command_name() == "./with-fenicsx remodel-fenicsx"
     monkeypatch.chdir(tmp_path)
-    assert typed() == f"{checkout / 'with-fenicsx'} remodel-fenicsx"
+    assert command_name() == f"{checkout / 'with-fenicsx'} remodel-fenicsx"
     monkeypatch.setenv("PATH", "/usr/bin:/bin")
-    assert typed() == "remodel-fenicsx"
+    assert command_name() == "remodel-fenicsx"
 
 
 def test_other_ranks_are_silent(capsys, tmp_path):
     with open_log(tmp_path / "run.log", 1) as log, Progress(2, "artery", 1) as progress:
         progress.step(1, "something")
         log.warning("something")
-    with hold_log(1, quiet=False) as held:
+    with buffer_log(1, quiet=False) as held:
         log.log(NOTICE, "something")
     assert not held and capsys.readouterr() == ("", "") and not list(tmp_path.iterdir())
 

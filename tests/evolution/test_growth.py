@@ -339,7 +339,7 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
             for step in simulation.steps():
                 rates += [np.abs(turnover.rates()).max()] if step.time in (600.0, 700.0) else []
             tissue = simulation.stepper.remodeling.parameters.largest()
-        _, slowly = turnover.settings.rule.rest(tissue)
+        _, slowly = turnover.settings.rule.gain_and_recovery_time(tissue)
         assert 100.0 / np.log(rates[0] / rates[1]) == pytest.approx(slowly, rel=0.03), gain
 
 

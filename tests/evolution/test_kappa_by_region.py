@@ -22,7 +22,7 @@ PAIRS = [
     (law, coupling)
     for law, kind in LAWS.items()
     for coupling in ("staggered", "relaxed", "extrapolated")
-    if kind.asks_kappa and (kind.target is not None or not COUPLINGS[coupling].needs_a_target)
+    if kind.stops_at_zero_kappa and (kind.target is not None or not COUPLINGS[coupling].needs_a_target)
 ]
 FIRST, SECOND = 0.08, 0.02
 LAYERS: dict[str, Any] = {"intima": {"outer_radius": 1.7}, "media": {"outer_radius": 2.4}, "adventitia": {}}
@@ -54,7 +54,7 @@ def solved(*arguments: Any, changes: tuple[tuple[str, Any], ...] = ()) -> tuple[
 
 def one_better(simulation: Simulation) -> np.ndarray:
     """A of the cells with which the last row is compared; zero of a law without errors in time."""
-    better, shape = simulation.stepper.coupling.better, simulation.quadrature.shape
+    better, shape = simulation.stepper.coupling.higher_order_cells, simulation.quadrature.shape
     return np.zeros((*shape, 3, 3)) if better is None else structure_tensor(*better[:2]).reshape(*shape, 3, 3)
 
 
@@ -90,7 +90,7 @@ def test_no_step_is_longer_than_the_fastest_region_allows() -> None:
     held = {"time.tolerance": 40.0, "time.end": 30.0}
     with made(scene((0.4, SECOND, SECOND), "tensor", "extrapolated", **held)) as chosen:
         lengths = np.diff([0.0, *(step.time for step in chosen.steps())])
-        longest = chosen.stepper.coupling.traits.longest / 0.4
+        longest = chosen.stepper.coupling.traits.max_scaled_step / 0.4
     assert 0.5 * longest < lengths.max() <= longest * (1 + 1e-9)
 
 

@@ -44,7 +44,7 @@ def test_the_lazy_zone_slows_and_stops(coupling: str) -> None:
     assert slow["mean_fibre_angle"] < start - 3 and asleep["mean_fibre_angle"] == pytest.approx(start, abs=1e-9)
     assert (slow["asleep_share"], asleep["asleep_share"]) == (0.0, 1.0)
     with np.errstate(all="raise"):
-        assert tensor_law.awake(np.diag([1e-300, 0.0, -1.0])[None], 1e60) == 0
+        assert tensor_law.activation(np.diag([1e-300, 0.0, -1.0])[None], 1e60) == 0
 
 
 def test_the_target_of_any_exponent() -> None:

@@ -13,7 +13,7 @@ from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.scene.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import Cells, Load
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.equilibrium import StateLimits
 from remodel_fenicsx.state import State
 from tests import parts
 from tests.parts import cube
@@ -183,9 +183,9 @@ def test_a_state_starts_unloaded() -> None:
 
 def test_admissible_is_below_the_contour_length_with_volume_left() -> None:
     here = (0.0, 0.0, 0.0)
-    assert Extension(0.999, 1e-3, here).admissible
+    assert StateLimits(0.999, 1e-3, here).admissible
     for extension, jacobian in ((1.0, 0.5), (1.1, 0.5), (0.5, 0.0), (0.5, -0.1), (np.nan, 0.5), (0.5, np.nan)):
-        assert not Extension(extension, jacobian, here).admissible
+        assert not StateLimits(extension, jacobian, here).admissible
 
 
 def test_extension_names_the_point_where_chains_are_longest() -> None:

@@ -197,11 +197,11 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
     def in_parts(step: Any, time: float, old_loads: Any, loads: Any, work: Any, again: bool) -> None:
         coupled._solve_in_parts(time, old_loads, loads, work, None)
 
-    def solved(origin: Any = None, roughly: bool = False) -> Any:
+    def solved(origin: Any = None, loose_tolerance: bool = False) -> Any:
         if simulation.state.number not in refused:
             refused.add(simulation.state.number)
             raise SolveFailure("in vain", Solution(extension=coupled.equilibrium.extension()))
-        return solve(origin, roughly)
+        return solve(origin, loose_tolerance)
 
     def noted(fraction: float) -> None:
         set_part(fraction)

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.evolution import stepper
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
-from remodel_fenicsx.solver.continuation import PROOF
+from remodel_fenicsx.solver.continuation import MIN_HALVINGS_FOR_JUMP
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests.runs import made
 from tests.values import isotropic
@@ -33,9 +33,9 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Attempt]]:
     found: list[Attempt] = []
     solve = GuardedNewton.solve
 
-    def counted(self: GuardedNewton, origin: Any = None, roughly: bool = False) -> Solution:
+    def counted(self: GuardedNewton, origin: Any = None, loose_tolerance: bool = False) -> Solution:
         try:
-            solution = solve(self, origin, roughly)
+            solution = solve(self, origin, loose_tolerance)
         except SolveFailure as failure:
             found.append(failure)
             raise
@@ -66,8 +66,8 @@ def rows(scene: Scene, found: list[Attempt]) -> Iterator[tuple[dict[str, float],
 def test_every_solve_of_a_step_counts_once(coupling: str, method: str, attempts: list[Attempt]) -> None:
     """The first step of a coupling without a stress before it is solved twice."""
     solves = []
-    # with fewer halvings than `parts.PROOF` a step that goes far is not looked into again
-    plain = {"solver.method": method, "solver.maximum_halvings": PROOF - 1}
+    # with fewer halvings than `parts.MIN_HALVINGS_FOR_JUMP` a step that goes far is not looked into again
+    plain = {"solver.method": method, "solver.maximum_halvings": MIN_HALVINGS_FOR_JUMP - 1}
     for row, work, found in rows(artery(coupling, **plain), attempts):
         spent = counts(found)
         assert (work.newton_iterations, work.linear_iterations, work.tangents) == spent

@@ -155,7 +155,7 @@ def test_a_run_knows_what_its_elements_lack(
     material = RadialMaterial(lame_lambda=3.103 * ratio, lame_mu=3.103, network_modulus=0.0)
     exact = solve_radial(pressure, 0.0, 4.0, 4.0, law="none", outer_radius=radius, material=material).inner_radii[-1]
     with caplog.at_level(logging.WARNING), simulated(scene) as (simulation, rows):
-        missing = sum(LockingWarning(simulation.stepper, formulation == "displacement").missing())
+        missing = sum(LockingWarning(simulation.stepper, formulation == "displacement").missing_deformation())
     lacking = 1 - (rows[-1]["inner_radius"] - 1) / (exact - 1)
     assert missing == pytest.approx(lacking, rel=0.25, abs=0.005)
     told = [record.getMessage() for record in caplog.records]
@@ -175,7 +175,7 @@ def test_elements_that_lock_in_an_elongated_tube_are_told(kinematics: str, press
         "cells.axes": "cylindrical", "loads.elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [4.0, 1.0]]},
     })  # fmt: skip
     with caplog.at_level(logging.WARNING), simulated(scene) as (simulation, rows):
-        missing = sum(LockingWarning(simulation.stepper, True).missing())
+        missing = sum(LockingWarning(simulation.stepper, True).missing_deformation())
     with simulated(scene.with_values({"mesh.refinement": 2, "mesh.degree": 2})) as (_, fine):
         pass
     found, exact = (np.array([of[-1]["inner_radius"] - 1, of[-1]["outer_radius"] - 3]) for of in (rows, fine))
@@ -246,7 +246,7 @@ def test_a_slope_of_the_pressure_is_no_noise() -> None:
         watcher = PressureNoise(simulation.stepper)
         noise, quadrature = watcher.degrees(), watcher.quadrature
         with pytest.MonkeyPatch.context() as patch:
-            beyond = quadrature.beyond
+            beyond = quadrature.polynomial_residual
             patch.setattr(quadrature, "beyond", lambda degree, values: beyond(0, values))
             assert noise < 0.4 * watcher.degrees()
 
@@ -284,7 +284,7 @@ def test_what_auto_takes() -> None:
     ):  # fmt: skip
         scene = remodeling_tube(1e3, **values, **{"time.end": 40.0})
         assert scene.mesh.formulation == "auto" and scene.formulation == taken, values
-        assert scene.formulation_in_words().startswith(f"formulation {taken!r}: lambda/mu = ")
+        assert scene.describe_formulation().startswith(f"formulation {taken!r}: lambda/mu = ")
     with simulated(remodeling_tube(1e3, **{"time.end": 2.5})) as (simulation, _):
         assert simulation.scene.mesh.formulation == SELECTIVE
 
@@ -299,7 +299,7 @@ def test_the_papers_artery_is_fine_enough(caplog: Any) -> None:
     artery = random_artery(**{"time.end": 5.0})
     with caplog.at_level(logging.WARNING), simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _):
         watcher = LockingWarning(simulation.stepper, True)
-        assert 0.025 < sum(watcher.missing()) < 0.038
+        assert 0.025 < sum(watcher.missing_deformation()) < 0.038
     assert not caplog.records
 
 

@@ -13,7 +13,7 @@ import pytest
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, run
-from remodel_fenicsx.body.reductions import AUTO, choice, explained, objections
+from remodel_fenicsx.body.reductions import AUTO, choice, describe_choice, objections
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.columns import Measurement
@@ -143,14 +143,14 @@ def test_a_quarter_of_random_cells_is_the_tube_that_has_their_mirror_images(monk
 
 def test_it_is_named_never_chosen_and_says_what_it_means(caplog: pytest.LogCaptureFixture) -> None:
     base = scene("tube", "sector", 2.0, cells={"initial": "random", "axes": "cylindrical"})
-    words = [line for line in explained(base) if "means over seeds are nearly those of the whole tube" in line]
+    words = [line for line in describe_choice(base) if "means over seeds are nearly those of the whole tube" in line]
     assert len(words) == 1
-    left = explained(base.with_values({"model.kinematics": AUTO}))
+    left = describe_choice(base.with_values({"model.kinematics": AUTO}))
     assert "'full'" in left[0] and any(line.startswith("'sector', allowed for means over seeds") for line in left)
     with caplog.at_level("INFO"):
         Simulation(base, SELF).close()
     assert words[0] in caplog.messages
-    assert not [line for line in explained(scene("tube", "sector", 2.0)) if "means over seeds" in line]
+    assert not [line for line in describe_choice(scene("tube", "sector", 2.0)) if "means over seeds" in line]
 
 
 # ---------------------------------------------------------------- rules
@@ -210,7 +210,7 @@ def test_axes_of_ones_own_may_have_no_symmetry(monkeypatch: pytest.MonkeyPatch) 
 def test_auto_takes_the_cheapest_that_is_allowed(shape: str, tables: dict[str, Any], name: str) -> None:
     chosen = scene(shape, AUTO, 2.0, **tables)
     assert choice(chosen).name == name
-    lines = explained(chosen)
+    lines = describe_choice(chosen)
     assert lines[0].startswith(f"kinematics '{name}'")
     assert len(lines) == len(chosen.geometry.reductions) + (name == "full")
 
@@ -222,9 +222,11 @@ def test_without_a_preset_the_choice_is_auto_and_presets_are_full() -> None:
 
 def test_what_the_symmetric_solution_cannot_show_is_said() -> None:
     for remodeling, said in (({"driver": "pk2"}, True), ({"law": "rate"}, True), ({}, False)):
-        lines = explained(scene("tube", AUTO, 2.0, remodeling=remodeling))
+        lines = describe_choice(scene("tube", AUTO, 2.0, remodeling=remodeling))
         assert any("leaves it after a while" in line for line in lines) == said
-    assert not any("leaves it" in line for line in explained(scene("cube", AUTO, 2.0, remodeling={"driver": "pk2"})))
+    assert not any(
+        "leaves it" in line for line in describe_choice(scene("cube", AUTO, 2.0, remodeling={"driver": "pk2"}))
+    )
 
 
 @pytest.mark.parametrize(
@@ -326,6 +328,6 @@ def test_auto_is_full_where_a_load_presses(force: float, unstable: str, name: st
         "loads": {"force": {"value": force, "ramp": [[0.0, 0.0], [3.0, 1.0]]}},
     })  # fmt: skip
     assert choice(scene).name == name
-    assert ("buckle" in " ".join(explained(scene))) == (name == "full")
+    assert ("buckle" in " ".join(describe_choice(scene))) == (name == "full")
     stops = scene.with_values({"solver.unstable": "stop"})
-    assert choice(stops).name == "full" and "modes of the whole body" in " ".join(explained(stops))
+    assert choice(stops).name == "full" and "modes of the whole body" in " ".join(describe_choice(stops))

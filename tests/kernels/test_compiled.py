@@ -77,8 +77,8 @@ def test_noise_across_the_axes(kernels: PointKernels) -> None:
     near = np.linalg.eigh(tensors)[1].swapaxes(1, 2)
     for limit in (0.0, 1e-2, 0.5, rng.random(COUNT)):
         for given in (axes, near):
-            wanted = spectral.without_noise(steady, given, limit)
-            np.testing.assert_allclose(kernels.without_noise(steady, given, limit), wanted, rtol=0, atol=1e-14)
+            wanted = spectral.drop_noise_shear(steady, given, limit)
+            np.testing.assert_allclose(kernels.drop_noise_shear(steady, given, limit), wanted, rtol=0, atol=1e-14)
 
 
 def test_the_positive_direction(kernels: PointKernels) -> None:
@@ -133,7 +133,7 @@ def test_values_that_just_agree_or_just_do_not(kernels: PointKernels, limited_by
 
 def test_signs_that_just_decide_or_just_do_not(kernels: PointKernels) -> None:
     """The first previous axis is almost across its own, on its other side; the next one would choose the other sign."""
-    cosine = EDGES * spectral.DECISIVE
+    cosine = EDGES * spectral.MIN_OVERLAP
     previous = np.tile(np.eye(3), (len(EDGES), 1, 1))
     previous[:, 0] = np.stack([-cosine, np.sqrt(1 - cosine**2), np.zeros_like(cosine)], axis=1)
     previous[:, 1] = [0.6, 0.8, 0.0]
@@ -164,6 +164,6 @@ def test_what_is_just_across_the_axes(kernels: PointKernels, plane: tuple[int, i
     tensors = np.tile(np.diag([3.0, 2.0, 1.0]), (len(near), 1, 1))
     tensors[:, plane[0], plane[1]] = tensors[:, plane[1], plane[0]] = -near * noise
     axes = np.tile(np.eye(3), (len(near), 1, 1))
-    found = kernels.without_noise(tensors, axes, noise)
-    np.testing.assert_array_equal(found, spectral.without_noise(tensors, axes, noise))
+    found = kernels.drop_noise_shear(tensors, axes, noise)
+    np.testing.assert_array_equal(found, spectral.drop_noise_shear(tensors, axes, noise))
     np.testing.assert_array_equal(found[:, plane[0], plane[1]], np.where(near > 1, -near * noise, 0.0))

@@ -44,7 +44,9 @@ FREELY_JOINTED = {"material__chain": "freely-jointed", "material__links_per_pers
 
 def test_the_force_is_the_slope_of_the_energy() -> None:
     """Of a freely jointed chain: beta = x (3 - x^2)/(1 - x^2)."""
-    chain, r = CHAINS["freely-jointed"].of({"links_per_persistence_length": 0.6}), np.linspace(0.05, 1.5, 9)
+    chain, r = CHAINS["freely-jointed"].with_parameters({"links_per_persistence_length": 0.6}), np.linspace(
+        0.05, 1.5, 9
+    )
     slope = (chain.energy(r + 1e-6, 1.6) - chain.energy(r - 1e-6, 1.6)) / 2e-6
     x = r / 1.6
     np.testing.assert_allclose(slope, chain.force(r, 1.6, 1.0), rtol=1e-8)

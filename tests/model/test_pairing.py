@@ -8,7 +8,7 @@ from remodel_fenicsx.body import Cube, LoadKind
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.laws import LAWS, Array, Drive, relaxed
-from remodel_fenicsx.model.spectral import PAIRINGS, continued, principal
+from remodel_fenicsx.model.spectral import PAIRINGS, principal_by_continuity, principal
 from remodel_fenicsx.schema.units import FORCE
 from tests import parts
 from tests.runs import made
@@ -28,7 +28,7 @@ def test_each_axis_takes_the_place_of_the_one_that_it_continues() -> None:
     rng = np.random.default_rng(1)
     true = parts.random_rotations(rng, COUNT)
     values = rng.normal(size=(COUNT, 3))  # in any order
-    found, axes = continued(parts.symmetric(values, true), nearby(rng, true))
+    found, axes = principal_by_continuity(parts.symmetric(values, true), nearby(rng, true))
     np.testing.assert_allclose(found, values, atol=1e-13)
     np.testing.assert_allclose(axes, true, atol=1e-11)  # with their signs
 
@@ -38,7 +38,7 @@ def test_in_descending_order_it_is_the_printed_one() -> None:
     true = parts.random_rotations(rng, COUNT)
     for values in ([3.0, 1.0, -2.0], [3.0, 3.0, -2.0], [3.0, -2.0, -2.0], [1.0, 1.0, 1.0]):
         tensors, previous = parts.symmetric(np.array(values), true), nearby(rng, true)
-        for one, other in zip(continued(tensors, previous), principal(tensors, previous), strict=True):
+        for one, other in zip(principal_by_continuity(tensors, previous), principal(tensors, previous), strict=True):
             np.testing.assert_array_equal(one, other)
 
 
@@ -51,7 +51,7 @@ def test_equal_values_keep_the_axes_that_they_continue(values: list[float], nois
     rng = np.random.default_rng(3)
     previous = parts.random_rotations(rng, COUNT)
     error = noise * rng.normal(size=previous.shape)
-    found, axes = continued(parts.symmetric(np.array(values), previous) + error, previous)
+    found, axes = principal_by_continuity(parts.symmetric(np.array(values), previous) + error, previous)
     np.testing.assert_allclose(found, np.broadcast_to(values, found.shape), atol=1e-10)
     np.testing.assert_allclose(axes, previous, atol=1e-10)
 
@@ -64,7 +64,7 @@ def test_where_several_pairings_are_as_good_rounding_does_not_choose() -> None:
     half_way = np.array([[c, c, 0.0], [-c, c, 0.0], [0.0, 0.0, 1.0]]) @ previous
     tensors = parts.symmetric(np.array([2.0, 1.0, 0.0]), half_way)
     for noise in (0.0, 1e-9):
-        found, _ = continued(tensors + noise * rng.normal(size=tensors.shape), previous)
+        found, _ = principal_by_continuity(tensors + noise * rng.normal(size=tensors.shape), previous)
         np.testing.assert_allclose(found, np.broadcast_to([2.0, 1.0, 0.0], found.shape), atol=1e-8)
 
 

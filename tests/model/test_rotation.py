@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from remodel_fenicsx import Scene
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.laws import LAWS, Array, Drive, angle_left
+from remodel_fenicsx.model.laws import LAWS, Array, Drive, remaining_angle
 from tests import parts
 from tests.runs import made
 
@@ -135,7 +135,7 @@ def test_a_fibre_across_the_tension_turns_and_rounding_does_not_choose_where() -
     for noise in (0.0, 1e-12, -1e-12):
         axes = Rotation.from_rotvec([0.0, noise, 0.0]).apply(np.eye(3)[[0, 1, 2]])
         new = updated(cells_of(axes[None]), pulled(np.diag([1.0, 0.0, 2.0])[None]), 2.0).axes[0]
-        angle = angle_left(np.array([np.pi / 2]), 2.0 / TAU)[0]
+        angle = remaining_angle(np.array([np.pi / 2]), 2.0 / TAU)[0]
         np.testing.assert_allclose(new[0], [np.sin(angle), 0.0, np.cos(angle)], atol=1e-11)  # towards +z, the third
         np.testing.assert_allclose(new[1], Y, atol=1e-11)
         stress = turn @ np.diag([1.0, 0.0, 2.0]) @ turn.T
@@ -172,7 +172,7 @@ def test_the_nearer_sense_is_the_one_in_the_reference_configuration() -> None:
 def test_a_share_of_a_rotation_is_a_rotation() -> None:
     """What the coupling `relaxed` makes of it: not the mean of two structure tensors, which would change the cell."""
     old, stress, _ = random_case(11)
-    new, share = updated(old, pulled(stress), 2.0), LAWS["rotation"].share
+    new, share = updated(old, pulled(stress), 2.0), LAWS["rotation"].relax
     half = share(old, new, 0.5)
     np.testing.assert_array_equal(half.dimensions, old.dimensions)
     np.testing.assert_allclose(half.axes @ np.swapaxes(half.axes, 1, 2), np.eye(3) + 0 * half.axes, atol=1e-13)
@@ -203,6 +203,6 @@ def test_a_cube_with_fibres_across_its_load(coupling: str, caplog: pytest.LogCap
         angles = [step.row["mean_fibre_angle"] for step in simulation.steps()]
     expected = [np.pi / 2]
     for _ in range(5):
-        expected.append((1 - share) * expected[-1] + share * angle_left(np.array(expected[-1:]), 1 / tau)[0])
+        expected.append((1 - share) * expected[-1] + share * remaining_angle(np.array(expected[-1:]), 1 / tau)[0])
     np.testing.assert_allclose(angles[-6:], np.degrees(expected), atol=1e-6)
     assert "overshoots" not in caplog.text

@@ -16,7 +16,7 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS, Drive
-from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, floor_above, follow, target
+from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, switch_threshold, relax_exactly, target
 from remodel_fenicsx.model.tensors import MANDEL, logarithm, second_divided_differences
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ def test_follow_is_the_solution_of_its_differential_equation() -> None:
     solution: Any = solve_ivp(
         lambda t, y: (kappa * s * (r0**2 * E - y.reshape(3, 3))).ravel(), (0, 30), A.ravel(), rtol=1e-11, atol=1e-12
     )
-    found = follow(A[None], Target(E[None], np.array([s])), r0, kappa * 30)[0]
+    found = relax_exactly(A[None], Target(E[None], np.array([s])), r0, kappa * 30)[0]
     np.testing.assert_allclose(found, solution.y[:, -1].reshape(3, 3), atol=1e-9)
 
 
@@ -175,8 +175,8 @@ def test_the_target_is_that_of_eq_9_to_11_in_the_principal_axes() -> None:
 def test_what_is_out_of_balance_counts_once() -> None:
     """The rounding is widened for Newton's method; a residual, which may be large, is not: half there, and no more."""
     tension = np.diag([1e-3, 0.0, 0.0])[None]
-    assert target(tension, floor_above(1e-3, 0.0)).switch[0] == pytest.approx(0.5)
-    assert target(tension, floor_above(0.0, 1e-3 / ABOVE_ROUNDING)).switch[0] == pytest.approx(0.5)
+    assert target(tension, switch_threshold(1e-3, 0.0)).switch[0] == pytest.approx(0.5)
+    assert target(tension, switch_threshold(0.0, 1e-3 / ABOVE_ROUNDING)).switch[0] == pytest.approx(0.5)
 
 
 def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is_one() -> None:
@@ -197,7 +197,7 @@ def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is
 
 def test_the_switch() -> None:
     """One under tension, nothing under compression or noise; no jump between."""
-    floor = floor_above(0.0, 1e-14)
+    floor = switch_threshold(0.0, 1e-14)
     tensors = np.array([np.diag(v) for v in ([1, 0, 0], [-1, -1, -1], [1e-14, -1, 0], [1e-15, 0, 0], [0.0, 0, 0])])
     np.testing.assert_allclose(target(tensors, floor).switch, [1, 0, 0, 0, 0], atol=1e-6)
     sizes = np.logspace(-13, 0, 400)

@@ -77,7 +77,7 @@ def test_a_run_without_fields_has_its_curves(browser: Browser, recorded: Recorde
 # ---------------------------------------------------------------- what the page says of the data
 @pytest.mark.parametrize("name", ["artery", "tendon"])
 def test_profile_and_rose_are_volume_means(browser: Browser, recorded: Recorded, name: str) -> None:
-    run, found = Recording(recorded(name)), Decoded.of(recorded(name))
+    run, found = Recording(recorded(name)), Decoded.from_run(recorded(name))
     browser.open(recorded(name) / REPORT)
     layer, volume = found.arrays["view.layer"], found.arrays["view.volume"]
     for index in (0, len(run.times) // 2, len(run.times) - 1):

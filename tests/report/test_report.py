@@ -48,7 +48,7 @@ class Decoded:
         self.view: dict[str, Any] = self.data["parts"].get("view", {})
 
     @classmethod
-    def of(cls, folder: Path) -> Decoded:
+    def from_run(cls, folder: Path) -> Decoded:
         return cls((folder / REPORT).read_text(encoding="utf-8"))
 
     def script(self, name: str) -> str:
@@ -76,7 +76,7 @@ def test_stresses_through_the_wall_are_those_of_the_columns(kinematics: str, tmp
         "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "output.columns": [*names, "inner_radius", "outer_radius"],
     }  # fmt: skip
     folder = run_scene(preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes), tmp_path / "run")
-    parts, history = Decoded.of(folder).data["parts"], Recording(folder).history
+    parts, history = Decoded.from_run(folder).data["parts"], Recording(folder).history
     found = parts["stress"]
     assert "content" not in parts
     layers = np.array(found["layers"])
@@ -96,7 +96,7 @@ def test_content_and_growth_through_the_wall(tmp_path: Path) -> None:
         "remodeling.turnover": {"time": 5.0, "volume": 0.5}, "time.step": 2.0, "output.columns": ["content", "growth"],
     }  # fmt: skip
     folder = run_scene(preset_scene("consistent", "tube").with_values(changes), tmp_path / "run")
-    found, history = Decoded.of(folder).data["parts"]["content"], Recording(folder).history
+    found, history = Decoded.from_run(folder).data["parts"]["content"], Recording(folder).history
     areas, layers = np.diff(np.linspace(1.0, 3.0, len(found["depth"]) + 1) ** 2), np.array(found["layers"])
     assert found["names"] == ["content", "growth"] and history["growth"][-1] < 0.98
     for number, name in enumerate(found["names"]):
@@ -107,7 +107,7 @@ def test_content_and_growth_through_the_wall(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["artery", "tendon", "cube", "tetrahedra", "quadratic"])
 def test_the_page_holds_what_was_recorded(recorded: Recorded, name: str) -> None:
     """Places to half a step, angles to half a level, r/L to half of a 255th, chains by their direction."""
-    run, found = Recording(recorded(name)), Decoded.of(recorded(name))
+    run, found = Recording(recorded(name)), Decoded.from_run(recorded(name))
     times = found.view["times"]
     np.testing.assert_array_equal(times, run.times)
     corners = run.elements[:, : {10: 4, 27: 8}.get(run.elements.shape[1], run.elements.shape[1])]
@@ -138,7 +138,7 @@ def worst_direction(first: np.ndarray, second: np.ndarray) -> float:
 
 def test_regions_are_shown_by_name(recorded: Recorded) -> None:
     """A curve for each beside those of the body, where each lies in the profile, and what differs in words."""
-    found = Decoded.of(recorded("layers"))
+    found = Decoded.from_run(recorded("layers"))
     regions = found.data["parts"]["angles"]["regions"]
     assert regions == [{"name": "media", "from": 0.0, "to": 0.5}, {"name": "adventitia", "from": 0.5, "to": 1.0}]
     drawn = found.data["parts"]["curves"]["curves"]
@@ -152,18 +152,18 @@ def test_regions_are_shown_by_name(recorded: Recorded) -> None:
         "initial (0.5, 0.85, 0.165",
     ):
         assert words in found.text
-    assert Decoded.of(recorded("artery")).data["parts"]["angles"]["regions"] == []
+    assert Decoded.from_run(recorded("artery")).data["parts"]["angles"]["regions"] == []
 
 
 def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
     """Where it is free of stress, the loaded body that was given, turnover and ramps; nothing that is not there."""
-    text = html.unescape(Decoded.of(recorded("unloaded")).text)
+    text = html.unescape(Decoded.from_run(recorded("unloaded")).text)
     expected = [
         "opening angle 60", "; under the loads: radii 1, 1.3, length 2",
         "time 40, deposition stretch 1.1, gain 1", "value 1.2, ramp ((0, 0), (24, 1))",
     ]  # fmt: skip
     assert not [words for words in expected if words not in text]
-    radial = html.unescape(Decoded.of(recorded("radial")).text)
+    radial = html.unescape(Decoded.from_run(recorded("radial")).text)
     said = re.sub("<.*?>", " ", radial[radial.index("What was run"):radial.index("Warnings (")])  # fmt: skip
     expected = ["cells.initial = isotropic for random", "time.end = 3 for 150", "model.kinematics = radial for full"]
     assert not [words for words in [*expected, "ends free", "law explicit"] if words not in said]
@@ -173,7 +173,7 @@ def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
 
 def test_tetrahedra_have_as_many_layers_as_lie_behind_one_another(recorded: Recorded) -> None:
     """And not one for each place that the middle of one of the six kinds has."""
-    found = Decoded.of(recorded("three tetrahedra"))
+    found = Decoded.from_run(recorded("three tetrahedra"))
     depth = found.data["parts"]["angles"]["depth"]
     np.testing.assert_allclose(depth, (np.arange(3) + 0.5) / 3, atol=1e-6)
     shares = np.bincount(found.arrays["view.layer"], weights=found.arrays["view.volume"])
@@ -182,13 +182,13 @@ def test_tetrahedra_have_as_many_layers_as_lie_behind_one_another(recorded: Reco
 
 def test_volumes_and_layers_are_those_of_the_body(recorded: Recorded) -> None:
     for name, layers in (("artery", 8), ("tendon", 10), ("cube", 1)):
-        found = Decoded.of(recorded(name))
+        found = Decoded.from_run(recorded(name))
         volume, layer = found.arrays["view.volume"], found.arrays["view.layer"]
         assert volume.sum() == pytest.approx(1.0, rel=1e-5) and set(layer) == set(range(layers))
         depth = found.data["parts"]["angles"]["depth"]
         np.testing.assert_allclose(depth, (np.arange(layers) + 0.5) / layers, atol=0.03)  # edges are chords
     # rings of equal thickness: their volumes grow like their radii
-    found = Decoded.of(recorded("artery"))
+    found = Decoded.from_run(recorded("artery"))
     shares = np.bincount(found.arrays["view.layer"], weights=found.arrays["view.volume"])
     radii = 1.0 + 2.0 * (np.arange(8) + 0.5) / 8
     np.testing.assert_allclose(shares, radii / radii.sum(), rtol=1e-4)
@@ -197,7 +197,7 @@ def test_volumes_and_layers_are_those_of_the_body(recorded: Recorded) -> None:
 @pytest.mark.parametrize("name", ["radial", "axisymmetric", "sector", "point"])
 def test_reductions_are_shown_as_whole_bodies(recorded: Recorded, name: str) -> None:
     """Their surfaces have the radii, lengths and stretches of the history; chains stay at their angle."""
-    run, found = Recording(recorded(name)), Decoded.of(recorded(name))
+    run, found = Recording(recorded(name)), Decoded.from_run(recorded(name))
     assert KINEMATICS[run.scene.model.kinematics].reduced and "shown as the whole body" in found.text
     start, end = found.position[0], found.position[-1]
     history = run.history

@@ -99,9 +99,9 @@ def test_a_few_radial_chains_among_others_of_an_element(wall: tuple[parts.Body, 
     made, _ = wall
     values = np.full(made.quadrature.shape, 30.0)
     values[:, 0] = np.nan
-    np.testing.assert_allclose(made.quadrature.element_mean_of_known(values), 30.0, rtol=1e-14)
-    assert made.quadrature.mean_of_known(values) == pytest.approx(30.0, rel=1e-14)
-    assert np.isnan(made.quadrature.mean_of_known(np.full_like(values, np.nan)))
+    np.testing.assert_allclose(made.quadrature.element_nanmean(values), 30.0, rtol=1e-14)
+    assert made.quadrature.nanmean(values) == pytest.approx(30.0, rel=1e-14)
+    assert np.isnan(made.quadrature.nanmean(np.full_like(values, np.nan)))
 
 
 def test_stretches_of_a_cube_that_is_pulled_more_on_one_side() -> None:

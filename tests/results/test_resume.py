@@ -28,8 +28,8 @@ from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError
 from remodel_fenicsx.results.checkpoint_file import read_checkpoint, read_file, time_of_checkpoint
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.schema.settings import COUPLINGS, CouplingKind
-from remodel_fenicsx.system.files import typed
-from remodel_fenicsx.results.recording import FolderTaken, RunLock, writer
+from remodel_fenicsx.system.files import command_name
+from remodel_fenicsx.results.recording import FolderTaken, RunLock, lock_holder
 from remodel_fenicsx.results.status import status
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.solver.continuation import StepFailure, Work
@@ -248,7 +248,7 @@ def test_what_may_change_changes(half: Path) -> None:
 def test_a_folder_that_a_run_writes_is_refused(half: Path) -> None:
     with RunLock(half), pytest.raises(FolderTaken, match=f"half: process {os.getpid()} on .* writes in it"):
         resume(half, [], SELF)
-    assert writer(half) == (None, False)
+    assert lock_holder(half) == (None, False)
     resume(half, [], SELF)
 
 
@@ -349,7 +349,7 @@ def test_a_lost_rank_loses_the_steps_since_the_checkpoint(
     """The other rank does not go on alone; nobody holds the folder."""
     lost = shutil.copytree(two_ranks[0] / "lost", tmp_path / "lost")
     assert time_of_checkpoint(lost) == 4.0 and Recording(lost).history["time"][-1] == LOST_AT - 1
-    assert not writer(lost)[1]
+    assert not lock_holder(lost)[1]
     resume(lost, [], SELF)
     assert_close(lost, whole)
 
@@ -372,7 +372,7 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     errors = process.communicate(timeout=100)[1]
     last = Recording(half).history["time"][-1]
     assert process.returncode == 4
-    assert errors.count("\n") == 1 and f"{typed()} run --resume {half}" in errors
+    assert errors.count("\n") == 1 and f"{command_name()} run --resume {half}" in errors
     assert time_of_checkpoint(half) == last and rows(half)[:10] == rows(whole)[:10]
     said = status(half)
     assert said[0] == f"{half}: scene, step {last:g} of 500, time {last:g} of 500"

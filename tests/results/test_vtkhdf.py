@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx.results.whole_body import chain_displacement, chain_lines
-from remodel_fenicsx.results.vtkhdf import PatientFile, TransientGrid, vtk_cells
+from remodel_fenicsx.results.vtkhdf import DeferredErrorFile, TransientGrid, vtk_cells
 from tests.forks import forked
 
 # In a process of its own, as users do. Steps are read forwards and backwards: VTK keeps the meshes of earlier steps.
@@ -166,7 +166,7 @@ def test_a_full_disk_raises_and_keeps_what_was_published(tmp_path):
 
 @pytest.mark.parametrize("steps", [1, 64])  # the index of HDF5 grows a level at 64 chunks
 def test_a_process_that_is_killed_leaves_what_was_published(tmp_path, monkeypatch, steps):
-    path, copies, write = tmp_path / "f.vtkhdf", [], PatientFile.write
+    path, copies, write = tmp_path / "f.vtkhdf", [], DeferredErrorFile.write
 
     def look(*arguments):
         copies.append(shutil.copy(path, tmp_path / f"{len(copies)}.copy"))
@@ -179,7 +179,7 @@ def test_a_process_that_is_killed_leaves_what_was_published(tmp_path, monkeypatc
     grid = TransientGrid(path, CUBE, VTK_CUBE, 12)
     append(grid, 0, steps)
     grid.close()
-    monkeypatch.setattr(PatientFile, "write", look)
+    monkeypatch.setattr(DeferredErrorFile, "write", look)
     append(grid, steps, steps + 1)
     grid.close()
     append(grid, steps + 1, steps + 2)

@@ -281,7 +281,7 @@ def _kept(folder: Path, changes: list[str]) -> Path:
     from remodel_fenicsx.results.run_folder import locked
 
     with locked(folder, SELF, new=False):
-        running._kept(folder, changes, SELF)
+        running._read_run(folder, changes, SELF)
     return folder
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from remodel_fenicsx import read_scene
 from remodel_fenicsx.scene.scene import scene_from_dict
-from remodel_fenicsx.schema.text import put
+from remodel_fenicsx.schema.text import set_nested
 from tests.runs import made
 
 
@@ -25,7 +25,7 @@ def cube(**changes: Any) -> dict[str, Any]:
         "output": {"fields": False},
     }
     for key, value in changes.items():
-        put(values, key, value)
+        set_nested(values, key, value)
     return values
 
 

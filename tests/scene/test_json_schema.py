@@ -16,7 +16,7 @@ from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene.reference import json_schema
 from remodel_fenicsx.scene.presets import PRESETS
 from remodel_fenicsx.scene.scene import preset_scene, scene_from_dict
-from remodel_fenicsx.schema.text import put
+from remodel_fenicsx.schema.text import set_nested
 from tests.conftest import Refused
 from tests.scene.test_bad_input import ODD_NUMBERS, ODD_TEXTS, changed
 from tests.scene.test_scene import WRONG
@@ -43,7 +43,7 @@ def artery(**changes: Any) -> dict[str, Any]:
     values = tomllib.loads(preset_scene("kuhl-holzapfel-2007", "tube").to_toml())
     del values["preset"]
     for key, value in changes.items():
-        put(values, key.replace("__", "."), value)
+        set_nested(values, key.replace("__", "."), value)
     return values
 
 

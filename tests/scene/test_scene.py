@@ -18,8 +18,8 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
 from remodel_fenicsx.scene.scene import FORMAT, Scene, preset_scene, read_scene, scene_from_dict, too_soft
 from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Time
-from remodel_fenicsx.schema.tables import SceneError, allowed, locate, shown
-from remodel_fenicsx.schema.text import put
+from remodel_fenicsx.schema.tables import SceneError, allowed, locate, format_value
+from remodel_fenicsx.schema.text import set_nested
 from tests.runs import rows_of
 from tests.tables import rows, values
 
@@ -45,7 +45,7 @@ def changed(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Nested dict with values at dotted keys."""
     result = copy.deepcopy(base)
     for key, value in changes.items():
-        put(result, key, value)
+        set_nested(result, key, value)
     return result
 
 
@@ -62,7 +62,7 @@ WRONG = [(key, value) for key, row in rows(__file__, "wrong_values.txt") for val
 def test_a_value_that_a_key_never_has(key: str, value: Any) -> None:
     _, _, field = locate(Scene, tuple(key.split(".")))
     assert field is not None
-    assert refusal(changed(TUBE, {key: value})) == f"{key} = {shown(value)}: {allowed(field)}"
+    assert refusal(changed(TUBE, {key: value})) == f"{key} = {format_value(value)}: {allowed(field)}"
 
 
 @pytest.mark.parametrize(("base", "changes", "line"), rows(__file__, "bad_scenes.txt"))

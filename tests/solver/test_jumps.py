@@ -14,10 +14,10 @@ from benchmarks.stability_map.cases import all_cases
 from benchmarks.stability_map.running import Runner
 from remodel_fenicsx import Scene
 from remodel_fenicsx.scene import scene_from_dict
-from remodel_fenicsx.solver.continuation import Change
-from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.continuation import Continuation
+from remodel_fenicsx.solver.equilibrium import StateLimits
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, Solution
-from remodel_fenicsx.solver.diagnosis import diagnosed
+from remodel_fenicsx.solver.diagnosis import diagnose_failure
 from tests.locking_bodies import thick_tube
 from tests.runs import made
 from tests.values import ramped, isotropic
@@ -64,8 +64,8 @@ def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:
     with made(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125})) as simulation:
         before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
         last = simulation.unknown.x.array - before
-        failure = SolveFailure("refused", Solution(25, 25, extension=Extension(0.7, 1.0, (0.0, 0.0, 0.0))), 50.0)
-        refusal = diagnosed(simulation.stepper.coupling.newton, failure, last)
+        failure = SolveFailure("refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), 50.0)
+        refusal = diagnose_failure(simulation.stepper.coupling.newton, failure, last)
     assert refusal.kind == "limit point"
 
 
@@ -75,8 +75,8 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
     """Near its largest pressure a tube without chains goes more than twice as far as its first tangent points."""
     changes: dict[str, Any] = {"material.chain_density": 0.0, "geometry.outer_radius": 3.0, "supports.ends": "free"}
     changes |= {"loads.elongation": {"value": 0.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}}
-    looked, confirm = [], Change.confirm
-    monkeypatch.setattr(Change, "confirm", lambda *arguments: looked.append(1) or confirm(*arguments))
+    looked, confirm = [], Continuation.repeat_in_substeps
+    monkeypatch.setattr(Continuation, "confirm", lambda *arguments: looked.append(1) or confirm(*arguments))
     (whole,), _ = radii(thin_tube(3.15, **changes))
     assert looked and not warnings(caplog)
     small, _ = radii(thin_tube(3.15, **changes, **{"time.step": 0.1}))
@@ -86,7 +86,7 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
 def test_where_a_step_is_expected_to_end_is_no_start_of_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
     """An increment like the last one changes the volume of a stiff body: its first Newton step is short, no way far."""
     looked: list[int] = []
-    monkeypatch.setattr(Change, "confirm", lambda *arguments: looked.append(1))
+    monkeypatch.setattr(Continuation, "confirm", lambda *arguments: looked.append(1))
     found = []
     for predictor in ("autoregressive", "none"):
         scene = thick_tube(1e3, "displacement").with_values(
@@ -109,15 +109,15 @@ def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
         far = wide.unknown.x.array.copy()
     solve, starts = GuardedNewton.solve, [far]
 
-    def misled(newton: GuardedNewton, origin: Any = None, roughly: bool = False) -> Any:
+    def misled(newton: GuardedNewton, origin: Any = None, loose_tolerance: bool = False) -> Any:
         if starts:
             first = newton.unknown.x.array.copy()
             newton.unknown.x.array[:] = starts.pop()
-            solution = solve(newton, origin, roughly)
+            solution = solve(newton, origin, loose_tolerance)
             assert np.abs(newton.unknown.x.array - first).max() > 1.0
             object.__setattr__(solution, "reach", 10.0)
             return solution
-        return solve(newton, origin, roughly)
+        return solve(newton, origin, loose_tolerance)
 
     monkeypatch.setattr(GuardedNewton, "solve", misled)
     found, _ = radii(thin_tube(0.29, **{"solver.relative_tolerance": 1e-9}))

@@ -10,9 +10,9 @@ import pytest
 import ufl
 
 from remodel_fenicsx.fem import jit, quadrature
-from remodel_fenicsx.model.tensors import passes_through_zero
+from remodel_fenicsx.model.tensors import determinant_changes_sign
 from remodel_fenicsx.schema.settings import Cells, Material
-from remodel_fenicsx.solver.equilibrium import Extension, Look
+from remodel_fenicsx.solver.equilibrium import StateLimits, PointState
 from remodel_fenicsx.solver.newton import SolveFailure
 from tests import parts
 from tests.conftest import slowly
@@ -134,7 +134,7 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     made = stretched_bar(4.0)
     start = made.displacement.x.array.copy()
     problem = made.problem(parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}}))
-    real, harmless = problem.look, Look(Extension(0.5, 0.5, (0.0, 0.0, 0.0)), *np.zeros((3, 0)))
+    real, harmless = problem.look, PointState(StateLimits(0.5, 0.5, (0.0, 0.0, 0.0)), *np.zeros((3, 0)))
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
     guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
     monkeypatch.setattr(problem, "look", guard)
@@ -153,12 +153,14 @@ def test_a_straight_way_through_a_collapsed_volume_is_seen() -> None:
     good = (np.linalg.det(before) > 0) & (np.linalg.det(after) > 0)
     before, after = before[good], after[good]
     lowest = np.min([np.linalg.det(before + s * (after - before)) for s in np.linspace(0, 1, 401)], axis=0)
-    found = passes_through_zero(before, after)
+    found = determinant_changes_sign(before, after)
     assert np.all(found[lowest <= 0]) and np.all(lowest[found] < 1e-3)
     assert 0.02 < found.mean() < 0.2
     half_a_turn = np.diag([-1.0, -1.0, 1.0])[None]
-    assert passes_through_zero(np.eye(3)[None], half_a_turn) and not passes_through_zero(half_a_turn, half_a_turn)
-    assert not passes_through_zero(np.eye(3)[None], np.full((1, 3, 3), np.nan))  # others refuse that
+    assert determinant_changes_sign(np.eye(3)[None], half_a_turn) and not determinant_changes_sign(
+        half_a_turn, half_a_turn
+    )
+    assert not determinant_changes_sign(np.eye(3)[None], np.full((1, 3, 3), np.nan))  # others refuse that
 
 
 def test_no_point_that_turns_is_left_out() -> None:
@@ -169,12 +171,13 @@ def test_no_point_that_turns_is_left_out() -> None:
     F = F[np.linalg.det(F) > 0]
     for size in (1e-3, 0.1, 0.3, 1.0):
         G = F + size * rng.normal(size=F.shape)
-        expected = passes_through_zero(F, G)
+        expected = determinant_changes_sign(F, G)
         for at in range(len(F)):
             ends = [
-                Look(problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1]) for X in (F, G)
+                PointState(problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1])
+                for X in (F, G)
             ]
-            assert problem.turns_inside_out(*ends) == expected[at]
+            assert problem.inverts_between(*ends) == expected[at]
     assert expected.any() and not expected.all()
 
 

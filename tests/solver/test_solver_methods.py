@@ -15,7 +15,7 @@ from remodel_fenicsx.fem import solver_methods as methods
 from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear
-from remodel_fenicsx.solver.linear import KeptFactor, Lagged, Secants
+from remodel_fenicsx.solver.linear import LaggedFactorisation, Lagged, LimitedMemoryUpdate
 from remodel_fenicsx.solver.newton import GuardedNewton
 from tests import parts
 from tests.parts import tube
@@ -48,13 +48,13 @@ def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]])
 
 
 # ---------------------------------------------------------------- what is chosen
-@pytest.mark.parametrize(("small", "reduced"), [(methods.SMALL_BODY, False), (methods.SMALL_REDUCTION, True)])
+@pytest.mark.parametrize(("small", "reduced"), [(methods.MAX_DIRECT_3D, False), (methods.MAX_DIRECT_REDUCED, True)])
 def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
-    large = methods.LARGE
+    large = methods.MIN_MULTIGRID
     for unknowns, method in ((small, "direct"), (small + 1, "lagged"), (large, "lagged"), (large + 1, "iterative")):
-        assert methods.chosen("auto", unknowns, reduced) == method
-        assert all(methods.chosen(name, unknowns, reduced) == name for name in methods.SOLVER_METHODS)
-    assert methods.chosen("auto", large + 1, reduced, multigrid=False) == "lagged"
+        assert methods.resolve_auto("auto", unknowns, reduced) == method
+        assert all(methods.resolve_auto(name, unknowns, reduced) == name for name in methods.SOLVER_METHODS)
+    assert methods.resolve_auto("auto", large + 1, reduced, multigrid=False) == "lagged"
 
 
 # ---------------------------------------------------------------- same states, other work
@@ -64,8 +64,8 @@ def test_all_methods_come_to_the_same_states(
     method: str, predictor: str, direct: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     factors = []
-    renew = KeptFactor.renew
-    monkeypatch.setattr(KeptFactor, "renew", lambda self, matrix: (factors.append(1), renew(self, matrix)))
+    renew = LaggedFactorisation.renew
+    monkeypatch.setattr(LaggedFactorisation, "renew", lambda self, matrix: (factors.append(1), renew(self, matrix)))
     simulation, rows = simulated(method, solver__predictor=predictor)
     assert_same(rows, direct)
     solver, iterations = simulation.stepper.coupling.newton, sum(row["newton_iterations"] for row in rows)
@@ -102,7 +102,7 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture, monkeypatch: py
     rng = np.random.default_rng(3)
     some = rng.standard_normal((30, 30))
     definite, indefinite, general = some @ some.T + np.eye(30), some + some.T, some + 30 * np.eye(30)
-    factor, kinds = KeptFactor(), []
+    factor, kinds = LaggedFactorisation(), []
     for values in (definite, indefinite, general, definite, 2 * definite):
         matrix = matrix_of(values)
         x, y = matrix.createVecs()
@@ -126,7 +126,7 @@ def test_a_tangent_that_stays_indefinite_is_refused_once(
     """CHOLMOD is asked again when MUMPS has found no negative pivot."""
     caplog.set_level(logging.INFO)
     monkeypatch.setattr(single, "is_available", lambda: False)
-    factor, packages = KeptFactor(), []
+    factor, packages = LaggedFactorisation(), []
     for shift in (-3.0, -2.0, -1.0, 1.0, 2.0):
         factor.renew(matrix_of(np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1))
         packages.append(factor.preconditioner.getFactorSolverType())
@@ -135,14 +135,16 @@ def test_a_tangent_that_stays_indefinite_is_refused_once(
     factor.close()
 
 
-needs_single = pytest.mark.skipif(not single.is_available(), reason="no header of CHOLMOD 5 (SuiteSparse 7) is here")
+needs_single = pytest.mark.skipif(
+    not single.has_single_precision(), reason="no header of CHOLMOD 5 (SuiteSparse 7) is here"
+)
 
 
 @needs_single
 def test_a_factor_in_single_precision_has_seven_digits_whatever_the_unit() -> None:
     some = np.random.default_rng(3).standard_normal((30, 30))
     values, unit = some @ some.T + np.eye(30), 1e150
-    x, factor = some[0], KeptFactor()
+    x, factor = some[0], LaggedFactorisation()
     matrix = matrix_of(unit * values)
     right, answer = matrix.createVecs()
     right.array[:] = x / unit
@@ -159,7 +161,7 @@ def test_a_factor_in_single_precision_has_seven_digits_whatever_the_unit() -> No
 @needs_single
 def test_an_indefinite_tangent_goes_from_single_precision_to_mumps_and_back(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    factor, found, negative = KeptFactor(), [], []
+    factor, found, negative = LaggedFactorisation(), [], []
     for shift in (1.0, -3.0, -2.0, 1.0, 2.0):
         values = np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1
         factor.renew(matrix_of(values))
@@ -182,11 +184,11 @@ def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
     softest: float, serves: bool, asked: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is off, or refuses what is definite, once; then CHOLMOD or MUMPS has all digits, now and the next time."""
-    calls, answers = [], KeptFactor._answers_in_single
-    monkeypatch.setattr(KeptFactor, "_answers_in_single", lambda *a: (calls.append(1), answers(*a))[1])
+    calls, answers = [], LaggedFactorisation._is_accurate_in_single
+    monkeypatch.setattr(LaggedFactorisation, "_answers_in_single", lambda *a: (calls.append(1), answers(*a))[1])
     axes = np.linalg.qr(np.random.default_rng(4).standard_normal((30, 30)))[0]
     values = axes @ np.diag(np.geomspace(softest, 1.0, 30)) @ axes.T
-    factor, matrix = KeptFactor(), matrix_of((values + values.T) / 2)
+    factor, matrix = LaggedFactorisation(), matrix_of((values + values.T) / 2)
     right, answer = matrix.createVecs()
     right.array[:] = axes[:, 0]
     for _ in range(2):
@@ -201,7 +203,7 @@ def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
 def test_a_kept_factor_stays_when_its_matrix_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     """In double precision: PETSc would make it anew by itself."""
     monkeypatch.setattr(single, "is_available", lambda: False)
-    matrix, factor = matrix_of(2 * np.eye(5)), KeptFactor()
+    matrix, factor = matrix_of(2 * np.eye(5)), LaggedFactorisation()
     x, y = matrix.createVecs()
     x.set(1.0)
     factor.renew(matrix)
@@ -225,7 +227,13 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
     assert 2 < max(made) <= 4 and "once more" not in caplog.text
 
     lagged = object.__new__(Lagged)
-    lagged._norms, lagged._due, lagged._always, lagged._before, lagged.secants = [], False, False, 0, Secants(SELF)
+    lagged._norms, lagged._due, lagged._always, lagged._before, lagged.secants = (
+        [],
+        False,
+        False,
+        0,
+        LimitedMemoryUpdate(SELF),
+    )
     monkeypatch.setattr(Lagged, "renew", lambda self: made.append(self.tangents))
     for lagged.tangents, every, given_up in ((2, False, False), (3, True, False), (4, True, False), (5, True, True)):
         made.clear()
@@ -233,7 +241,7 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
         assert (made == [lagged.tangents], lagged.given_up) == (every, given_up)
         assert not (every and lagged.improve(None, None, None, True))
         lagged._norms.clear()
-    lagged.keep_nothing()
+    lagged.disable_reuse()
     assert not lagged.given_up
 
 
@@ -308,7 +316,7 @@ def test_a_linear_problem_is_soon_solved_with_secants() -> None:
     matrix, right = matrix_of(values), rng.standard_normal(40)
     norms = {}
     for most in (0, 20):
-        secants = Secants(SELF)
+        secants = LimitedMemoryUpdate(SELF)
         x, residual = matrix.createVecs()
         for _ in range(25):
             residual.array[:] = values @ x.array - right

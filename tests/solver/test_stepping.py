@@ -11,8 +11,8 @@ from remodel_fenicsx.evolution.stepper import Stepper, times
 from remodel_fenicsx.scene.scene import Load, preset_scene
 from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.simulation import Simulation
-from remodel_fenicsx.solver.continuation import Blend, StepFailure, Work
-from remodel_fenicsx.solver.equilibrium import Extension
+from remodel_fenicsx.solver.continuation import CellHomotopy, StepFailure, Work
+from remodel_fenicsx.solver.equilibrium import StateLimits
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests import parts
 from tests.parts import cube, tube
@@ -102,10 +102,10 @@ def test_the_first_part_of_an_exchange_is_no_longer_than_its_bound(monkeypatch: 
     coupling: Any = stepper.coupling
     done, real = [0.0], GuardedNewton.solve
 
-    def noted(newton: GuardedNewton, origin: Any = None, roughly: bool = False) -> Solution:
+    def noted(newton: GuardedNewton, origin: Any = None, loose_tolerance: bool = False) -> Solution:
         if newton is not coupling.newton:
             done.append(float(coupling.blend.theta.value))
-        return real(newton, origin, roughly)
+        return real(newton, origin, loose_tolerance)
 
     monkeypatch.setattr(GuardedNewton, "solve", noted)
     monkeypatch.setattr(coupling.blend, "largest_part", lambda done: 0.1)
@@ -170,11 +170,11 @@ class Refusing:
         self.tried: list[float] = []
         self.accepted = [0.0]
 
-    def __call__(self, origin: Any = None, roughly: bool = False) -> Solution:
+    def __call__(self, origin: Any = None, loose_tolerance: bool = False) -> Solution:
         force = self.made.loading.values["force"]
         self.tried.append(force)
         if force - self.accepted[-1] > self.limit:
-            raise SolveFailure("too much", Solution(7, 7, extension=Extension(0.9, 0.5, (0.0, 0.0, 0.0))))
+            raise SolveFailure("too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0))))
         self.accepted.append(force)
         return Solution(3, 3)
 
@@ -200,7 +200,7 @@ def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(monkeyp
     refusing = Refusing(made, 2.5)
     real = refusing.__call__
 
-    def stricter_near_the_end(origin: Any = None, roughly: bool = False) -> Solution:
+    def stricter_near_the_end(origin: Any = None, loose_tolerance: bool = False) -> Solution:
         refusing.limit = 1.5 if refusing.accepted[-1] >= 6.0 else 2.5
         return real()
 
@@ -245,10 +245,10 @@ def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeyp
     coupling: Any = stepper.coupling
     tried: list[tuple[str, float]] = []
 
-    def refuse_the_first(newton: GuardedNewton, origin: Any = None, roughly: bool = False) -> Solution:
+    def refuse_the_first(newton: GuardedNewton, origin: Any = None, loose_tolerance: bool = False) -> Solution:
         tried.append(("loads" if newton is coupling.newton else "cells", made.loading.values["force"]))
         if len(tried) == 1:
-            raise SolveFailure("too much", Solution(7, 7, extension=Extension(0.9, 0.5, (0.0, 0.0, 0.0))))
+            raise SolveFailure("too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0))))
         return Solution(3, 3)
 
     monkeypatch.setattr(GuardedNewton, "solve", refuse_the_first)
@@ -281,7 +281,7 @@ def test_power_of_remodeling_is_the_derivative_of_the_stored_energy() -> None:
     for time in (1.0, 2.0, 4.5):  # steps that are not one: power is energy per time
         step = time - stepper.state.time
         power = stepper.advance(time).remodeling_power
-        blend = Blend(simulation.state, tissue, solver)
+        blend = CellHomotopy(simulation.state, tissue, solver)
         energy = {}
         for theta in (1e-4, -1e-4):
             blend.set(theta)

@@ -40,14 +40,14 @@ def test_one_process_does_many_commands(worker: Worker, tmp_path: Path) -> None:
     scene.write_text(pulled_cube(5000.0).to_toml())
     said = [tmp_path / f"{name}.txt" for name in ("one", "two", "three")]
     assert end_of(worker, ["validate", str(tmp_path / "nothing.toml")], said[0]) == 2
-    assert worker.last_words().endswith("nothing.toml: no such file; a scene is a TOML file")
+    assert worker.last_output().endswith("nothing.toml: no such file; a scene is a TOML file")
     assert end_of(worker, ["no-such-command"], said[1]) == 2  # argparse ends in a way of its own
     assert "no such file" not in said[1].read_text() and worker.is_alive and worker.process.pid == number
     worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], said[2])
     assert worker.poll() is None and worker.is_at_work
     os.kill(number, signal.SIGKILL)
     wait_for_one([worker], 300.0)
-    assert worker.poll() == -signal.SIGKILL and worker.last_words() == "killed by SIGKILL"
+    assert worker.poll() == -signal.SIGKILL and worker.last_output() == "killed by SIGKILL"
     assert end_of(worker, ["info"], said[2]) == -signal.SIGKILL  # who is not there does nothing
 
 

@@ -101,7 +101,7 @@ def test_what_was_stopped_goes_on(
         run(member.scene, member.folder, MPI.COMM_SELF)
     assert len(member.history()["time"]) == 3 and not member.is_complete()
     with forked_children(), closing(both):
-        both.do()
+        both.run_all()
     assert both.failed == {} and member.is_complete()
     whole = Recording(made[0] / "seed-3").history
     np.testing.assert_array_equal(member.history()["mean_stretch"], whole["mean_stretch"])

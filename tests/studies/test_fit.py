@@ -17,7 +17,7 @@ import pytest
 
 from remodel_fenicsx import Scene, SceneError, cli, preset_scene, read_scene
 from remodel_fenicsx.schema.settings import STRESS_UNITS
-from remodel_fenicsx.studies.fit import Problem, doubts, fit, minimised, read_measurements
+from remodel_fenicsx.studies.fit import Problem, data_warnings, fit, minimised, read_measurements
 from tests.conftest import Refused, forked_children
 from tests.runs import rows_of
 from tests.tables import rows
@@ -250,7 +250,7 @@ def test_a_simulation_that_stays_says_what_a_new_one_does(folder: Path, changes:
     x = np.log([unknown.start for unknown in problem.unknowns.values()])
     for far in (0.1, 4.0):
         problem.residuals(x + far)
-    for found, fresh in zip(problem.models(x + 0.02, problem.kept), problem.models(x + 0.02), strict=True):
+    for found, fresh in zip(problem.predictions(x + 0.02, problem.kept), problem.predictions(x + 0.02), strict=True):
         for name in fresh:
             np.testing.assert_allclose(found[name], fresh[name], rtol=1e-9)
 
@@ -263,7 +263,7 @@ def test_a_passive_test_of_remodeled_tissue(folder: Path) -> None:
     sd, state = "outer_radius = 0.01, inner_radius = 0.01", "state = 'after'\ntime = 40.0"
     data = written(folder, {"material.lame_mu": 3.0}, "after.csv", sd, state)
     problem = Problem(end, *read_measurements(data, end))
-    found = problem.models(np.log([3.0]))[0]
+    found = problem.predictions(np.log([3.0]))[0]
     assert found["outer_radius"][-1] == pytest.approx(expected["outer_radius"], rel=1e-8)
     assert found["inner_radius"][-1] == pytest.approx(expected["inner_radius"], rel=1e-8)
     virgin = inflated()[-1]
@@ -400,8 +400,8 @@ def test_numbers_of_another_kind_are_doubted(name: str, factor: float, said: str
     path.write_text("\n".join(map(",".join, table)))
     scene = read_scene(folder / "scene.toml")
     problem = Problem(scene, *read_measurements(folder / "data.toml", scene))
-    at_start = problem.models(np.log([unknown.start for unknown in problem.unknowns.values()]))
-    found = [*doubts(problem.tables, at_start, scene)]
+    at_start = problem.predictions(np.log([unknown.start for unknown in problem.unknowns.values()]))
+    found = [*data_warnings(problem.tables, at_start, scene)]
     assert len(found) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in found)
 
 

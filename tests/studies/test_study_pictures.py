@@ -10,14 +10,14 @@ import pytest
 from matplotlib.figure import Figure
 
 from remodel_fenicsx.scene.scene import preset_scene
-from remodel_fenicsx.studies.study import Answer, Page
+from remodel_fenicsx.studies.study import StudyResult, Page
 from remodel_fenicsx.studies.stability import Analysis
 from remodel_fenicsx.studies.trade import Trade
 from tests.studies.test_ensemble import of_seeds
 from tests.studies.test_trade import artery, compared
 
 
-def the_ensemble(seeds: int) -> Answer:
+def the_ensemble(seeds: int) -> StudyResult:
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length_unit": "mm"})
     time, rng = np.arange(151.0), np.random.default_rng(1)
     names = ("inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_outer", "max_chain_extension")
@@ -25,12 +25,12 @@ def the_ensemble(seeds: int) -> Answer:
     return of_seeds(scene, columns)
 
 
-def the_analysis(factor: float) -> Answer:
+def the_analysis(factor: float) -> StudyResult:
     factors = dict(zip(np.linspace(15.0, 150.0, 10), np.linspace(0.0, factor, 10), strict=True))
     return Analysis(preset_scene("kuhl-holzapfel-2007", "tube"), factors, "radial", 0.5)
 
 
-def the_trade(noise: float) -> Answer:
+def the_trade(noise: float) -> StudyResult:
     return Trade(artery(), compared(noise, **{"cells.initial": "random"} if noise else {}))
 
 
@@ -43,7 +43,11 @@ def the_trade(noise: float) -> Answer:
     (the_trade, 0.3, {"seconds of the processor"}),
 ])  # fmt: skip
 def test_a_picture_says_its_answer_and_every_word_can_be_read(
-    study: Callable[[float], Answer], value: float, labels: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    study: Callable[[float], StudyResult],
+    value: float,
+    labels: set[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found: list[tuple[Page, Figure]] = []
     save = Page.save_figure

@@ -52,7 +52,7 @@ def test_errors_are_differences_from_the_finest_and_trusted_where_that_is_finer_
             assert np.isnan(row.angle_error) and row.doubt == "the others are compared with it" and not row.on_front
             continue
         apart = made_up(row.setting).angles - finest.angles
-        assert row.angle_error == pytest.approx(trade.typical(apart))
+        assert row.angle_error == pytest.approx(trade.nanrms(apart))
         assert row.length_error == pytest.approx(np.abs(0.01 * apart[..., :2]).max(), rel=0.02)
     doubts = {name: rows[f"radial-{name}"].doubt for name in ("1-degree-1-step-1", "2-degree-2-step-0.5",
               "4-degree-2-step-1", "1-degree-1-step-0.25", "4-degree-2-step-0.25")}  # fmt: skip
@@ -151,7 +151,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         rows = np.arange(0.0, 20.5, step)
         s = 1 - np.exp(-0.1 * np.maximum(rows - step, 0.0))
         columns.append(np.interp(times, rows, np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))))
-    apart = [trade.typical(column - columns[2]) for column in columns[:2]]
+    apart = [trade.nanrms(column - columns[2]) for column in columns[:2]]
     np.testing.assert_allclose([float(entry["error_degrees"]) for entry in table[:2]], apart, rtol=1e-5)
     monkeypatch.setattr(trade, "TOLERANCES", (0.5,))
     code, said = traded(out, "0.001s")
@@ -173,7 +173,7 @@ def test_trusted_errors_of_the_artery_are_the_true_ones(tmp_path: Path) -> None:
         if not row.doubt:
             history = Recording(folder / f"{row.setting.name}-1").history
             angles = np.transpose([np.interp(times, history["time"], history[name]) for name in PROFILE])
-            ratios.append(row.angle_error / trade.typical(angles - (2 * fine - coarse)))
+            ratios.append(row.angle_error / trade.nanrms(angles - (2 * fine - coarse)))
     assert len(ratios) > 8 and np.mean([0.5 <= ratio <= 2.0 for ratio in ratios]) >= 0.8, sorted(ratios)
 
 

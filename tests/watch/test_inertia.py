@@ -14,8 +14,8 @@ from remodel_fenicsx import Scene, read_scene
 from remodel_fenicsx.evolution.stepper import Step
 from remodel_fenicsx.schema.settings import Cells
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.equilibrium import Extension
-from remodel_fenicsx.solver.diagnosis import Inertia, diagnosed
+from remodel_fenicsx.solver.equilibrium import StateLimits
+from remodel_fenicsx.solver.diagnosis import Inertia, diagnose_failure
 from remodel_fenicsx.solver.newton import SolveFailure, Solution
 from remodel_fenicsx.watch import stability as equilibrium_stability
 from remodel_fenicsx.watch.stability import EquilibriumStability
@@ -83,7 +83,7 @@ def test_a_pressure_that_follows_a_free_end_has_no_buckling_load(load: str, capl
     The symmetric part of its tangent is indefinite nevertheless. A dead thrust of this size is beyond Euler's load.
     """
     made = parts.body(parts.tendon(area=1.0), Cells(initial="isotropic"))
-    made.loading.hold_facets(made.domain.facet_tags.find(made.domain.faces["bottom"]))
+    made.loading.hold_facets(made.domain.facet_tags.emit(made.domain.faces["bottom"]))
     if load == "dead thrust":
         made.loading.add_dead_force("end", "top", component=2)
     else:
@@ -199,5 +199,5 @@ def test_more_elongation_than_chains_allow_is_chain_locking() -> None:
 @pytest.mark.parametrize(("left", "kind"), [(50.0, "solver tolerance"), (1e6, "")])
 def test_a_residual_that_is_almost_small_enough_is_a_matter_of_the_tolerance(left: float, kind: str) -> None:
     made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
-    failure = SolveFailure("refused", Solution(25, 25, extension=Extension(0.7, 1.0, (0.0, 0.0, 0.0))), left)
-    assert diagnosed(made.problem().newton, failure).kind == kind
+    failure = SolveFailure("refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), left)
+    assert diagnose_failure(made.problem().newton, failure).kind == kind

@@ -134,7 +134,7 @@ def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: flo
     # the third difference of f^k is f^(k-3) (f - 1)^3
     expected = 4e-5 * abs(factor) ** 3 * abs(factor - 1) ** 3 / 8
     assert swing.size == pytest.approx(expected, rel=1e-6)
-    assert scripted.watcher.said == (factor == -3.0)
+    assert scripted.watcher.is_reported == (factor == -3.0)
 
 
 @pytest.mark.parametrize(("coupling", "said"), [("staggered", True), ("extrapolated", True)])
@@ -143,14 +143,14 @@ def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(coupling: 
     law = {"remodeling__law": "tensor", "material__repulsion": "log", "remodeling__coupling": coupling}
     scripted = Scripted(-3.0, 4e-5, **law)
     scripted.passes(8)
-    assert scripted.watcher.said == said
+    assert scripted.watcher.is_reported == said
 
 
 def test_passes_around_a_rest_do_not_count() -> None:
     """Cells that go on after a rest jump. The same swing without one is warned of at 6, as above."""
     scripted = Scripted(-3.0, 4e-5)
     scripted.passes(8, rest=5)
-    assert not scripted.watcher.said
+    assert not scripted.watcher.is_reported
 
 
 # ---------------------------------------------------------------- cells that rest
