@@ -78,8 +78,9 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
     for name, region in regions.items():
         key, radius = f"regions.{name}.outer_radius", _outer(region, outer_radius)
         if not inner_radius < radius <= outer_radius:
-            limits = f"geometry.inner_radius = {format_value(inner_radius)}, at most outer_radius = {format_value(outer_radius)}"
-            raise validation_error(f"must be greater than {limits}", key, radius)
+            inner, outer = format_value(inner_radius), format_value(outer_radius)
+            rule = f"must be greater than geometry.inner_radius = {inner}, at most outer_radius = {outer}"
+            raise validation_error(rule, key, radius)
         if radius in seen:
             rule = f"regions.{seen[radius]} also ends at {format_value(radius)}; outer radii must differ"
             raise validation_error(rule, key, region.outer_radius)

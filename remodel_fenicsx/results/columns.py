@@ -93,8 +93,8 @@ class Observer(Watcher):
                 value = column.value(measurement)
                 if not isinstance(value, Real) or np.isinf(value):
                     error = RemodelError(
-                        f"the column {column.name!r} is {format_value(value)} at time {step.time:g}: must be a finite number, "
-                        "or nan where there is none"
+                        f"the column {column.name!r} is {format_value(value)} at time {step.time:g}: "
+                        "must be a finite number, or nan where there is none"
                     )
                     error.on_all_ranks = False
                     raise error

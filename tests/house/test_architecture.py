@@ -18,8 +18,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PACKAGE = "remodel_fenicsx"
 # what a room may import: itself, and those before it
-ROOMS = ("errors", "_renamed", "_lazy", "_version", "system", "schema", "model", "fem", "kernels", "schema.settings", "body",
-         "scene", "state", "solver", "evolution", "watch", "results", "report", "initial",
+ROOMS = ("errors", "_renamed", "_lazy", "_version", "system", "schema", "model", "fem", "kernels",
+         "schema.settings", "body", "scene", "state", "solver", "evolution", "watch", "results", "report", "initial",
          "simulation", "unloading", "running", "studies", "pictures", "recording", "cli", "parts",
          "extend")  # fmt: skip
 
