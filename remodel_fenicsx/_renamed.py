@@ -62,7 +62,6 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
     "CellField": {"ufl_cell": "symbolic_cell"},
     "WarnsOnce": {"of": "for_scene", "look": "check", "find": "emit", "said": "is_reported"},
     "WithParameters": {"of": "with_parameters"},
-    "advance": {"way": "strategy"},
     "hold_facets": {"way": "direction"},
     "ranked": {"of_absolute_time": "depends_on_absolute_time"},
 }

@@ -242,7 +242,7 @@ class Loading:
 
     def add_axial_force(self, name: str) -> None:
         """Add a force on the ends along z if the length is an unknown (`FreeLength`)."""
-        change = getattr(self.kinematics, "change_of_length", None)
+        change = getattr(self.kinematics, "length_change", None)
         if change is None:
             return
         dx = ufl.Measure("dx", domain=self.domain.mesh)

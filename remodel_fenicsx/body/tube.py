@@ -301,7 +301,7 @@ class Tube(RoundWall):
             FORCE,
             reductions=tuple(REDUCTIONS),
             makes_length_unknown=True,
-            value=partial(_of_the_end, "of_the_wall"),
+            value=partial(_of_the_end, "wall_force"),
             area=lambda shape: shape.section_area,
         ),
     }

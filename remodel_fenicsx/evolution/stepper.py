@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from remodel_fenicsx._renamed import with_old_arguments, with_old_names
+from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.coupling import Coupling, CouplingFactory
 from remodel_fenicsx.evolution.life_cycle import Remodels
@@ -414,7 +413,6 @@ class Stepper(LoadCaseSolver):
                 watcher.started(step)
         return step
 
-    @partial(with_old_arguments, "advance")
     def advance(
         self,
         time: float,

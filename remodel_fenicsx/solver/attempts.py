@@ -31,7 +31,7 @@ MADE_ANEW = Attempt(
     "Newton failed; retrying",
 )
 IN_PARTS = Attempt("in substeps: first the remodeled cells, then the loads; a failed substep is halved", "Change")
-STEP_REFUSED = Attempt("the step fails, with its cause and advice", "diagnosed")
+STEP_REFUSED = Attempt("the step fails, with its cause and advice", "diagnose_failure")
 SHORTER_STEP = Attempt(
     "with time.tolerance: a quarter of the step size, up to three times", "StepControl", "retrying with a smaller step"
 )

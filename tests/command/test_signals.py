@@ -55,7 +55,7 @@ STOPPED_WHILE_IT_COMPILES = """
 import os, signal, sys
 from remodel_fenicsx import cli
 from remodel_fenicsx.evolution.coupling import Staggered
-from remodel_fenicsx.solver.continuation import Blend
+from remodel_fenicsx.solver.continuation import CellHomotopy
 from remodel_fenicsx.system.interrupts import stopping_at_once
 whole = Staggered._solve
 def compiled(blend):
@@ -65,7 +65,7 @@ def in_parts(coupling, step, time, old_loads, loads, work, again):
     if coupling.state.number < 3:
         return whole(coupling, step, time, old_loads, loads, work, again)
     coupling._solve_in_parts(4.0, dict(coupling.state.loading.values), loads, work, None)
-Blend.equilibrium = property(compiled)
+CellHomotopy.equilibrium = property(compiled)
 Staggered._solve = in_parts
 sys.exit(cli.main(sys.argv[1:]))
 """

@@ -76,7 +76,7 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
     changes: dict[str, Any] = {"material.chain_density": 0.0, "geometry.outer_radius": 3.0, "supports.ends": "free"}
     changes |= {"loads.elongation": {"value": 0.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}}
     looked, confirm = [], Continuation.repeat_in_substeps
-    monkeypatch.setattr(Continuation, "confirm", lambda *arguments: looked.append(1) or confirm(*arguments))
+    monkeypatch.setattr(Continuation, "repeat_in_substeps", lambda *arguments: looked.append(1) or confirm(*arguments))
     (whole,), _ = radii(thin_tube(3.15, **changes))
     assert looked and not warnings(caplog)
     small, _ = radii(thin_tube(3.15, **changes, **{"time.step": 0.1}))
@@ -86,7 +86,7 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
 def test_where_a_step_is_expected_to_end_is_no_start_of_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
     """An increment like the last one changes the volume of a stiff body: its first Newton step is short, no way far."""
     looked: list[int] = []
-    monkeypatch.setattr(Continuation, "confirm", lambda *arguments: looked.append(1))
+    monkeypatch.setattr(Continuation, "repeat_in_substeps", lambda *arguments: looked.append(1))
     found = []
     for predictor in ("autoregressive", "none"):
         scene = thick_tube(1e3, "displacement").with_values(

@@ -98,7 +98,7 @@ def matrix_of(values: np.ndarray) -> Any:
 def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """In double precision: CHOLMOD, MUMPS for the indefinite and the unsymmetric one, and back; else no answer."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(single, "is_available", lambda: False)
+    monkeypatch.setattr(single, "has_single_precision", lambda: False)
     rng = np.random.default_rng(3)
     some = rng.standard_normal((30, 30))
     definite, indefinite, general = some @ some.T + np.eye(30), some + some.T, some + 30 * np.eye(30)
@@ -125,7 +125,7 @@ def test_a_tangent_that_stays_indefinite_is_refused_once(
 ) -> None:
     """CHOLMOD is asked again when MUMPS has found no negative pivot."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(single, "is_available", lambda: False)
+    monkeypatch.setattr(single, "has_single_precision", lambda: False)
     factor, packages = LaggedFactorisation(), []
     for shift in (-3.0, -2.0, -1.0, 1.0, 2.0):
         factor.renew(matrix_of(np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1))
@@ -185,7 +185,7 @@ def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
 ) -> None:
     """It is off, or refuses what is definite, once; then CHOLMOD or MUMPS has all digits, now and the next time."""
     calls, answers = [], LaggedFactorisation._is_accurate_in_single
-    monkeypatch.setattr(LaggedFactorisation, "_answers_in_single", lambda *a: (calls.append(1), answers(*a))[1])
+    monkeypatch.setattr(LaggedFactorisation, "_is_accurate_in_single", lambda *a: (calls.append(1), answers(*a))[1])
     axes = np.linalg.qr(np.random.default_rng(4).standard_normal((30, 30)))[0]
     values = axes @ np.diag(np.geomspace(softest, 1.0, 30)) @ axes.T
     factor, matrix = LaggedFactorisation(), matrix_of((values + values.T) / 2)
@@ -202,7 +202,7 @@ def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
 
 def test_a_kept_factor_stays_when_its_matrix_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     """In double precision: PETSc would make it anew by itself."""
-    monkeypatch.setattr(single, "is_available", lambda: False)
+    monkeypatch.setattr(single, "has_single_precision", lambda: False)
     matrix, factor = matrix_of(2 * np.eye(5)), LaggedFactorisation()
     x, y = matrix.createVecs()
     x.set(1.0)

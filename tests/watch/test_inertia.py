@@ -159,7 +159,7 @@ def test_a_dead_hydrostatic_load_beyond_rivlins(caplog: pytest.LogCaptureFixture
 def test_a_start_that_is_indefinite_is_told_apart(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(equilibrium_stability, "of_the_unloaded_body", lambda inertia: (1, -0.1))
+    monkeypatch.setattr(equilibrium_stability, "inertia_without_loads", lambda inertia: (1, -0.1))
     caplog.set_level(logging.INFO)
     run(pushed_cube(-20.0, **COLUMN, **{"remodeling.law": "none", "solver.unstable": "stop"}))
     assert not warnings(caplog)
