@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.assembly import integral
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
 from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import Load
@@ -82,9 +83,8 @@ class Loading:
         self._potentials: list[Potential] = []
         self._begins: dict[int, str] = {}  # where the strain is one number: the face from which it is counted
         self.has_caps = False
-        self.supports: dict[str, Potential | None] = (
-            {}
-        )  # by face: the potential of its springs, a function of u; None: held
+        # by face: the potential of its springs, a function of u; None: held
+        self.supports: dict[str, Potential | None] = {}
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
@@ -402,8 +402,7 @@ class Loading:
     # ------------------------------------------------------------ inside
     def _integral(self, measure: ufl.Measure) -> float:
         """Volume or area of the body."""
-        local = dolfinx.fem.assemble_scalar(jit.form(self.constant(1.0) * self.weight * measure))
-        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+        return integral(jit.form(self.constant(1.0) * self.weight * measure))
 
     def constant(self, value: float) -> Constant:
         """A number as an argument of kernels, so that another one compiles nothing."""

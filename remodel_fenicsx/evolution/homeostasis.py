@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.fem import assembly
@@ -183,7 +182,6 @@ class Homeostasis:
         """
         state, factor = self.state, 1.0
         coupling = self.stepper.coupling
-        assert isinstance(coupling, Staggered)
         changes = self._to_the_limit(time, work.residual)
         for _ in range(TAIL_PASSES):
             left = self._size(changes)
@@ -193,7 +191,8 @@ class Homeostasis:
             for part, change in zip(self.remodels, changes, strict=True):
                 part.follow(change, factor, time, residual)
             soon = state.time + 1 / self.stepper.slowest
-            found = attempted(partial(coupling.balanced, soon, loads, again=True), StepFailure)
+            balanced = partial(coupling.balanced, soon, loads, again=True)  # type: ignore[attr-defined]
+            found = attempted(balanced, StepFailure)
             if isinstance(found, StepFailure):
                 log.info("the tail of the path is not extrapolated further: %s", found)
                 state.restore(before)

@@ -19,6 +19,7 @@ from remodel_fenicsx.fem.assembly import (
     Remembered,
     assemble_matrix,
     create_matrix,
+    integral,
     of_all_ranks,
     over_ranks,
     second_derivative,
@@ -108,9 +109,8 @@ class PointStresses:
         if self._repulsion is not None:
             self.ufl = self.ufl.plus(F, self._repulsion.stress)
         kinematics = state.kinematics
-        if (
-            isinstance(kinematics, NaturalConfiguration) and kinematics.grows
-        ):  # amounts belong to the volume of the start, stresses to the present one
+        if kinematics.grows:  # amounts belong to the volume of the start, stresses to the present one
+            assert isinstance(kinematics, NaturalConfiguration)
             self.ufl = Stresses(*(stress / kinematics.volume_ratio() for stress in self.ufl))
 
     def refresh(self) -> None:
@@ -272,9 +272,8 @@ class Equilibrium:
         """Integral of W over the body."""
         if not self._energy_forms:
             self.compile_energy()
-        local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
         pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
-        return float(over_ranks(self.comm, local, MPI.SUM)) + pointwise
+        return sum(map(integral, self._energy_forms)) + pointwise
 
     def compile_energy(self) -> None:
         """Make `stored_energy` ready; apart, because a blend needs none."""
