@@ -66,6 +66,7 @@ KINDS: dict[str, Callable[[str], object]] = {
     **dict.fromkeys(("DATA", "DIR", "FILE", "FOLDER", "SCENE"), Path),
     **{"K": int, "LENGTH": float, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
 }
+# what a mark behind a value means: required, may be left out, one or more, may be given several times
 MARKS: dict[str, dict[str, Any]] = {
     "": {},
     "!": {"required": True},
