@@ -27,7 +27,6 @@ from remodel_fenicsx.system.environment import (
     check_usable,
     kernels,
     load_extensions,
-    reason_undrawable,
     reason_unusable,
     versions,
 )
@@ -201,10 +200,7 @@ def _parsed(arguments: list[str]) -> argparse.Namespace:
             silence = stack.enter_context(open(os.devnull, "w"))
             stack.enter_context(contextlib.redirect_stdout(silence))
             stack.enter_context(contextlib.redirect_stderr(silence))
-        found, rest = first.parse_known_args(arguments)
-        load_extensions(getattr(found, "with"))
-        if rest[:1] == ["figures"]:
-            raise RemodelError("figures: is a script now: ./with-fenicsx python3 demos/figures.py fig8")
+        load_extensions(getattr(first.parse_known_args(arguments)[0], "with"))
         return parser().parse_args(arguments)
 
 
@@ -286,7 +282,7 @@ VIEWING = """
         (default: %(default)s).
     -o --output FILE  Write to this new file, whose ending says the kind (default: {} in DIR,
         numbered when taken)."""
-COMPUTES, DRAWS = (reason_unusable,), (reason_undrawable,)
+COMPUTES = (reason_unusable,)
 
 
 # ---------------------------------------------------------------- the commands
@@ -362,7 +358,6 @@ def _report(options: argparse.Namespace) -> None:
     --time T+  Show these times beside each other, each the nearest recorded one (default: the
         last).
     """,
-    needs=DRAWS,
     alone=True,
 )
 def _picture(options: argparse.Namespace) -> None:
@@ -381,7 +376,6 @@ def _picture(options: argparse.Namespace) -> None:
     --frames N = 60  Show this many recorded times, 2 to 500 (default: %(default)s, or all where
         there are fewer).
     """,
-    needs=DRAWS,
     alone=True,
 )
 def _animate(options: argparse.Namespace) -> None:
@@ -556,7 +550,7 @@ def _answer(study: Callable[..., tuple[Path, Answer]], *wishes: object) -> int:
     --seed SEED = 1  Draw the Latin hypercube from this seed (default: %(default)s).
     """,
     _study("sweep"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _sweep(options: argparse.Namespace) -> int:
     """Run a scene with other numbers, and show how its end depends on them."""
@@ -574,7 +568,7 @@ def _sweep(options: argparse.Namespace) -> int:
     SCENE_AND_CHANGES,
     "--seeds N = 32  Use this many seeds (default: %(default)s; at least 2).",
     _study("ensemble"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _ensemble(options: argparse.Namespace) -> int:
     """Run a scene of random cells with many seeds."""
@@ -591,7 +585,7 @@ def _ensemble(options: argparse.Namespace) -> int:
         a larger budget goes on.
     """,
     _study("trade"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings: what each costs, and how far off it is."""
@@ -612,7 +606,7 @@ def _trade(options: argparse.Namespace) -> int:
         %(default)s).
     """,
     _study("fit"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _fit(options: argparse.Namespace) -> int:
     """Find numbers of a scene from measurements, with 95 % bands."""
@@ -631,7 +625,7 @@ def _fit(options: argparse.Namespace) -> int:
     --times N = 10  Look at N times of the run (default: %(default)s).
     """,
     QUIET,
-    needs=DRAWS + COMPUTES,
+    needs=COMPUTES,
 )
 def _stability(options: argparse.Namespace) -> None:
     """Run a scene and say whether its remodeling passes damp small errors or amplify them."""
@@ -645,13 +639,8 @@ def _stability(options: argparse.Namespace) -> None:
 def _info(options: argparse.Namespace) -> None:
     """Print the versions of the program and its libraries, the solvers and the BLAS."""
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
-    from remodel_fenicsx.kernels import is_available
 
-    found = versions() | {
-        "kept factors": f"in {'single' if is_available() else 'double'} precision",
-        "solver methods": ", ".join(SOLVER_METHODS),
-    }
-    for name, version in found.items():
+    for name, version in (versions() | {"solver methods": ", ".join(SOLVER_METHODS)}).items():
         _say(f"{name:16} {version}")
 
 

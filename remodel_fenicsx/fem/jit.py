@@ -189,27 +189,17 @@ class PointValues:
         return values[0] if len(values) == 1 else np.concatenate(values, axis=2)
 
 
-def library(
-    comm: MPI.Intracomm,
-    declarations: str,
-    source: str,
-    what: str,
-    seconds: int = 2,
-    include: Path | None = None,
-    libraries: tuple[str, ...] = (),
-) -> ModuleType:
+def library(comm: MPI.Intracomm, declarations: str, source: str, what: str) -> ModuleType:
     """Compile C functions of our own, or take them from the cache. Collective; says and raises what `form` does."""
     text = "\0".join([declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()])
     name = f"libremodel_{hashlib.sha256(text.encode()).hexdigest()[:40]}"
     failure: BaseException | None = None
     if comm.rank == 0 and not _is_cached(name):
         try:
-            with _compiling(name, what, seconds):
+            with _compiling(name, what, seconds=2):
                 builder = cffi.FFI()
                 builder.cdef(declarations)
-                folders = {"include_dirs": [f"{include}"], "library_dirs": [f"{include}/../lib"]} if include else {}
-                names = ["m", *libraries]
-                builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=names, **folders)
+                builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=["m"])
                 if not _is_cached(name):  # else by the run that this one has waited for
                     builder.compile(tmpdir=str(cache_folder()))
                     (cache_folder() / f"{name}.c.cached").touch()  # as FFCx does: last the end mark

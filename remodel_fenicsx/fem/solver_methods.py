@@ -110,8 +110,7 @@ REMOVED = {"exact": "was removed; take 'lagged', or 'direct' for a new tangent i
 """Methods of earlier versions, and what to take in their place."""
 
 # Factors that are kept, by what is known of the tangent, the best first; each but the last may be refused
-SINGLE, DEFINITE = "positive definite in single precision", "positive definite"  # both by CHOLMOD
-SYMMETRIC, GENERAL = "symmetric", "general"  # by MUMPS
+DEFINITE, SYMMETRIC, GENERAL = "positive definite", "symmetric", "general"  # by CHOLMOD; by MUMPS
 FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
     DEFINITE: {
         "pc_type": "cholesky",

@@ -2,8 +2,7 @@
 
 `Library` compiles the C files and calls them; there is a method for each function. Most stand for
 a function of the package: it is the reference, decides where C leaves a point open, and runs in its place with
-``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger. Those of `factor`, which calls CHOLMOD, stand for
-none: without them factors are PETSc's, in double precision.
+``REMODEL_FENICSX_KERNELS=numpy`` in the environment, for a debugger.
 
 =================== =====================================================================================
 in C                stands for
@@ -16,10 +15,6 @@ structure           model.cells.structure_tensor
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
-factor_new          kernels.SingleFactor
-factor_renew        kernels.SingleFactor.renew
-factor_solve        kernels.SingleFactor.solve
-factor_free         kernels.SingleFactor.close
 =================== =====================================================================================
 """
 
@@ -28,7 +23,6 @@ from __future__ import annotations
 import functools
 import logging
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -55,11 +49,9 @@ Flags = NDArray[np.bool_]
 FOLDER = Path(__file__).parent
 NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 NOT_FINITE = 2  # mark of a point with NaN or infinity
-HEADER = "suitesparse/cholmod.h"
 C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}  # of numpy's characters; all others are double
 NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
 """What tensor.c takes from Python: the numbers that tune."""
-FIRST = 5  # CHOLMOD's version that has single precision
 
 
 def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
@@ -96,19 +88,10 @@ def _say_so() -> None:
 class Library:
     """The functions of a C file, which can be called with arrays."""
 
-    def __init__(
-        self,
-        comm: MPI.Intracomm,
-        name: str,
-        what: str,
-        seconds: int = 2,
-        numbers: Mapping[str, float] = NO_NUMBERS,
-        include: Path | None = None,
-        libraries: tuple[str, ...] = (),
-    ):
+    def __init__(self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float] = NO_NUMBERS):
         text = source(name, numbers)
         called = "".join(f"{line};\n" for line in declarations(text))
-        module = jit.library(comm, called, text, what, seconds, include, libraries)
+        module = jit.library(comm, called, text, what)
         self._functions, self._ffi = module.lib, module.ffi
 
     def __call__(self, name: str, *arguments: Any) -> Any:
@@ -230,50 +213,3 @@ class TensorKernels:
         first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
         self.call("log_derivatives", len(C), C, A, first, matrices)
         return first, matrices
-
-
-# ---------------------------------------------------------------- factors in single precision, where CHOLMOD 5 is
-
-
-@functools.cache
-def include_folder() -> Path | None:
-    """Where CHOLMOD's header is; None, and a line in the log, where no version with single precision is."""
-    for folder in (Path(sys.prefix) / "include", Path("/usr/include"), Path("/usr/local/include")):
-        path = folder / HEADER
-        if path.is_file():
-            version = re.search(r"define CHOLMOD_MAIN_VERSION\s+(\d+)", path.read_text(encoding="utf-8"))
-            if version and int(version[1]) >= FIRST:
-                return folder
-    log.info("kept factors have double precision, for twice the time: no header of CHOLMOD %d or later is here", FIRST)
-    return None
-
-
-def is_available() -> bool:
-    """Whether such factors can be made here."""
-    return include_folder() is not None and not in_numpy()
-
-
-class SingleFactor:
-    """A factor L L^T of sparse symmetric matrices of one pattern, with seven digits."""
-
-    def __init__(self, starts: NDArray[np.int32], columns: NDArray[np.int32]):
-        self._call = Library(
-            MPI.COMM_SELF, "factor.c", "factors in single precision", include=include_folder(), libraries=("cholmod",)
-        )
-        self._handle: Any = self._call("factor_new", len(starts) - 1, starts, columns)
-        if not self._handle:
-            raise MemoryError("no memory for a factor in single precision")
-
-    def renew(self, values: Array) -> bool:
-        """Factorise the matrix with these values (entries,); whether it is positive definite to single precision."""
-        return bool(self._call("factor_renew", self._handle, values))
-
-    def solve(self, right: Array, answer: Array) -> bool:
-        """Write the answer (n,) to a right-hand side (n,); whether both are finite."""
-        return bool(self._call("factor_solve", self._handle, right, answer))
-
-    def close(self) -> None:
-        """Free its memory."""
-        if self._handle:
-            self._call("factor_free", self._handle)
-        self._handle = None

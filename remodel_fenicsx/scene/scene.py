@@ -54,7 +54,6 @@ from remodel_fenicsx.schema.settings import (
     UNLOADED,
     faces_of,
 )
-from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.tables import (
     Faults,
     IN_A_LIST,
@@ -78,6 +77,7 @@ from remodel_fenicsx.schema.units import (
     STRESS,
     STRESS_UNIT,
     NUMBER_TOO_LARGE,
+    convention_doubt,
     scene_units,
 )
 from remodel_fenicsx.system.interrupts import is_first_rank
@@ -198,7 +198,6 @@ def _times(ratio: float) -> str:
 
 PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}  # which may bring keys of [material]
 FORMAT = 2  # of recorded scenes: raised where a reader of the one before would not understand them
-COLUMNS_THAT_WENT = ("held_points",)  # runs of earlier versions may have asked for them
 MOST_TABLES = 200  # of one kind: each is checked against all others, and has columns of its own
 SLOW_REST = 3.0  # of k a, below which a wall with turnover takes more than about 5 T for a factor of e
 FORGOTTEN_AFTER = (
@@ -602,11 +601,9 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise fault(rule, "format", written)
     values = {**values, "format": FORMAT}
-    turnover, columns = presets.said(values, "remodeling", "turnover"), presets.said(values, "output", "columns")
+    turnover = presets.said(values, "remodeling", "turnover")
     if isinstance(turnover, Mapping) and "time" in turnover:  # as version 0.3.0 ran it, where it does not say
         values = merged({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
-    if isinstance(columns, list | tuple):
-        values = merged(values, {"output": {"columns": [name for name in columns if name not in COLUMNS_THAT_WENT]}})
     return values
 
 

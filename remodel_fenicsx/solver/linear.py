@@ -13,9 +13,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from remodel_fenicsx import kernels
 from remodel_fenicsx.fem.assembly import DegreeOne, degree_one, over_ranks, rigid_motions
-from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
+from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 if TYPE_CHECKING:
@@ -80,8 +79,6 @@ log = logging.getLogger(__name__)
 UNSYMMETRIC = 1e-10  # relative to the largest row: what a symmetric tangent may be unsymmetric by
 OVER = 3  # iterations over which the rate of convergence is taken, but for the first one
 SLOW_STEP = 2 / 3  # of `worth`: iterations of a step after which the next one starts with a new factor
-SINGLE_ERROR = 0.5  # relative, of the answer to the softest motion: 0.36 (40,800 unknowns) cost no iteration, for
-# L-BFGS learns such motions; above 1 a factor may even have another sign there
 MOST_RENEWALS = 6  # of one solve: what needs more is no matter of old factors; Newton's method goes on, as often again
 
 LAST, SURELY = 1e-5, 0.3  # relative, of a linear solve that ends it all: tried down to LAST; share of what is needed
@@ -102,16 +99,10 @@ class KeptFactor:
         self.preconditioner: PETSc.PC = None
         self._options: ProblemOptions | None = None
         self._kind = ""
-        self._takes_single = kernels.is_available()
-        self._single: kernels.SingleFactor | None = None
-        self._soft: PETSc.Vec = None  # the softest motion that is known: a vector of length one
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """PETSc asks for y, the inverse of the kept tangent times x; NaN where there is none: the solve then fails."""
-        if self._kind == SINGLE and self._single is not None:
-            if not self._single.solve(x.array_r, y.array_w):
-                y.set(np.nan)
-        elif self.preconditioner is None:
+        if self.preconditioner is None:
             y.set(np.nan)
         else:
             self.preconditioner.apply(x, y)
@@ -119,20 +110,12 @@ class KeptFactor:
     def renew(self, matrix: Mat) -> None:
         """Factorise a tangent. Where that fails there are no factors at all, and a log line."""
         symmetric = matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
-        kinds, refused = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL], False
+        kinds = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL]
         if symmetric and self._was_indefinite():
             kinds.remove(DEFINITE)  # most likely refused again
-        elif symmetric and self._takes_single:
-            answers = self._answers_in_single(matrix)
-            if answers:
-                return
-            if refused := answers is None:
-                kinds.remove(DEFINITE)  # most likely indefinite
         for kind in kinds:
             if self._factorised(kind, matrix):
                 break
-        if refused and self._kind == SYMMETRIC and not self._was_indefinite():
-            self._takes_single = False  # it refuses what is definite
 
     def is_definite(self, matrix: Mat) -> bool:
         """Whether a symmetric matrix is positive definite: CHOLMOD takes it."""
@@ -141,49 +124,12 @@ class KeptFactor:
         return taken
 
     def close(self) -> None:
-        """Free PETSc's objects and CHOLMOD's."""
-        self._let_go()
-        if self._single is not None:
-            self._single.close()
-            self._soft.destroy()
-        self._single = self._soft = None
-
-    def _let_go(self) -> None:
-        """Free the factor of PETSc."""
+        """Free PETSc's objects."""
         if self.preconditioner is not None:
             self.preconditioner.destroy()
         if self._options is not None:
             self._options.close()
         self.preconditioner, self._options, self._kind = None, None, ""
-
-    def _answers_in_single(self, matrix: Mat) -> bool | None:
-        """Whether a factor in single precision answers soft motions well enough; None where there is no such factor."""
-        starts, columns, values = matrix.getValuesCSR()
-        looks = 1
-        if self._single is None:
-            self._single, self._soft = kernels.SingleFactor(starts, columns), uneven(matrix.createVecRight())
-            looks = 2
-        if not self._single.renew(values):
-            log.info("the tangent cannot be factorised as %s", SINGLE)
-            return None
-        self._let_go()
-        self._kind = SINGLE
-        answer, back = self._soft.duplicate(), self._soft.duplicate()
-        for _ in range(looks):  # motions become softer from one to the next: there what rounding has done is largest
-            self.apply(None, self._soft, answer)
-            matrix.mult(answer, back)
-            back.axpy(-1.0, self._soft)
-            error = back.norm() / self._soft.norm()
-            answer.copy(self._soft)
-            self._soft.normalize()
-        answer.destroy()
-        back.destroy()
-        if error < SINGLE_ERROR:
-            return True
-        log.info("a factor in single precision is %.2g off", error)
-        self._kind = ""
-        uneven(self._soft)
-        return False
 
     def _was_indefinite(self) -> bool:
         """Whether the kept factor has negative pivots, which MUMPS counts of a symmetric tangent."""
@@ -191,7 +137,7 @@ class KeptFactor:
 
     def _factorised(self, kind: str, matrix: Mat) -> bool:
         if self._kind != kind:
-            self._let_go()
+            self.close()
             self._options = ProblemOptions(factor_options(kind), {})
             self.preconditioner, self._kind = PETSc.PC().create(self.comm), kind
             self._options.apply(self.preconditioner)
@@ -206,7 +152,7 @@ class KeptFactor:
             failed = True
         if failed:
             log.info("the tangent cannot be factorised as %s", kind)
-            self._let_go()
+            self.close()
         return not failed
 
 

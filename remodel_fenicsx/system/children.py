@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import gc
 import importlib
@@ -11,7 +12,6 @@ import os
 import re
 import resource
 import select
-import shutil
 import signal
 import subprocess
 import sys
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SECONDS_TO_END = 30.0  # seconds
+PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 SERVE, PART = "serve", "fit-part"  # commands of processes: of a worker, and of what it does for a fit
 
 
@@ -37,11 +38,7 @@ class Worker:
 
     def __init__(self) -> None:
         # -P: no module is taken from the working folder, which may be somebody else's
-        command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE]
-        if shutil.which("setpriv"):  # the signal comes from now on; who was killed before is not the parent any more
-            only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
-            command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
-        pipe = subprocess.PIPE
+        command, pipe = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE], subprocess.PIPE
         self.process = subprocess.Popen(
             command, env=environment_of_child(), stdin=pipe, stdout=pipe, text=True, bufsize=1
         )
@@ -97,6 +94,8 @@ def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
 
 def serve(command: Callable[[Sequence[str]], int]) -> int:
     """Do what a `Worker` asks for until it asks no more: the other end of its pipes."""
+    if sys.platform == "linux":  # SIGTERM where the other end is killed; before this call standard input has ended
+        ctypes.CDLL(None).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
             words, messages = json.loads(line)

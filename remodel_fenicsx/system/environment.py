@@ -109,12 +109,6 @@ def reason_unusable() -> str | None:
     return None
 
 
-def reason_undrawable() -> str | None:
-    """Why this environment cannot draw, or None."""
-    missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
-    return f"no {missing[0]}" if missing else None
-
-
 @functools.cache
 def blas_library() -> str:
     """Path of the BLAS that this process has loaded (Debian's links resolved), or `unknown`."""
