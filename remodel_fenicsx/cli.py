@@ -27,7 +27,6 @@ from remodel_fenicsx.system.environment import (
     check_usable,
     kernels,
     load_extensions,
-    drawing_problem,
     environment_problem,
     versions,
 )
@@ -67,6 +66,7 @@ TYPE_OF_METAVAR: dict[str, Callable[[str], object]] = {
     **dict.fromkeys(("DATA", "DIR", "FILE", "FOLDER", "SCENE"), Path),
     **{"K": int, "LENGTH": float, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
 }
+# what a mark behind a value means: required, may be left out, one or more, may be given several times
 MARKS: dict[str, dict[str, Any]] = {
     "": {},
     "!": {"required": True},
@@ -204,10 +204,7 @@ def _parsed(arguments: list[str]) -> argparse.Namespace:
             silence = stack.enter_context(open(os.devnull, "w"))
             stack.enter_context(contextlib.redirect_stdout(silence))
             stack.enter_context(contextlib.redirect_stderr(silence))
-        found, rest = first.parse_known_args(arguments)
-        load_extensions(getattr(found, "with"))
-        if rest[:1] == ["figures"]:
-            raise RemodelError("figures: replaced by a script: ./with-fenicsx python3 demos/figures.py fig8")
+        load_extensions(getattr(first.parse_known_args(arguments)[0], "with"))
         return parser().parse_args(arguments)
 
 
@@ -289,7 +286,7 @@ VIEWING = """
         (default: %(default)s).
     -o --output FILE  Output file; its suffix selects the format. Must not exist (default: {} in
         DIR, numbered if it exists)."""
-COMPUTES, DRAWS = (environment_problem,), (drawing_problem,)
+COMPUTES = (environment_problem,)
 
 
 # ---------------------------------------------------------------- the commands
@@ -363,7 +360,6 @@ def _report(options: argparse.Namespace) -> None:
     --time T+  Show these times next to each other, each the nearest recorded time (default: the
         last).
     """,
-    needs=DRAWS,
     alone=True,
 )
 def _picture(options: argparse.Namespace) -> None:
@@ -381,7 +377,6 @@ def _picture(options: argparse.Namespace) -> None:
     """
     --frames N = 60  Show at most N recorded times, 2 to 500 (default: %(default)s).
     """,
-    needs=DRAWS,
     alone=True,
 )
 def _animate(options: argparse.Namespace) -> None:
@@ -556,7 +551,7 @@ def _run_study(study: Callable[..., tuple[Path, StudyResult]], *wishes: object) 
     --seed SEED = 1  Seed of the Latin hypercube (default: %(default)s).
     """,
     _study_options("sweep"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _sweep(options: argparse.Namespace) -> int:
     """Run a scene over parameter values, and show how its end depends on them."""
@@ -574,7 +569,7 @@ def _sweep(options: argparse.Namespace) -> int:
     SCENE_AND_CHANGES,
     "--seeds N = 32  Number of seeds, at least 2 (default: %(default)s).",
     _study_options("ensemble"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _ensemble(options: argparse.Namespace) -> int:
     """Run a scene of random cells with many seeds."""
@@ -591,7 +586,7 @@ def _ensemble(options: argparse.Namespace) -> int:
         repeat the command with a larger budget to resume.
     """,
     _study_options("trade"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings, and show the cost and error of each."""
@@ -611,7 +606,7 @@ def _trade(options: argparse.Namespace) -> int:
         (default: %(default)s).
     """,
     _study_options("fit"),
-    needs=COMPUTES + DRAWS,
+    needs=COMPUTES,
 )
 def _fit(options: argparse.Namespace) -> int:
     """Fit parameters of a scene to measurements, with 95 % confidence intervals."""
@@ -630,7 +625,7 @@ def _fit(options: argparse.Namespace) -> int:
     --times N = 10  Analyse N times of the run (default: %(default)s).
     """,
     QUIET,
-    needs=DRAWS + COMPUTES,
+    needs=COMPUTES,
 )
 def _stability(options: argparse.Namespace) -> None:
     """Run a scene and report whether its remodeling passes damp or amplify small errors."""
@@ -644,13 +639,8 @@ def _stability(options: argparse.Namespace) -> None:
 def _info(options: argparse.Namespace) -> None:
     """Print the versions of the program and its libraries, the solvers and the BLAS."""
     from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
-    from remodel_fenicsx.kernels import has_single_precision
 
-    found = versions() | {
-        "factorisations": f"lagged, in {'single' if has_single_precision() else 'double'} precision",
-        "solver methods": ", ".join(SOLVER_METHODS),
-    }
-    for name, version in found.items():
+    for name, version in (versions() | {"solver methods": ", ".join(SOLVER_METHODS)}).items():
         _print(f"{name:16} {version}")
 
 

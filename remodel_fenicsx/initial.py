@@ -86,17 +86,6 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
             quadrature.values(function, (3, 3))[:] = values
         made = [NaturalConfiguration(one, present, closed, initial if grows else None) for one in made]
     cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, fibres)
-    if scene.natural.fibres and quadrature.shape[1] > 1:
-        from remodel_fenicsx.results.export import unevenness
-
-        tensors = domain.gather_elements(quadrature.element_mean(cells.structure_tensor()))
-        elements = domain.gather_mesh()[1]
-        if tensors is not None and elements is not None:
-            log.info(
-                "natural.fibres: files have element means, so the first row has an error from "
-                "variations inside elements; at nodes the means differ by up to %.1f %% of tr A",
-                100 * unevenness(elements, tensors),
-            )
     return [make_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 
 

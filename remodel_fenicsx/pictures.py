@@ -188,13 +188,11 @@ def _drawn(job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], boun
     """Draw the bodies of a sheet next to each other, at one scale."""
     columns = min(len(sheet), MOST_COLUMNS)
     rows = math.ceil(len(sheet) / columns)
-    size = [max(800, PANEL * columns), PANEL * rows + FOOT]
-    weights = [*[PANEL] * rows, FOOT]
     plotter: Any = new_plotter(
         off_screen=True,
-        window_size=size,
+        window_size=[max(800, PANEL * columns), PANEL * rows + FOOT],
         shape=(rows + 1, columns),
-        row_weights=weights,
+        row_weights=[*[PANEL] * rows, FOOT],
         groups=[(rows, slice(None))],
         border=False,
     )

@@ -38,7 +38,7 @@ from remodel_fenicsx.results.run_folder import (
 from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
 from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
-from remodel_fenicsx.scene.scene import REMOVED_COLUMNS, check_continuation, leaves
+from remodel_fenicsx.scene.scene import check_continuation, leaves
 from remodel_fenicsx.schema.settings import in_region
 from remodel_fenicsx.schema.tables import format_value
 from remodel_fenicsx.schema.text import read_toml
@@ -169,8 +169,6 @@ def _read_run(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tup
             scene_as_run(place)
             raise
         checkpoint, values = read_checkpoint(place), read_toml(place / SCENE)
-        for name in set(values.get("output", {}).get("columns", ())) & set(REMOVED_COLUMNS):
-            log.warning("resumes without the column %s, which this version does not have", name)
         if checkpoint is None:
             log.info("no checkpoint: restarting at t = 0")
         else:
@@ -255,7 +253,7 @@ def _record(
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     wants_report = report and scene.output.report and comm.rank == 0
-    after = LastStep(columns, state.number, state.time, REMOVED_COLUMNS) if state.number else None
+    after = LastStep(columns, state.number, state.time) if state.number else None
     if resumes:
         wanted = bool(scene.output.fields)
         raise_on_all_ranks(comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None)

@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from remodel_fenicsx._renamed import with_old_arguments, with_old_names
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.fem import jit
+from remodel_fenicsx.fem.assembly import integral
 from remodel_fenicsx.fem.kinematics import FullKinematics, Kinematics, field_degree
 from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import Load
@@ -86,9 +87,8 @@ class Loading:
         self._potentials: list[Potential] = []
         self._begins: dict[int, str] = {}  # by component of uniform strain: first constrained face
         self.has_caps = False
-        self.supports: dict[str, Potential | None] = (
-            {}
-        )  # by face: the potential of its springs, a function of u; None: fixed
+        # by face: the potential of its springs, a function of u; None: fixed
+        self.supports: dict[str, Potential | None] = {}
 
     # ------------------------------------------------------------ supports
     def hold_face(self, face: str, component: int) -> None:
@@ -417,8 +417,7 @@ class Loading:
     # ------------------------------------------------------------ inside
     def _integral(self, measure: ufl.Measure) -> float:
         """Return the volume or area of the body over a measure. Collective."""
-        local = dolfinx.fem.assemble_scalar(jit.form(self.constant(1.0) * self.weight * measure))
-        return float(np.real(self.domain.mesh.comm.allreduce(local, MPI.SUM)))
+        return integral(jit.form(self.constant(1.0) * self.weight * measure))
 
     def constant(self, value: float) -> Constant:
         """Return a number as an argument of kernels, so that another value needs no compilation."""

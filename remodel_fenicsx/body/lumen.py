@@ -306,13 +306,9 @@ def write_wall(
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))
     nodes = np.unique(outer)
     between = np.linalg.norm(wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1)
-    # Richardson extrapolation for parabolas: chords of half the length have a quarter of the error.
-    coarse, fine = (_signed_volume(wall.points, face) for face in (inner[:, :3], _halved(inner)))
     lines = [
         f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, {max(through, len(names))} through the wall",
-        f"thickness {between.min():.4g} to {between.max():.4g} at the nodes; volume of the lumen "
-        f"{(4 * fine - coarse) / 3:.5g}, of the flat triangles in {surface.name} "
-        f"{radius * area / 2:.5g}",
+        f"thickness {between.min():.4g} to {between.max():.4g} at the nodes",
         f"faces {', '.join(wall.faces)}; " + (f"regions {', '.join(names)}" if shares else "one region"),
     ]
     if wall.straight:

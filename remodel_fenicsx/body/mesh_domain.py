@@ -23,7 +23,7 @@ from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.body.mesh_file import MeshFile
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.assembly import raise_on_all_ranks, allreduce
+from remodel_fenicsx.fem.assembly import integral, raise_on_all_ranks
 from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.schema.settings import Support
 from remodel_fenicsx.schema.tables import SceneError
@@ -78,9 +78,8 @@ class MeshDomain(Domain):
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
         psi = harmonic(slopes(mesh, degree, dx), self.facets("inlet"), self.facets("outlet"))
         slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(mesh, np.float64(1.0))
-        parts = [float(np.real(dolfinx.fem.assemble_scalar(jit.form(value * dx)))) for value in (one, slope)]
-        volume, total = allreduce(self.comm, np.array(parts), MPI.SUM)
-        return float(volume / total)
+        volume, total = (integral(jit.form(value * dx)) for value in (one, slope))
+        return volume / total
 
 
 def shared(

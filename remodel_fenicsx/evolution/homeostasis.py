@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
-from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.fem import assembly
@@ -200,7 +199,6 @@ class Homeostasis:
         # their change decreases.
         state, factor = self.state, 1.0
         coupling = self.stepper.coupling
-        assert isinstance(coupling, Staggered)
         changes = self._to_the_limit(time, work.residual)
         for _ in range(TAIL_PASSES):
             size = self._size(changes)
@@ -210,7 +208,8 @@ class Homeostasis:
             for process, change in zip(self.remodels, changes, strict=True):
                 process.follow(change, factor, time, residual)
             soon = state.time + 1 / self.stepper.slowest
-            outcome = attempted(partial(coupling.solve_equilibrium, soon, loads, again=True), StepFailure)
+            equilibrium = partial(coupling.solve_equilibrium, soon, loads, again=True)  # type: ignore[attr-defined]
+            outcome = attempted(equilibrium, StepFailure)
             if isinstance(outcome, StepFailure):
                 log.info("extrapolation of the path stopped: %s", outcome)
                 state.restore(before)

@@ -201,9 +201,6 @@ def library(
     declarations: str,
     source: str,
     what: str,
-    seconds: int = 2,
-    include: Path | None = None,
-    libraries: tuple[str, ...] = (),
 ) -> ModuleType:
     """Compile the package's C functions, or take them from the cache. See `form`. Collective."""
     text = "\0".join([declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()])
@@ -211,12 +208,10 @@ def library(
     failure: BaseException | None = None
     if comm.rank == 0 and not _is_cached(name):
         try:
-            with _compiling(name, what, seconds):
+            with _compiling(name, what, seconds=2):
                 builder = cffi.FFI()
                 builder.cdef(declarations)
-                folders = {"include_dirs": [f"{include}"], "library_dirs": [f"{include}/../lib"]} if include else {}
-                names = ["m", *libraries]
-                builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=names, **folders)
+                builder.set_source(name, source, extra_compile_args=LIBRARY_FLAGS, libraries=["m"])
                 if not _is_cached(name):  # unless the run that this one waited for has compiled it
                     builder.compile(tmpdir=str(cache_folder()))
                     # The end mark comes last, as in FFCx.

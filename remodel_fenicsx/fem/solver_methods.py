@@ -115,9 +115,8 @@ REMOVED = {"exact": "was removed; use 'lagged', or 'direct' for a new tangent in
 
 # Lagged factorisations, the fastest first. Each but the last requires properties of the tangent and
 # may fail.
-# Both by CHOLMOD.
-SINGLE, DEFINITE = "Cholesky factorisation in single precision", "Cholesky factorisation"
-SYMMETRIC, GENERAL = "LDL^T factorisation", "LU factorisation"  # by MUMPS
+# By CHOLMOD, and by MUMPS.
+DEFINITE, SYMMETRIC, GENERAL = "Cholesky factorisation", "LDL^T factorisation", "LU factorisation"
 FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
     DEFINITE: {
         "pc_type": "cholesky",

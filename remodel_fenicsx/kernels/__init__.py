@@ -3,33 +3,26 @@
 `Library` compiles the C files like the forms, and calls their functions. Most functions in C
 replace a function in Python. That function is the reference of the tests, and computes the points
 that C leaves open. For a debugger it runs in place of C, with ``REMODEL_FENICSX_KERNELS=numpy`` in
-the environment. The functions of `factor`, which call CHOLMOD, replace none: without them
-factorisations are PETSc's, in double precision.
+the environment.
 
 =================== ============================================================
 in C                replaces
 =================== ============================================================
 principal           model.spectral.principal
 positive_direction  model.spectral.positive_direction
-drop_noise_shear       model.spectral.drop_noise_shear
+drop_noise_shear    model.spectral.drop_noise_shear
 squared_length      model.energy.squared_end_to_end_length
 structure           model.cells.structure_tensor
 log_sum             model.energy.log_sum
 log_derivatives     model.energy.log_derivatives
 target              model.laws.tensor_target
-factor_new          kernels.SingleFactor
-factor_renew        kernels.SingleFactor.renew
-factor_solve        kernels.SingleFactor.solve
-factor_free         kernels.SingleFactor.close
-=================== ============================================================
-"""
+=================== ====================================================="""
 
 from __future__ import annotations
 
 import functools
 import logging
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -56,12 +49,10 @@ Flags = NDArray[np.bool_]
 FOLDER = Path(__file__).parent
 NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 NOT_FINITE = 2  # flag of a point with NaN or infinity
-HEADER = "suitesparse/cholmod.h"
 # By numpy's type character; double for all others.
 C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}
 NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
 """Constants that tensor.c takes from Python."""
-MIN_CHOLMOD_VERSION = 5  # first version of CHOLMOD with single precision
 
 
 def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
@@ -99,19 +90,10 @@ def _log_numpy_once() -> None:
 class Library:
     """Functions of a C file that can be called with arrays."""
 
-    def __init__(
-        self,
-        comm: MPI.Intracomm,
-        name: str,
-        what: str,
-        seconds: int = 2,
-        numbers: Mapping[str, float] = NO_NUMBERS,
-        include: Path | None = None,
-        libraries: tuple[str, ...] = (),
-    ):
+    def __init__(self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float] = NO_NUMBERS):
         text = source(name, numbers)
         called = "".join(f"{line};\n" for line in declarations(text))
-        module = jit.library(comm, called, text, what, seconds, include, libraries)
+        module = jit.library(comm, called, text, what)
         self._functions, self._ffi = module.lib, module.ffi
 
     def __call__(self, name: str, *arguments: Any) -> Any:
@@ -234,57 +216,3 @@ class TensorKernels:
         first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
         self.call("log_derivatives", len(C), C, A, first, matrices)
         return first, matrices
-
-
-# ---------------------------------------------------------------- factorisations with CHOLMOD 5
-
-
-@functools.cache
-def include_folder() -> Path | None:
-    """Return the folder of CHOLMOD's header; log and return None if no version is new enough."""
-    for folder in (Path(sys.prefix) / "include", Path("/usr/include"), Path("/usr/local/include")):
-        path = folder / HEADER
-        if path.is_file():
-            version = re.search(r"define CHOLMOD_MAIN_VERSION\s+(\d+)", path.read_text(encoding="utf-8"))
-            if version and int(version[1]) >= MIN_CHOLMOD_VERSION:
-                return folder
-    log.info(
-        "CHOLMOD %d headers not found; lagged factorisations use double precision " "and take about twice the time",
-        MIN_CHOLMOD_VERSION,
-    )
-    return None
-
-
-def has_single_precision() -> bool:
-    """Return whether factorisations in single precision are available."""
-    return include_folder() is not None and not uses_numpy()
-
-
-class SinglePrecisionFactor:
-    """Cholesky factorisation L L^T of sparse matrices of one pattern, with seven digits."""
-
-    def __init__(self, starts: NDArray[np.int32], columns: NDArray[np.int32]):
-        self._call = Library(
-            MPI.COMM_SELF,
-            "factor.c",
-            "factorisations in single precision",
-            include=include_folder(),
-            libraries=("cholmod",),
-        )
-        self._handle: Any = self._call("factor_new", len(starts) - 1, starts, columns)
-        if not self._handle:
-            raise MemoryError("no memory for a factorisation in single precision")
-
-    def renew(self, values: Array) -> bool:
-        """Factorise a matrix of values (entries,). Return whether it is positive definite."""
-        return bool(self._call("factor_renew", self._handle, values))
-
-    def solve(self, right: Array, answer: Array) -> bool:
-        """Write the solution (n,) of a right-hand side (n,). Return whether both are finite."""
-        return bool(self._call("factor_solve", self._handle, right, answer))
-
-    def close(self) -> None:
-        """Free the memory of the factorisation."""
-        if self._handle:
-            self._call("factor_free", self._handle)
-        self._handle = None

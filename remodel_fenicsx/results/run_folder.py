@@ -137,9 +137,6 @@ class LastStep(NamedTuple):
     columns: Sequence[str]
     number: int
     time: float
-    removed_columns: Sequence[
-        str
-    ] = ()  # columns of earlier versions: they stay in the file, and are empty from there on
 
 
 class History:
@@ -216,7 +213,7 @@ def size_of_rows(path: Path, after: LastStep) -> int:
         right = False
     if not right:
         raise RecordingError(f"{path}: lacks rows: the checkpoint belongs to {rows} rows up to time {after.time:g}")
-    if [name for name in found if name not in after.removed_columns] != list(after.columns):
+    if found != list(after.columns):
         raise RecordingError(f"{path}: has other columns than this run; output.columns must stay as it was")
     return sum(map(len, lines))
 

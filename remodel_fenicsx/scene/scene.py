@@ -55,7 +55,6 @@ from remodel_fenicsx.schema.settings import (
     UNLOADED,
     faces_of,
 )
-from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.tables import (
     Faults,
     IN_A_LIST,
@@ -79,6 +78,7 @@ from remodel_fenicsx.schema.units import (
     STRESS,
     STRESS_UNIT,
     NUMBER_TOO_LARGE,
+    convention_doubt,
     scene_units,
 )
 from remodel_fenicsx.system.interrupts import is_first_rank
@@ -206,7 +206,6 @@ def _format_factor(ratio: float) -> str:
 # components that may bring keys of [material]
 PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSIONS}
 FORMAT = 2  # format of recorded scenes; increased if earlier versions could not read them
-REMOVED_COLUMNS = ("held_points",)  # columns of earlier versions
 # per kind of table; each table is checked against all others and has its own columns
 MOST_TABLES = 200
 # value of k a below which a wall with turnover takes more than about 5 T for a factor of e
@@ -622,13 +621,9 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
         rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
         raise validation_error(rule, "format", written)
     values = {**values, "format": FORMAT}
-    turnover, columns = presets.said(values, "remodeling", "turnover"), presets.said(values, "output", "columns")
+    turnover = presets.said(values, "remodeling", "turnover")
     if isinstance(turnover, Mapping) and "time" in turnover:  # defaults of version 0.3.0
         values = merge_nested({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
-    if isinstance(columns, list | tuple):
-        values = merge_nested(
-            values, {"output": {"columns": [name for name in columns if name not in REMOVED_COLUMNS]}}
-        )
     return values
 
 

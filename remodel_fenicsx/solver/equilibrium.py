@@ -19,6 +19,7 @@ from remodel_fenicsx.fem.assembly import (
     CachedValue,
     assemble_matrix,
     create_matrix,
+    integral,
     allgather,
     allreduce,
     second_derivative,
@@ -111,7 +112,8 @@ class PointStresses:
             self.ufl = self.ufl.plus(F, self._repulsion.stress)
         kinematics = state.kinematics
         # Amounts refer to the volume at the start, stresses to the present volume.
-        if isinstance(kinematics, NaturalConfiguration) and kinematics.grows:
+        if kinematics.grows:
+            assert isinstance(kinematics, NaturalConfiguration)
             self.ufl = Stresses(*(stress / kinematics.volume_ratio() for stress in self.ufl))
 
     def refresh(self) -> None:
@@ -274,9 +276,8 @@ class Equilibrium:
         """Return the integral of W over the body. Collective."""
         if not self._energy_forms:
             self.compile_energy()
-        local = sum(np.real(dolfinx.fem.assemble_scalar(form)) for form in self._energy_forms)
         pointwise = 0.0 if self.pointwise is None else self.pointwise.energy()
-        return float(allreduce(self.comm, local, MPI.SUM)) + pointwise
+        return sum(map(integral, self._energy_forms)) + pointwise
 
     def compile_energy(self) -> None:
         """Compile `stored_energy`, which `continuation.CellHomotopy` does not need. Collective."""

@@ -13,10 +13,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from remodel_fenicsx import kernels
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.fem.assembly import PMultigrid, degree_one, allreduce, rigid_body_modes
-from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SINGLE, SYMMETRIC, factor_options
+from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SYMMETRIC, factor_options
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 if TYPE_CHECKING:
@@ -83,10 +82,6 @@ UNSYMMETRIC = 1e-10  # largest unsymmetric part of a symmetric tangent, relative
 RATE_WINDOW = 3  # number of iterations for the rate of convergence, except for the first iteration
 # Iterations of a step, relative to `worth`, after which the next step factorises first.
 SLOW_STEP = 2 / 3
-# Relative error for the softest mode that is accepted in single precision. An error of 0.36
-# (40,800 unknowns) cost no iteration, because L-BFGS learns such modes. Above 1 a factorisation may
-# even have another sign there.
-SINGLE_ERROR = 0.5
 # Number of factorisations in a solve. If it needs more, lagging is not the cause: the solve
 # continues as Newton's method for as many more.
 MOST_RENEWALS = 6
@@ -112,16 +107,10 @@ class LaggedFactorisation:
         self.preconditioner: PETSc.PC = None
         self._options: ProblemOptions | None = None
         self._kind = ""
-        self._takes_single = kernels.has_single_precision()
-        self._single: kernels.SinglePrecisionFactor | None = None
-        self._softest_mode: PETSc.Vec = None  # the softest known mode, of norm one
 
     def apply(self, _: PC, x: Vec, y: Vec) -> None:
         """Apply the lagged factorisation: y = K^-1 x; NaN without one, and the solve fails."""
-        if self._kind == SINGLE and self._single is not None:
-            if not self._single.solve(x.array_r, y.array_w):
-                y.set(np.nan)
-        elif self.preconditioner is None:
+        if self.preconditioner is None:
             y.set(np.nan)
         else:
             self.preconditioner.apply(x, y)
@@ -129,20 +118,12 @@ class LaggedFactorisation:
     def renew(self, matrix: Mat) -> None:
         """Factorise a tangent. If that fails, log it and keep no factorisation."""
         symmetric = matrix.isSymmetric(UNSYMMETRIC * matrix.norm(PETSc.NormType.NORM_INFINITY))
-        kinds, refused = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL], False
+        kinds = [DEFINITE, SYMMETRIC, GENERAL] if symmetric else [GENERAL]
         if symmetric and self._was_indefinite():
             kinds.remove(DEFINITE)  # most likely fails again
-        elif symmetric and self._takes_single:
-            answers = self._is_accurate_in_single(matrix)
-            if answers:
-                return
-            if refused := answers is None:
-                kinds.remove(DEFINITE)  # most likely indefinite
         for kind in kinds:
             if self._factorised(kind, matrix):
                 break
-        if refused and self._kind == SYMMETRIC and not self._was_indefinite():
-            self._takes_single = False  # it failed although the matrix is positive definite
 
     def is_definite(self, matrix: Mat) -> bool:
         """Return whether CHOLMOD factorises a symmetric matrix, which is then positive definite."""
@@ -151,55 +132,12 @@ class LaggedFactorisation:
         return taken
 
     def close(self) -> None:
-        """Free the objects of PETSc and CHOLMOD."""
-        self._free_factor()
-        if self._single is not None:
-            self._single.close()
-            self._softest_mode.destroy()
-        self._single = self._softest_mode = None
-
-    def _free_factor(self) -> None:
-        """Free PETSc's factorisation."""
+        """Free PETSc's objects."""
         if self.preconditioner is not None:
             self.preconditioner.destroy()
         if self._options is not None:
             self._options.close()
         self.preconditioner, self._options, self._kind = None, None, ""
-
-    def _is_accurate_in_single(self, matrix: Mat) -> bool | None:
-        """Factorise in single precision. Return whether it is accurate, or None on failure."""
-        starts, columns, values = matrix.getValuesCSR()
-        looks = 1
-        if self._single is None:
-            self._single, self._softest_mode = kernels.SinglePrecisionFactor(starts, columns), fill_asymmetric(
-                matrix.createVecRight()
-            )
-            looks = 2
-        if not self._single.renew(values):
-            log.info("%s failed, the tangent is probably indefinite; " "using LDL^T in double precision", SINGLE)
-            return None
-        self._free_factor()
-        self._kind = SINGLE
-        answer, back = self._softest_mode.duplicate(), self._softest_mode.duplicate()
-        # Inverse iterations lead to softer modes, for which rounding errors are largest.
-        for _ in range(looks):
-            self.apply(None, self._softest_mode, answer)
-            matrix.mult(answer, back)
-            back.axpy(-1.0, self._softest_mode)
-            error = back.norm() / self._softest_mode.norm()
-            answer.copy(self._softest_mode)
-            self._softest_mode.normalize()
-        answer.destroy()
-        back.destroy()
-        if error < SINGLE_ERROR:
-            return True
-        log.info(
-            "single-precision factorisation rejected: relative error %.2g for the softest mode "
-            "(limit %g); using double precision", error, SINGLE_ERROR,
-        )  # fmt: skip
-        self._kind = ""
-        fill_asymmetric(self._softest_mode)
-        return False
 
     def _was_indefinite(self) -> bool:
         """Return whether MUMPS has counted negative pivots in its LDL^T factorisation."""
@@ -207,7 +145,7 @@ class LaggedFactorisation:
 
     def _factorised(self, kind: str, matrix: Mat) -> bool:
         if self._kind != kind:
-            self._free_factor()
+            self.close()
             self._options = ProblemOptions(factor_options(kind), {})
             self.preconditioner, self._kind = PETSc.PC().create(self.comm), kind
             self._options.apply(self.preconditioner)
@@ -222,7 +160,7 @@ class LaggedFactorisation:
             failed = True
         if failed:
             log.info("%s of the tangent failed", kind)
-            self._free_factor()
+            self.close()
         return not failed
 
 

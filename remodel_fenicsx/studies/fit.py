@@ -29,10 +29,17 @@ from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Load
-from remodel_fenicsx.schema.units import convention_doubt
 from remodel_fenicsx.schema.tables import Table, validation_error, format_value
 from remodel_fenicsx.schema.text import read_columns, read_toml
-from remodel_fenicsx.schema.units import FORCE, LENGTH, LENGTH_UNIT, STRESS, STRESS_UNIT, factor_to_scene
+from remodel_fenicsx.schema.units import (
+    FORCE,
+    LENGTH,
+    LENGTH_UNIT,
+    STRESS,
+    STRESS_UNIT,
+    convention_doubt,
+    factor_to_scene,
+)
 from remodel_fenicsx.initial import resolve_auto_settings
 from remodel_fenicsx.simulation import Simulation, reset_simulation
 from remodel_fenicsx.solver.continuation import StepFailure

@@ -7,6 +7,7 @@ import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,12 +30,9 @@ log = logging.getLogger(__name__)
 
 # ---------------------------------------------------------------- settings of a scene from coarse to fine
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
-STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
+STEPS = (8.0, 4.0, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
-MESHES = (  # refinement and step in the scene's own, degree
-    *((1, 1, 1.0), (2, 1, 1.0), (4, 1, 1.0), (8, 1, 1.0), (1, 2, 1.0), (2, 2, 1.0), (4, 2, 1.0)),
-    *((2, 1, 0.5), (2, 2, 0.5), (2, 2, 0.25), (4, 2, 0.25)),
-)
+MESHES = [*product((1, 2, 4), (1, 2), (1.0, 0.25))]  # refinement in the scene's own, degree, step in the scene's own
 SEEDS = 3  # of random cells
 COMPARED = 9  # times at which rows are compared, the last is the end
 KINEMATIC = "model.kinematics"

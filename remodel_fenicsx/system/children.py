@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import gc
 import importlib
@@ -11,7 +12,6 @@ import os
 import re
 import resource
 import select
-import shutil
 import signal
 import subprocess
 import sys
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SECONDS_TO_END = 30.0  # seconds until a worker is killed
+PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
 SERVE, PART = "serve", "fit-part"  # internal commands: of a worker, and of a parallel part of a fit
 
 
@@ -37,12 +38,7 @@ class Worker:
 
     def __init__(self) -> None:
         # -P: import no module from the working folder, which may belong to somebody else.
-        command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE]
-        # The signal is set from here on. If the parent died before, the process has another parent.
-        if shutil.which("setpriv"):
-            only_with_parent = ["sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"', str(os.getpid())]
-            command = ["setpriv", "--pdeathsig", signal.SIGTERM.name, *only_with_parent, *command]
-        pipe = subprocess.PIPE
+        command, pipe = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE], subprocess.PIPE
         self.process = subprocess.Popen(
             command, env=environment_of_child(), stdin=pipe, stdout=pipe, text=True, bufsize=1
         )
@@ -100,6 +96,8 @@ def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
 
 def serve(command: Callable[[Sequence[str]], int]) -> int:
     """Run the commands that a `Worker` sends, until it closes the pipe; return the exit code."""
+    if sys.platform == "linux":  # SIGTERM if the parent is killed; before this call standard input has ended
+        ctypes.CDLL(None).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
             words, messages = json.loads(line)

@@ -110,12 +110,6 @@ def environment_problem() -> str | None:
     return None
 
 
-def drawing_problem() -> str | None:
-    """Return why this environment cannot draw, or None."""
-    missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
-    return f"no {missing[0]}" if missing else None
-
-
 @functools.cache
 def blas_library() -> str:
     """Return the path of the loaded BLAS (Debian's links resolved), or "unknown"."""

@@ -188,13 +188,12 @@ def test_files_of_many_programs_are_the_same_surface(tmp_path: Path, capsys: pyt
 def test_elements_bend_as_the_smooth_lumen(
     bend: float, wide: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of an ellipse, whose curvature is nine times its mean at its tips, and of a torus: pi a b L."""
+    """Of an ellipse, whose curvature is nine times its mean at its tips, and of a torus."""
     points, triangles = tube(bend)
     file, path = written(tmp_path / "lumen.ply", points * [wide, 1, 1], triangles), tmp_path / "vessel.msh"
     assert wall(file, "--thickness", 0.5, "--size", 0.5, "-o", path) == 0
-    said = re.search(r"thickness ([\d.]+) to 0.5 at the nodes; volume of the lumen ([\d.]+)", capsys.readouterr().out)
+    said = re.search(r"thickness ([\d.]+) to 0.5 at the nodes", capsys.readouterr().out)
     assert said is not None and float(said[1]) > 0.48
-    assert float(said[2]) == pytest.approx(np.pi * wide * LENGTH, rel=1e-3)
     mesh = meshio.read(path)
     face = mesh.get_cells_type("triangle6")[mesh.get_cell_data("gmsh:physical", "triangle6") == 1]
     u, v = (np.array(each) for each in zip(*[(i / 16, j / 16) for i in range(17) for j in range(17 - i)], strict=True))
@@ -203,7 +202,8 @@ def test_elements_bend_as_the_smooth_lumen(
     x, y, z = np.moveaxis(np.einsum("np,fnd->fpd", shapes, mesh.points[face]), 2, 0)
     if bend:
         x = np.hypot(x + LENGTH / bend, z) - LENGTH / bend
-    assert np.abs((x / wide) ** 2 + y**2 - 1).max() < 0.03  # the flat triangles of the file: 0.004; of this size: 0.2
+    off = (x / wide) ** 2 + y**2 - 1
+    assert abs(off.mean()) < 2e-3 and np.abs(off).max() < 0.03  # flat triangles of this size: 0.2
 
 
 def closed() -> tuple[Any, Any]:

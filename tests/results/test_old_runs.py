@@ -67,27 +67,6 @@ def test_it_goes_on_as_if_this_version_had_begun_it(folder: Path, tmp_path: Path
     assert said in (folder / "run.log").read_text()
 
 
-def test_it_goes_on_without_a_column_that_went(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Rows of before keep it, new ones leave it empty, and the log says so."""
-    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values(
-        {"time.end": 2.0, "output.columns": ["asleep_share"]}
-    )
-    folder = run(scene, tmp_path / "run")
-    for name in ("scene.toml", "history.csv"):
-        (folder / name).write_text((folder / name).read_text().replace("asleep_share", "held_points"))
-    for path in folder.glob("checkpoint*.npz"):
-        with np.load(path) as file:
-            arrays = dict(file)
-        arrays["header"] = np.frombuffer(arrays["header"].tobytes().replace(b"asleep_share", b"held_points"), np.uint8)
-        np.savez(path, **arrays)
-    assert cli.main(["run", "--resume", str(folder), "--set", "time.end=4", "-q", "--no-report"]) == 0
-    found = Recording(folder)
-    assert not found.scene.output.columns and len(found.times) == 5
-    assert np.isnan(found.history["held_points"][3:]).all()
-    assert "resumes without the column held_points" in (folder / "run.log").read_text()
-    assert found.report().stat().st_size > 10_000
-
-
 def newer_scene(folder: Path) -> None:
     """Of a later format."""
     text = (folder / "scene.toml").read_text()

@@ -12,7 +12,6 @@ from petsc4py import PETSc
 
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.fem import solver_methods as methods
-from remodel_fenicsx import kernels as single
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.solver import linear
 from remodel_fenicsx.solver.linear import LaggedFactorisation, Lagged, LimitedMemoryUpdate
@@ -95,10 +94,9 @@ def matrix_of(values: np.ndarray) -> Any:
     return matrix
 
 
-def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In double precision: CHOLMOD, MUMPS for the indefinite and the unsymmetric one, and back; else no answer."""
+def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
+    """CHOLMOD, MUMPS for the indefinite and the unsymmetric one, and back; else no answer."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(single, "has_single_precision", lambda: False)
     rng = np.random.default_rng(3)
     some = rng.standard_normal((30, 30))
     definite, indefinite, general = some @ some.T + np.eye(30), some + some.T, some + 30 * np.eye(30)
@@ -120,12 +118,9 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture, monkeypatch: py
     factor.close()
 
 
-def test_a_tangent_that_stays_indefinite_is_refused_once(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tangent_that_stays_indefinite_is_refused_once(caplog: pytest.LogCaptureFixture) -> None:
     """CHOLMOD is asked again when MUMPS has found no negative pivot."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(single, "has_single_precision", lambda: False)
     factor, packages = LaggedFactorisation(), []
     for shift in (-3.0, -2.0, -1.0, 1.0, 2.0):
         factor.renew(matrix_of(np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1))
@@ -135,74 +130,8 @@ def test_a_tangent_that_stays_indefinite_is_refused_once(
     factor.close()
 
 
-needs_single = pytest.mark.skipif(
-    not single.has_single_precision(), reason="no header of CHOLMOD 5 (SuiteSparse 7) is here"
-)
-
-
-@needs_single
-def test_a_factor_in_single_precision_has_seven_digits_whatever_the_unit() -> None:
-    some = np.random.default_rng(3).standard_normal((30, 30))
-    values, unit = some @ some.T + np.eye(30), 1e150
-    x, factor = some[0], LaggedFactorisation()
-    matrix = matrix_of(unit * values)
-    right, answer = matrix.createVecs()
-    right.array[:] = x / unit
-    factor.renew(matrix)
-    factor.apply(None, right, answer)
-    error = np.abs(values @ (unit**2 * answer.array) - x).max()
-    assert 1e-12 < error < 1e-4 and factor.preconditioner is None
-    right.array[3] = np.nan
-    factor.apply(None, right, answer)
-    assert np.isnan(answer.array).all()
-    factor.close()
-
-
-@needs_single
-def test_an_indefinite_tangent_goes_from_single_precision_to_mumps_and_back(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    factor, found, negative = LaggedFactorisation(), [], []
-    for shift in (1.0, -3.0, -2.0, 1.0, 2.0):
-        values = np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1
-        factor.renew(matrix_of(values))
-        mumps = factor.preconditioner
-        found.append((mumps is None, 0 if mumps is None else mumps.getFactorMatrix().getMumpsInfog(12)))
-        negative.append(int((np.linalg.eigvalsh(values) < 0).sum()))
-    assert found == list(zip([True, False, False, False, True], negative, strict=True)) and max(negative) > 1
-    assert [r.message for r in caplog.records] == [
-        "Cholesky factorisation in single precision failed, the tangent is probably indefinite; "
-        "using LDL^T in double precision"
-    ]
-    factor.close()
-
-
-@needs_single
-@pytest.mark.parametrize(
-    ("softest", "serves", "asked"), [(1e-6, True, 2), (1e-7, True, 2), (5e-9, False, 2), (1e-9, False, 1)]
-)
-def test_soft_motions_that_single_precision_cannot_tell_have_a_factor_in_double(
-    softest: float, serves: bool, asked: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is off, or refuses what is definite, once; then CHOLMOD or MUMPS has all digits, now and the next time."""
-    calls, answers = [], LaggedFactorisation._is_accurate_in_single
-    monkeypatch.setattr(LaggedFactorisation, "_is_accurate_in_single", lambda *a: (calls.append(1), answers(*a))[1])
-    axes = np.linalg.qr(np.random.default_rng(4).standard_normal((30, 30)))[0]
-    values = axes @ np.diag(np.geomspace(softest, 1.0, 30)) @ axes.T
-    factor, matrix = LaggedFactorisation(), matrix_of((values + values.T) / 2)
-    right, answer = matrix.createVecs()
-    right.array[:] = axes[:, 0]
-    for _ in range(2):
-        factor.renew(matrix)
-        factor.apply(None, right, answer)
-        error = np.abs(softest * answer.array - axes[:, 0]).max()
-        assert error < (0.15 if serves else 1e-7) and (factor.preconditioner is None) == serves
-    assert len(calls) == asked
-    factor.close()
-
-
-def test_a_kept_factor_stays_when_its_matrix_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In double precision: PETSc would make it anew by itself."""
-    monkeypatch.setattr(single, "has_single_precision", lambda: False)
+def test_a_kept_factor_stays_when_its_matrix_changes() -> None:
+    """PETSc would make it anew by itself."""
     matrix, factor = matrix_of(2 * np.eye(5)), LaggedFactorisation()
     x, y = matrix.createVecs()
     x.set(1.0)

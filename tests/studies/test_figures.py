@@ -19,7 +19,6 @@ import remodel_fenicsx
 from docs.making import verification
 from docs.making.pages import read_table
 from remodel_fenicsx.scene.scene import Scene
-from tests.conftest import Refused
 from tests.forks import forked
 
 PACKAGE = Path(remodel_fenicsx.__file__).parent
@@ -54,13 +53,6 @@ def draw(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
 
 
 # ---------------------------------------------------------------- bad input
-
-
-def test_the_command_of_old_names_the_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused) -> None:
-    monkeypatch.chdir(tmp_path)
-    for words in (["figures"], ["figures", "fig7", "--format", "pdf", "-o", "out"]):
-        assert "./with-fenicsx python3 demos/figures.py fig8" in refused(*words)
-    assert os.listdir() == []
 
 
 @pytest.mark.parametrize(("arguments", "named"), [
