@@ -17,7 +17,7 @@ from remodel_fenicsx.body.tendon import draw_tendon
 from remodel_fenicsx.body.wall import Wall
 from remodel_fenicsx.body.tube import draw_tube
 
-WALL = Wall.of(1.0, 3.0, 8, {})
+WALL = Wall.from_regions(1.0, 3.0, 8, {})
 
 # file -> what is in it, as in the paper: Figs. 6 and 7
 MESHES = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import warnings
 from collections.abc import Callable, Mapping
 from typing import TypeVar, cast
@@ -108,6 +109,7 @@ def with_old_names(kind: Kind) -> Kind:
     for old in OLD_NAMES[owner]:
         setattr(kind, old, OldAttribute(owner, old))
     setattr(kind, "__init_subclass__", classmethod(overridden))
-    maker = "__new__" if issubclass(kind, tuple) else "__init__"
-    setattr(kind, maker, with_old_arguments(owner, getattr(kind, maker)))
+    if {*OLD_NAMES[owner].values()} & {*inspect.signature(kind).parameters}:
+        maker = "__new__" if issubclass(kind, tuple) else "__init__"
+        setattr(kind, maker, with_old_arguments(owner, getattr(kind, maker)))
     return kind

@@ -423,7 +423,7 @@ def test_a_scene_has_bounds(tmp_path: Path) -> None:
 def test_numbers_on_the_command_line_have_bounds(words: tuple[str, ...], tmp_path: Path) -> None:
     done = run(words[0], demo("cube"), *words[1:], cwd=tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert "allowed is a whole number from 1 to 10000" in done.stderr or "more than 100 parts" in done.stderr
+    assert "must be an integer from 1 to 10000" in done.stderr or "more than 100 parts" in done.stderr
     assert not list(tmp_path.iterdir())
 
 

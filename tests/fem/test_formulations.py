@@ -95,7 +95,7 @@ def test_the_guard_knows_j_where_the_formulation_takes_it() -> None:
     x, y, z = (2 * made.nodes - 1).T
     for sign in (-1.0, 1.0):
         made.set_displacement(0.15 * np.column_stack((y * z, x * z, sign * x * y)) - 0.3 * made.nodes)
-        at_points, at_centre = problem.look().jacobians.min(), problem.state.dilatation.jacobians().min()
+        at_points, at_centre = problem.evaluate().jacobians.min(), problem.state.dilatation.jacobians().min()
         assert at_centre == pytest.approx(0.7**3, rel=1e-12)
         assert (at_points > at_centre) == (sign < 0) and abs(at_points - at_centre) > 1e-3
         assert problem.extension().min_jacobian == min(at_points, at_centre)
@@ -247,7 +247,7 @@ def test_a_slope_of_the_pressure_is_no_noise() -> None:
         noise, quadrature = watcher.degrees(), watcher.quadrature
         with pytest.MonkeyPatch.context() as patch:
             beyond = quadrature.polynomial_residual
-            patch.setattr(quadrature, "beyond", lambda degree, values: beyond(0, values))
+            patch.setattr(quadrature, "polynomial_residual", lambda degree, values: beyond(0, values))
             assert noise < 0.4 * watcher.degrees()
 
 

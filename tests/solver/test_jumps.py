@@ -115,7 +115,7 @@ def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
             newton.unknown.x.array[:] = starts.pop()
             solution = solve(newton, origin, loose_tolerance)
             assert np.abs(newton.unknown.x.array - first).max() > 1.0
-            object.__setattr__(solution, "reach", 10.0)
+            object.__setattr__(solution, "displacement_ratio", 10.0)
             return solution
         return solve(newton, origin, loose_tolerance)
 

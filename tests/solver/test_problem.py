@@ -134,10 +134,10 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     made = stretched_bar(4.0)
     start = made.displacement.x.array.copy()
     problem = made.problem(parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}}))
-    real, harmless = problem.look, PointState(StateLimits(0.5, 0.5, (0.0, 0.0, 0.0)), *np.zeros((3, 0)))
+    real, harmless = problem.evaluate, PointState(StateLimits(0.5, 0.5, (0.0, 0.0, 0.0)), *np.zeros((3, 0)))
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
     guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
-    monkeypatch.setattr(problem, "look", guard)
+    monkeypatch.setattr(problem, "evaluate", guard)
     with pytest.raises(SolveFailure, match=r"reached r/L = 2\.72") as caught:
         problem.solve()
     assert problem.newton._snes.getConvergedReason() > 0 and problem.newton._snes.getFunctionNorm() < 1e-9
@@ -186,9 +186,9 @@ def test_a_state_that_is_not_finite_is_at_its_limits(number: float) -> None:
     """At its worst point r/L is infinite, J is no volume, and the other points stay as they are."""
     made = parts.body(cube(refinement=2), Cells(initial="isotropic"))
     problem = made.problem()
-    elsewhere = problem.look().stretches
+    elsewhere = problem.evaluate().stretches
     made.displacement.x.array[0] = number
-    look = problem.look()
+    look = problem.evaluate()
     bad = np.isinf(look.stretches)
     assert bad.any() and not look.extension.admissible
     assert look.extension.max_chain_extension == np.inf and look.extension.min_jacobian == -np.inf
