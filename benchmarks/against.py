@@ -30,23 +30,42 @@ def checkout(commit: str, into: Path) -> Path:
     """The folder of a state."""
     if Path(commit).is_dir():
         return Path(commit).resolve()
-    subprocess.run(["git", "clone", "--quiet", "--shared", "--no-checkout", str(PROJECT), str(into)], check=True)
+    subprocess.run(
+        ["git", "clone", "--quiet", "--shared", "--no-checkout", str(PROJECT), str(into)],
+        check=True,
+    )
     subprocess.run(["git", "-C", str(into), "checkout", "--quiet", commit], check=True)
     return into
 
 
-def processor_seconds(command: list[str], core: int, *paths: Path, folder: Path | None = None) -> float:
+def processor_seconds(
+    command: list[str], core: int, *paths: Path, folder: Path | None = None
+) -> float:
     """Of a command on one core with these paths of Python, which must succeed."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(map(str, paths)),
+        "OMP_NUM_THREADS": "1",
+    }
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(["taskset", "--cpu-list", str(core), *command], check=True, env=environment, cwd=folder)
+    subprocess.run(
+        ["taskset", "--cpu-list", str(core), *command], check=True, env=environment, cwd=folder
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def run(state: Path, scene: str, settings: list[str], folder: Path, core: int) -> float:
     """Processor seconds of a recorded run."""
-    command = [sys.executable, "-m", "remodel_fenicsx.cli", "run", str(state / scene), "-o", str(folder), "-q"]
+    command = [
+        sys.executable,
+        "-m",
+        "remodel_fenicsx.cli",
+        "run",
+        str(state / scene),
+        "-o",
+        str(folder),
+        "-q",
+    ]
     changes = [word for setting in settings for word in ("--set", setting)]
     return processor_seconds([*command, *changes], core, state, folder=state)
 
@@ -54,11 +73,16 @@ def run(state: Path, scene: str, settings: list[str], folder: Path, core: int) -
 def history(folder: Path) -> dict[float, dict[str, float]]:
     """Rows by time; without what was not computed."""
     with (folder / "history.csv").open() as file:
-        rows = [{name: float(value) for name, value in row.items() if value} for row in csv.DictReader(file)]
+        rows = [
+            {name: float(value) for name, value in row.items() if value}
+            for row in csv.DictReader(file)
+        ]
     return {row["time"]: row for row in rows}
 
 
-def farthest(one: dict[float, dict[str, float]], other: dict[float, dict[str, float]]) -> dict[str, float]:
+def farthest(
+    one: dict[float, dict[str, float]], other: dict[float, dict[str, float]]
+) -> dict[str, float]:
     """Largest difference of each column that both have, relative where values are above 1."""
     found: dict[str, float] = {}
     for time in one.keys() & other.keys():
@@ -70,7 +94,9 @@ def farthest(one: dict[float, dict[str, float]], other: dict[float, dict[str, fl
 
 def main() -> None:
     """Warm up, measure in turns, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("commit")
     parser.add_argument("--scene", default="demos/artery.toml")
     parser.add_argument("--steps", type=float, default=150, help="time.end")
@@ -82,13 +108,25 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         states = {"there": checkout(options.commit, Path(temporary) / "state"), "here": PROJECT}
-        settings = {"there": options.set + options.set_there, "here": options.set + options.set_here}
+        settings = {
+            "there": options.set + options.set_there,
+            "here": options.set + options.set_here,
+        }
         seconds, starts, rows = dict[str, list[float]](), dict[str, list[float]](), {}
-        step = ["1.0", *(word.split("=")[1] for word in options.set if word.startswith("time.step="))][-1]
+        step = [
+            "1.0",
+            *(word.split("=")[1] for word in options.set if word.startswith("time.step=")),
+        ][-1]
         for pair in range(options.pairs + 1):  # the first fills the caches
             for name, state in states.items():
                 folder = Path(temporary) / f"{name}-{pair}"
-                start = run(state, options.scene, [*settings[name], f"time.end={step}"], folder / "one", options.core)
+                start = run(
+                    state,
+                    options.scene,
+                    [*settings[name], f"time.end={step}"],
+                    folder / "one",
+                    options.core,
+                )
                 if pair:
                     asked = [*settings[name], f"time.end={options.steps}"]
                     total = run(state, options.scene, asked, folder / "all", options.core)
@@ -96,7 +134,9 @@ def main() -> None:
                     seconds.setdefault(name, []).append(total - start)
                     rows[name] = history(folder / "all")
     ratios = [here / there for here, there in zip(seconds["here"], seconds["there"], strict=True)]
-    print(f"{options.scene} to t = {options.steps:g}, against {options.commit}: processor seconds without the start")
+    print(
+        f"{options.scene} to t = {options.steps:g}, against {options.commit}: processor seconds without the start"
+    )
     for name in ("there", "here"):
         print(
             f"{name:6} {statistics.median(seconds[name]):8.2f} s "
@@ -104,7 +144,9 @@ def main() -> None:
             f"start {statistics.median(starts[name]):.2f} s"
         )
     print(f"ratio  {statistics.median(ratios):8.3f}   ({min(ratios):.3f} to {max(ratios):.3f})")
-    for name, difference in sorted(farthest(rows["there"], rows["here"]).items(), key=lambda pair: -pair[1]):
+    for name, difference in sorted(
+        farthest(rows["there"], rows["here"]).items(), key=lambda pair: -pair[1]
+    ):
         print(f"       {name:28} {difference:.1e}")
 
 

@@ -22,7 +22,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
 
-from docs.making.pages import DOCS, FIGURES, between_marks, by_column, markdown, panel_letters, read_table
+from docs.making.pages import (
+    DOCS,
+    FIGURES,
+    between_marks,
+    by_column,
+    markdown,
+    panel_letters,
+    read_table,
+)
 from remodel_fenicsx import read_scene
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.studies.study import COLOURS, STYLE, Page
@@ -34,7 +42,11 @@ STEPS = (5.0, 2.5, 1.25, 0.625)
 TUBE = Tube(inner_radius=1.0, outer_radius=3.0, length=0.5)
 FINEST = 0.15625  # of the limits, which are extrapolated from it and from twice as long steps
 PRINTED = {"remodeling.law": "explicit", "remodeling.frame": "material"}
-CONSISTENT = {"remodeling.law": "tensor", "remodeling.frame": "material", "material.repulsion": "log"}
+CONSISTENT = {
+    "remodeling.law": "tensor",
+    "remodeling.frame": "material",
+    "material.repulsion": "log",
+}
 
 
 class Scheme(NamedTuple):
@@ -48,10 +60,18 @@ class Scheme(NamedTuple):
 
 
 SCHEMES = {
-    "printed-staggered": Scheme("eq. (11), staggered", PRINTED, "staggered", ("staggered", 1), COLOURS[0]),
-    "printed-relaxed": Scheme("eq. (11), relaxed", PRINTED, "relaxed", ("staggered", 1), COLOURS[4]),
-    "tensor-staggered": Scheme("tensor, staggered", CONSISTENT, "staggered", ("extrapolated", 2), COLOURS[1]),
-    "tensor-extrapolated": Scheme("tensor, extrapolated", CONSISTENT, "extrapolated", ("extrapolated", 2), COLOURS[2]),
+    "printed-staggered": Scheme(
+        "eq. (11), staggered", PRINTED, "staggered", ("staggered", 1), COLOURS[0]
+    ),
+    "printed-relaxed": Scheme(
+        "eq. (11), relaxed", PRINTED, "relaxed", ("staggered", 1), COLOURS[4]
+    ),
+    "tensor-staggered": Scheme(
+        "tensor, staggered", CONSISTENT, "staggered", ("extrapolated", 2), COLOURS[1]
+    ),
+    "tensor-extrapolated": Scheme(
+        "tensor, extrapolated", CONSISTENT, "extrapolated", ("extrapolated", 2), COLOURS[2]
+    ),
 }
 CAPTION = (
     "Error against processor time",
@@ -62,10 +82,19 @@ Columns = dict[str, np.ndarray]
 
 
 # ---------------------------------------------------------------- error
-def layer(scheme: Scheme, cells: str, step: float, coupling: str) -> tuple[np.ndarray, np.ndarray, float]:
+def layer(
+    scheme: Scheme, cells: str, step: float, coupling: str
+) -> tuple[np.ndarray, np.ndarray, float]:
     """A and u at the end, and processor time of the steps."""
-    changes = {"geometry.length": 0.5, "cells.initial": cells, "output.fields": False, "remodeling.coupling": coupling}
-    scene = read_scene(ARTERY, ["time.end=40.0", f"time.step={step}"]).with_values(scheme.values | changes)
+    changes = {
+        "geometry.length": 0.5,
+        "cells.initial": cells,
+        "output.fields": False,
+        "remodeling.coupling": coupling,
+    }
+    scene = read_scene(ARTERY, ["time.end=40.0", f"time.step={step}"]).with_values(
+        scheme.values | changes
+    )
     domain = whole_tube(TUBE, (12, 8, 1), "hexahedron", 1, MPI.COMM_SELF)
     with made(scene, domain) as simulation:
         start = clock.process_time()
@@ -86,9 +115,15 @@ def errors() -> Iterator[dict[str, Any]]:
             key = cells, str(scheme.values)
             if key not in limits:
                 coupling, order = scheme.limit
-                fine, coarse = (layer(scheme, cells, step, coupling)[:2] for step in (FINEST, 2 * FINEST))
-                share = 0.0 if printed_random else 1 / (2**order - 1)  # of a law without a limit the finest steps
-                limits[key] = fine[0] + share * (fine[0] - coarse[0]), fine[1] + share * (fine[1] - coarse[1])
+                fine, coarse = (
+                    layer(scheme, cells, step, coupling)[:2] for step in (FINEST, 2 * FINEST)
+                )
+                share = (
+                    0.0 if printed_random else 1 / (2**order - 1)
+                )  # of a law without a limit the finest steps
+                limits[key] = fine[0] + share * (fine[0] - coarse[0]), fine[1] + share * (
+                    fine[1] - coarse[1]
+                )
             for step in STEPS:
                 tensor, unknown, spent = layer(scheme, cells, step, scheme.coupling)
                 apart = np.linalg.norm(tensor - limits[key][0], axis=(-1, -2))
@@ -133,7 +168,9 @@ def rows_of(table: Columns) -> Iterator[list[str]]:
             rows = (table["cells"] == cells) & (table["scheme"] == name)
             if rows.any():
                 at_one = rows & (table["step"] == 1.25)
-                A, u, spent = (float(table[key][at_one].item()) for key in ("error_A", "error_u", "seconds"))
+                A, u, spent = (
+                    float(table[key][at_one].item()) for key in ("error_A", "error_u", "seconds")
+                )
                 orders = (order(table, cells, name, key) for key in ("error_A", "error_u"))
                 yield [scheme.label, cells, f"{A:.1e}", f"{u:.1e}", *orders, f"{spent:.1f}"]
 
@@ -147,14 +184,18 @@ def page() -> str:
 
 def main() -> None:
     """Measure, draw, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--page", action="store_true", help="measure nothing")
     options = parser.parse_args()
     source = "benchmarks/couplings.py"
     if not options.page:
         Page(FIGURES, "couplings", *CAPTION).save_table(by_column(errors()), [source])
     with matplotlib.rc_context(STYLE):
-        Page(FIGURES, "couplings", *CAPTION).save_figure(draw(read_table(FIGURES / "couplings.csv")), source)
+        Page(FIGURES, "couplings", *CAPTION).save_figure(
+            draw(read_table(FIGURES / "couplings.csv")), source
+        )
     PAGE.write_text(page(), encoding="utf-8")
 
 

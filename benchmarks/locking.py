@@ -28,7 +28,11 @@ from tests.runs import made
 MESHES = [  # elements, their degree, and how many of them go around and through
     ("hexahedron", 1, 16, 8), ("hexahedron", 1, 32, 16), ("hexahedron", 2, 8, 4), ("tetrahedron", 1, 16, 8),
 ]  # fmt: skip
-COLUMNS_OF_CELLS = (*(f"fibre_angle_{place}" for place in ("inner", "middle", "outer")), "inner_radius", "outer_radius")
+COLUMNS_OF_CELLS = (
+    *(f"fibre_angle_{place}" for place in ("inner", "middle", "outer")),
+    "inner_radius",
+    "outer_radius",
+)
 RATIOS_OF_CELLS = (8.8, 100.0, 1e3, 1e4)  # lambda/mu
 
 
@@ -37,8 +41,13 @@ def tube_rows() -> Iterator[list[str]]:
     for element, degree, around, through in MESHES:
         for name, formulation in FORMULATIONS.items():
             if formulation.applies_to(element, degree):
-                scene = thick_tube(1e2, name).with_values({"mesh.element": element, "mesh.degree": degree})
-                scenes = [scene.with_values({"material.lame_lambda": 3.103 * ratio}) for ratio in (1e2, 1e3, 1e4)]
+                scene = thick_tube(1e2, name).with_values(
+                    {"mesh.element": element, "mesh.degree": degree}
+                )
+                scenes = [
+                    scene.with_values({"material.lame_lambda": 3.103 * ratio})
+                    for ratio in (1e2, 1e3, 1e4)
+                ]
                 cells = [tube_cell(one, (around, through, 1)) for one in scenes]
                 yield [f"{element} {degree}", f"{around} x {through}", name, *cells]
 
@@ -49,7 +58,11 @@ def tube_cell(scene: Scene, divisions: tuple[int, int, int]) -> str:
     domain = tube(1.0, 3.0, 1.0, 1, mesh.element, mesh.degree, MPI.COMM_SELF, divisions)
     with made(scene, domain) as simulation:
         rows = [step.row for step in simulation.steps()]
-        missing = sum(LockingWarning(simulation.stepper, FORMULATIONS[mesh.formulation].locks).missing_deformation())
+        missing = sum(
+            LockingWarning(
+                simulation.stepper, FORMULATIONS[mesh.formulation].locks
+            ).missing_deformation()
+        )
     off = (rows[-1]["inner_radius"] - 1.0) / EXACT_TUBE - 1
     iterations = sum(row["newton_iterations"] for row in rows)
     return f"{100 * off:+.2f} % ({100 * missing:.3g} %), {iterations:.0f}"
@@ -65,10 +78,15 @@ def turning_rows() -> Iterator[list[str]]:
             )]  # fmt: skip
 
 
-def turning_tube(ratio: float, radius: float, pressure: float, degree: int, formulation: str) -> Scene:
+def turning_tube(
+    ratio: float, radius: float, pressure: float, degree: int, formulation: str
+) -> Scene:
     """Isotropic cells that turn by the law "tensor" for two times 1/kappa."""
     ramp = [[0, 0], [20, 1]]
-    loads = {"pressure": {"value": pressure, "ramp": ramp}, "elongation": {"value": 0.1, "ramp": ramp}}
+    loads = {
+        "pressure": {"value": pressure, "ramp": ramp},
+        "elongation": {"value": 0.1, "ramp": ramp},
+    }
     return Scene(
         geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": radius, "length": 2.0},
         material={"lame_lambda": 3.103 * ratio}, cells={"initial": "isotropic"}, model={"kinematics": "radial"},
@@ -92,7 +110,9 @@ def turning_cell(scene: Scene, exact: np.ndarray) -> str:
 def reference_cells(ratio: float, radius: float, pressure: float) -> np.ndarray:
     """Angles as means over the elements of the mesh, and radii, by 200 quadratic elements and steps of 0.5."""
     material, size = RadialMaterial(lame_lambda=3.103 * ratio, lame_mu=3.103), (radius - 1) / 8
-    found = solve_radial(pressure, 0.1, 20.0, 80.0, 0.5, law="tensor", outer_radius=radius, material=material)
+    found = solve_radial(
+        pressure, 0.1, 20.0, 80.0, 0.5, law="tensor", outer_radius=radius, material=material
+    )
     middle = (1 + radius) / 2
     places = ((1, 1 + size), (middle - size, middle + size), (radius - size, radius))
     angles = [found.mean_fibre_angle(*place) for place in places]
@@ -113,7 +133,9 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     over = [f"lambda/mu = {ratio}" for ratio in ("1e2", "1e3", "1e4")]
     tables = {
-        "turning": table(["R_o", "degree", "formulation", *map("{:g}".format, RATIOS_OF_CELLS)], turning_rows()),
+        "turning": table(
+            ["R_o", "degree", "formulation", *map("{:g}".format, RATIOS_OF_CELLS)], turning_rows()
+        ),
         "tube": table(["elements", "around x through", "formulation", *over], tube_rows()),
     }
     page = DOCS / "what_may_go_wrong.md"

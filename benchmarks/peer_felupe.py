@@ -26,7 +26,16 @@ PARTS = {
 }
 
 
-def energy(tm: Any, C: Any, cells: Any, mu: float, lmbda: float, modulus: float, contour: float, initial: float) -> Any:
+def energy(
+    tm: Any,
+    C: Any,
+    cells: Any,
+    mu: float,
+    lmbda: float,
+    modulus: float,
+    contour: float,
+    initial: float,
+) -> Any:
     """W of eqs. (4) and (6) per reference volume, of the energy factor 1; `cells`: three lengths, then three axes."""
     squared, repulsion = 0.0, 0.0
     for i in range(3):
@@ -93,7 +102,9 @@ class Tube:
         factor = min(time / float(given["ramp"]), 1.0)
         self.pressure.update(float(given["pressure"]) * factor)
         prescribed = np.concatenate([self.held, self.drawn])
-        values = np.concatenate([np.zeros(len(self.held)), np.full(len(self.drawn), float(given["drawn"]) * factor)])
+        values = np.concatenate(
+            [np.zeros(len(self.held)), np.full(len(self.drawn), float(given["drawn"]) * factor)]
+        )
         order = np.argsort(prescribed)
         prescribed, values = prescribed[order], values[order]
         free = np.setdiff1d(np.arange(self.field[0].values.size), prescribed)
@@ -116,7 +127,9 @@ def held_and_drawn(points: Any, given: Any) -> tuple[Any, Any]:
     inner = float(given["inner_radius"])
     held = [3 * np.flatnonzero(np.isclose(z, 0.0)) + 2]
     for place, component in (((inner, 0, 0), 1), ((-inner, 0, 0), 1), ((0, inner, 0), 0)):
-        held.append(3 * np.flatnonzero(np.isclose(points, place, atol=1e-9).all(axis=1)) + component)
+        held.append(
+            3 * np.flatnonzero(np.isclose(points, place, atol=1e-9).all(axis=1)) + component
+        )
     return np.concatenate(held), 3 * np.flatnonzero(np.isclose(z, float(given["length"]))) + 2
 
 
@@ -124,7 +137,9 @@ def main(problem: str, steps: str, tolerance: str, result: str, parts: str) -> N
     """Run, write the displacement and the number of iterations."""
     if parts == "jax":
         importlib.import_module("jax").config.update("jax_enable_x64", True)
-    warnings.simplefilter("error", RuntimeWarning)  # a chain at its full length: no number may come of it
+    warnings.simplefilter(
+        "error", RuntimeWarning
+    )  # a chain at its full length: no number may come of it
     tube, iterations = Tube(np.load(problem), parts), 0
     for number in range(1, int(steps) + 1):
         iterations += tube.step(float(number), float(tolerance))

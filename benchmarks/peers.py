@@ -32,7 +32,12 @@ OWN = ("solver.method=auto", "solver.predictor=autoregressive")
 
 def own(steps: int, folder: Path, options: argparse.Namespace) -> float:
     """Processor seconds of a run of ours."""
-    changes = [*OWN, f"solver.relative_tolerance={options.tolerance}", *options.set, f"time.end={steps}"]
+    changes = [
+        *OWN,
+        f"solver.relative_tolerance={options.tolerance}",
+        *options.set,
+        f"time.end={steps}",
+    ]
     return run(PROJECT, "demos/artery.toml", changes, folder, options.core)
 
 
@@ -69,9 +74,13 @@ def radii(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     """Measure in turns, compare, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("packages", type=Path, help="folder with felupe and tensortrax")
-    parser.add_argument("--parts", choices=("tensortrax", "jax"), default="tensortrax", help="jax: with Pardiso")
+    parser.add_argument(
+        "--parts", choices=("tensortrax", "jax"), default="tensortrax", help="jax: with Pardiso"
+    )
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--pairs", type=int, default=1)
     parser.add_argument("--core", type=int, default=0)
@@ -87,7 +96,9 @@ def main() -> None:
         first_of_other = other(1, folder / "problem.npz", folder / "first.npz", options)
         for pair in range(options.pairs):
             seconds = own(options.steps, folder / f"own-{pair}", options) - first
-            seconds_of_other = other(options.steps, folder / "problem.npz", folder / "other.npz", options)
+            seconds_of_other = other(
+                options.steps, folder / "problem.npz", folder / "other.npz", options
+            )
             seconds_of_other -= first_of_other
             recording, found = Recording(folder / f"own-{pair}"), np.load(folder / "other.npz")
             ours = radii(recording.points, recording.fields(float(options.steps))["displacement"])

@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remodel_fenicsx import Scene, preset_scene
-from remodel_fenicsx.studies.fit import PROFILE_TOLERANCE, Fit, Measured, Problem, Unknown, minimised, result_of
+from remodel_fenicsx.studies.fit import (
+    PROFILE_TOLERANCE,
+    Fit,
+    Measured,
+    Problem,
+    Unknown,
+    minimised,
+    result_of,
+)
 
 Array = NDArray[np.float64]
 
@@ -34,7 +42,11 @@ TRUTH = {
 PRESSURES = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
 VIRGIN_PRESSURES = np.array([0.1, *PRESSURES])
 TIMES = np.array([5.0, 10.0, 20.0, 30.0, 45.0, 60.0])
-RADIUS, FORCE, ANGLE = 0.01, 0.05, 5.0  # standard deviations: shares of the radius and of the largest force, degrees
+RADIUS, FORCE, ANGLE = (
+    0.01,
+    0.05,
+    5.0,
+)  # standard deviations: shares of the radius and of the largest force, degrees
 FACTOR = 2.0  # of the starts, to both sides
 
 
@@ -51,7 +63,10 @@ def tube() -> Scene:
 def unknowns(factors: Array) -> dict[str, Unknown]:
     """Those of `TRUTH`, from starts off by factors."""
     pairs = zip(TRUTH.items(), factors, strict=True)
-    return {key: Unknown(start=value * factor, lower=value / 1e2, upper=value * 1e2) for (key, value), factor in pairs}
+    return {
+        key: Unknown(start=value * factor, lower=value / 1e2, upper=value * 1e2)
+        for (key, value), factor in pairs
+    }
 
 
 def tables(scene: Scene) -> list[Measured]:
@@ -77,7 +92,11 @@ def filled(scene: Scene, empty: list[Measured]) -> list[Measured]:
     problem = Problem(scene, unknowns(np.ones(len(TRUTH))), empty)
     said = problem.predictions(np.log(list(TRUTH.values())))
     return [
-        replace(one, columns=one.columns | modelled, sd={name: _sd(name, modelled[name]) for name in one.sd})
+        replace(
+            one,
+            columns=one.columns | modelled,
+            sd={name: _sd(name, modelled[name]) for name in one.sd},
+        )
         for one, modelled in zip(empty, said, strict=True)
     ]
 
@@ -93,7 +112,8 @@ def noisy(tables_: list[Measured], random: np.random.Generator) -> list[Measured
     return [
         replace(
             one,
-            columns=one.columns | {n: one.columns[n] + sd * random.normal(size=one.rows) for n, sd in one.sd.items()},
+            columns=one.columns
+            | {n: one.columns[n] + sd * random.normal(size=one.rows) for n, sd in one.sd.items()},
         )
         for one in tables_
     ]
@@ -104,14 +124,18 @@ def fitted(scene: Scene, data: list[Measured], factors: Array) -> tuple[Fit, flo
     began = clock.process_time()
     problem = Problem(scene, unknowns(factors), data)
     rough = minimised(
-        problem, np.log([unknown.start for unknown in problem.unknowns.values()]), enough=PROFILE_TOLERANCE
+        problem,
+        np.log([unknown.start for unknown in problem.unknowns.values()]),
+        enough=PROFILE_TOLERANCE,
     )
     return result_of(problem, [minimised(problem, rough.x)]), clock.process_time() - began
 
 
 def main() -> None:
     """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--starts", type=int, default=12)
     parser.add_argument("--draws", type=int, default=20)
     options = parser.parse_args()
@@ -136,8 +160,12 @@ def main() -> None:
     last = ends[0][0]
     print(f"{same} of {options.starts} starts end in one minimum")
     for key, covered, low, high in zip(TRUTH, inside, *np.exp(last.band), strict=True):
-        print(f"{key}: the band covers the truth in {covered} of {options.draws}; +-{50 * np.log(high / low):.0f} %")
-    print(f"most runs {max(len(end.problem.known) for end, _ in ends)}, most seconds {max(s for _, s in ends):.1f}")
+        print(
+            f"{key}: the band covers the truth in {covered} of {options.draws}; +-{50 * np.log(high / low):.0f} %"
+        )
+    print(
+        f"most runs {max(len(end.problem.known) for end, _ in ends)}, most seconds {max(s for _, s in ends):.1f}"
+    )
 
 
 def _line(found: Fit, seconds: float) -> str:

@@ -37,7 +37,9 @@ PAPER = (16, 8, 12)  # elements around, through the wall, along
 
 def divisions(unknowns: int) -> tuple[int, int, int]:
     """Elements of a mesh like the paper's, with about so many unknowns."""
-    made = [tuple(max(1, round(4 * k * number / PAPER[0])) for number in PAPER) for k in range(1, 60)]
+    made = [
+        tuple(max(1, round(4 * k * number / PAPER[0])) for number in PAPER) for k in range(1, 60)
+    ]
     return min(made, key=lambda mesh: abs(3 * mesh[0] * (mesh[1] + 1) * (mesh[2] + 1) - unknowns))
 
 
@@ -50,7 +52,11 @@ def measure(unknowns: int, steps: int, method: str) -> None:
     begun = clock.perf_counter()
     body = Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
     simulation = Simulation(scene, comm, whole_tube(body, chosen, "hexahedron", 1, comm))
-    record: dict[str, Any] = {"divisions": chosen, "ranks": comm.size, "made": clock.perf_counter() - begun}
+    record: dict[str, Any] = {
+        "divisions": chosen,
+        "ranks": comm.size,
+        "made": clock.perf_counter() - begun,
+    }
     record |= {name: [] for name in ("wall", "cpu", "newton", "linear")}
     before, spent = clock.perf_counter(), clock.process_time()
     for step in simulation.steps():
@@ -59,7 +65,9 @@ def measure(unknowns: int, steps: int, method: str) -> None:
         record["newton"].append(step.work.newton_iterations)
         record["linear"].append(step.work.linear_iterations)
         before, spent = clock.perf_counter(), clock.process_time()
-        if len(record["wall"]) == steps:  # the last step of a run counts negative eigenvalues, which is no part of it
+        if (
+            len(record["wall"]) == steps
+        ):  # the last step of a run counts negative eigenvalues, which is no part of it
             break
     record["memory"] = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
     newton = simulation.stepper.coupling.newton
@@ -70,14 +78,29 @@ def measure(unknowns: int, steps: int, method: str) -> None:
 
 def run(unknowns: int, ranks: int, options: argparse.Namespace) -> None:
     """A case in processes of its own."""
-    command = [sys.executable, "-m", "mpi4py", __file__, "--case", str(unknowns), "--steps", str(options.steps)]
+    command = [
+        sys.executable,
+        "-m",
+        "mpi4py",
+        __file__,
+        "--case",
+        str(unknowns),
+        "--steps",
+        str(options.steps),
+    ]
     command += ["--method", options.method]
     start = ["mpirun", "-n", str(ranks), "--bind-to", "none"] if ranks > 1 else []
     environment = os.environ | {"PYTHONPATH": str(PROJECT), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([*start, *command], capture_output=True, text=True, env=environment)
-    said = [line.removeprefix("RECORD ") for line in done.stdout.splitlines() if line.startswith("RECORD ")]
+    said = [
+        line.removeprefix("RECORD ")
+        for line in done.stdout.splitlines()
+        if line.startswith("RECORD ")
+    ]
     if not said:
-        print(f"{unknowns} unknowns on {ranks} ranks: exit {done.returncode}\n{done.stderr[-1500:]}")
+        print(
+            f"{unknowns} unknowns on {ranks} ranks: exit {done.returncode}\n{done.stderr[-1500:]}"
+        )
         return
     record = json.loads(said[0])
     key = (record["unknowns"], ranks, record["method"])
@@ -89,7 +112,9 @@ def run(unknowns: int, ranks: int, options: argparse.Namespace) -> None:
 
 def read() -> list[dict]:
     """What was measured."""
-    return [json.loads(line) for line in RESULTS.read_text().splitlines()] if RESULTS.exists() else []
+    return (
+        [json.loads(line) for line in RESULTS.read_text().splitlines()] if RESULTS.exists() else []
+    )
 
 
 HEAD = ["unknowns", "ranks", "method", "wall s a step", "processor s", "Newton its", "linear its each",
@@ -100,14 +125,27 @@ def row(record: dict) -> list[str]:
     """Of the table."""
     size, steps = record["unknowns"], len(record["wall"])
     wall, cpu, newton, linear = (sum(record[name]) for name in ("wall", "cpu", "newton", "linear"))
-    numbers = (wall / steps, cpu / steps, newton / steps, linear / newton, 1e6 * wall / size / newton)
+    numbers = (
+        wall / steps,
+        cpu / steps,
+        newton / steps,
+        linear / newton,
+        1e6 * wall / size / newton,
+    )
     memory = (record["memory"] / 1e9, record["memory"] / size / 1e3)
-    return [f"{size:,}", f"{record['ranks']}", record["method"], *(f"{number:.3g}" for number in (*numbers, *memory))]
+    return [
+        f"{size:,}",
+        f"{record['ranks']}",
+        record["method"],
+        *(f"{number:.3g}" for number in (*numbers, *memory)),
+    ]
 
 
 def main() -> None:
     """Measure, or report."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--unknowns", type=int, action="append")
     parser.add_argument("--ranks", type=int, action="append")
     parser.add_argument("--steps", type=int, default=3)
@@ -119,7 +157,12 @@ def main() -> None:
         measure(options.case, options.steps, options.method)
         return
     if options.report:
-        print(markdown(HEAD, map(row, sorted(read(), key=lambda r: (r["unknowns"], r["ranks"], r["method"])))))
+        print(
+            markdown(
+                HEAD,
+                map(row, sorted(read(), key=lambda r: (r["unknowns"], r["ranks"], r["method"]))),
+            )
+        )
         return
     print(markdown(HEAD, []))
     for unknowns in options.unknowns or SIZES:

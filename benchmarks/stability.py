@@ -6,7 +6,8 @@
 
 A case ends as right, refused, unstable, warned, wrong or unchecked (docs/what_may_go_wrong.md says what each means).
 Each result is one line of results/stability/VERSION.jsonl. What is there is not run again: a run that was stopped
-goes on where it was. Results belong to the package as it was; another commit has benchmarks of its own."""
+goes on where it was. Results belong to the package as it was; another commit has benchmarks of its own.
+"""
 
 from __future__ import annotations
 

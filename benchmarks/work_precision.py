@@ -46,7 +46,10 @@ PARTS = ("artery", "paper", "whole")
 COARSE = (8.0, 4.0)  # tolerances, degrees, below what a study asks for
 RADIAL = {"model.kinematics": "radial"}
 TIMES = [5.0, 25.0, 45.0, 65.0, 85.0, 105.0, 125.0, 145.0, 150.0]
-REFERENCE = {"explicit": (150, 1 / 8, 1 / 16), "tensor": (60, 1 / 2, 1 / 4)}  # elements and steps, by law
+REFERENCE = {
+    "explicit": (150, 1 / 8, 1 / 16),
+    "tensor": (60, 1 / 2, 1 / 4),
+}  # elements and steps, by law
 # how the tables of docs/speed_and_accuracy.md were measured: the presets named this up to 0.2.0
 EVERY_TANGENT = {"solver.method": "direct", "solver.predictor": "with-tolerance"}
 # the whole tube is solved as a user would
@@ -129,9 +132,13 @@ class Kept:
             return
         rows = rows_of(as_run(setting).with_values({"output.times": TIMES}))
         asked = [next(row for row in rows if math.isclose(row["time"], time)) for time in TIMES]
-        angles, lengths = ([[row[n] for n in names] for row in asked] for names in (PROFILE, LENGTHS))
+        angles, lengths = (
+            [[row[n] for n in names] for row in asked] for names in (PROFILE, LENGTHS)
+        )
         seconds = np.array(sum(row["processor_seconds"] for row in rows))
-        self.keep(name, {"angles": np.array(angles), "lengths": np.array(lengths), "seconds": seconds})
+        self.keep(
+            name, {"angles": np.array(angles), "lengths": np.array(lengths), "seconds": seconds}
+        )
 
 
 LENGTHS = ("inner_radius", "outer_radius")
@@ -147,7 +154,8 @@ def settings(method: Method) -> list[Setting]:
     """The profiles, those of the ladder, and coarser ones."""
     base = scene(method)
     found = [
-        Setting(f"profile-{name}", base.with_values({**profile.values, **RADIAL})) for name, profile in PROFILES.items()
+        Setting(f"profile-{name}", base.with_values({**profile.values, **RADIAL}))
+        for name, profile in PROFILES.items()
     ]
     for tolerance in COARSE:
         coarse = base.with_values({**RADIAL, "time.tolerance": tolerance})
@@ -158,10 +166,18 @@ def settings(method: Method) -> list[Setting]:
 def whole(method: Method) -> list[Setting]:
     """The whole tube from coarse to fine: the price where no part stands for the body."""
     steps = [(*mesh, "step", step, {}) for mesh, every in method.steps.items() for step in every]
-    steps += [(1, 1, "tolerance", 1.0, {}), (1, 2, "tolerance", 0.5, {}), (1, 1, "step", 1.0, SELECTIVE)]
+    steps += [
+        (1, 1, "tolerance", 1.0, {}),
+        (1, 2, "tolerance", 0.5, {}),
+        (1, 1, "step", 1.0, SELECTIVE),
+    ]
     found = []
     for refinement, degree, kind, value, other in steps:
-        values = SOLVED | {"mesh.refinement": refinement, "mesh.degree": degree, f"time.{kind}": value} | other
+        values = (
+            SOLVED
+            | {"mesh.refinement": refinement, "mesh.degree": degree, f"time.{kind}": value}
+            | other
+        )
         name = f"whole-{refinement}-degree-{degree}-{kind}-{value:g}{'-selective-integration' if other else ''}"
         found.append(Setting(name, scene(method).with_values(values)))
     return sorted(found, key=lambda setting: setting.expected_seconds)
@@ -172,7 +188,9 @@ def reference(law: str, kept: Kept) -> tuple[Array, Array]:
     name = f"reference-{law}"
     if name not in kept:
         elements, *steps = REFERENCE[law]
-        (angles, radii), (finer_angles, finer_radii) = (_reference(law, step, int(elements)) for step in steps)
+        (angles, radii), (finer_angles, finer_radii) = (
+            _reference(law, step, int(elements)) for step in steps
+        )
         kept.keep(name, {"angles": 2 * finer_angles - angles, "radii": 2 * finer_radii - radii})
     return kept[name]["angles"], kept[name]["radii"]
 
@@ -182,7 +200,9 @@ def _reference(law: str, step: float, elements: int) -> tuple[Array, Array]:
     hats = profile_weights((history.points - 1.0) / 2.0) * history.areas[:, None]
     rows = [round(time / step) - 1 for time in TIMES]
     dimensions = history.dimensions[rows]
-    angles = np.degrees(np.arctan2(dimensions[..., 1], dimensions[..., 0])) @ hats / hats.sum(axis=0)
+    angles = (
+        np.degrees(np.arctan2(dimensions[..., 1], dimensions[..., 0])) @ hats / hats.sum(axis=0)
+    )
     return angles, np.stack([history.inner_radii[rows], history.outer_radii[rows]], axis=1)
 
 
@@ -205,7 +225,9 @@ def points(kept: Kept) -> Iterator[Point]:
         for setting in [*settings(method), *whole(method)]:
             if (file := f"{name}-{setting.name}") in kept:
                 run = kept[file]
-                apart, percent = run["angles"] - angles, 100 * np.max(np.abs(run["lengths"] / lengths - 1))
+                apart, percent = run["angles"] - angles, 100 * np.max(
+                    np.abs(run["lengths"] / lengths - 1)
+                )
                 numbers = run["seconds"], nanrms(apart), np.abs(apart).max(), percent
                 yield Point(name, setting.name, *map(float, numbers))
 
@@ -219,7 +241,11 @@ def report(kept: Kept) -> None:
     text = filled(Path(__file__).with_suffix(".template.md"), parts)
     (kept.folder / "tables.md").write_text(text, encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")
-    for name, made in {"paper": paper_rows(found), "front": best(found), "whole": best(whole_tube)}.items():
+    for name, made in {
+        "paper": paper_rows(found),
+        "front": best(found),
+        "whole": best(whole_tube),
+    }.items():
         text = between_marks(text, name, made)
     PAGE.write_text(text, encoding="utf-8")
     _draw(found)
@@ -253,7 +279,12 @@ def paper_rows(found: Sequence[Point]) -> str:
         f"{tube.typical:.2g}",
         f"{tube.anywhere:.2g}",
     ]
-    alone = ["the wall alone on the same elements", f"{wall.seconds:.1g}", f"{wall.typical:.2g}", ""]
+    alone = [
+        "the wall alone on the same elements",
+        f"{wall.seconds:.1g}",
+        f"{wall.typical:.2g}",
+        "",
+    ]
     return markdown(["the printed method", "seconds", "degrees", "largest"], [own, alone])
 
 
@@ -263,7 +294,12 @@ def _front(found: Sequence[Point]) -> list[bool]:
 
 def _draw(found: Sequence[Point]) -> None:
     title = "The artery: error against time of the processor"
-    page = Page(FIGURES, PICTURE, title, "Filled: the front of all. Squares: the whole tube in three dimensions.")
+    page = Page(
+        FIGURES,
+        PICTURE,
+        title,
+        "Filled: the front of all. Squares: the whole tube in three dimensions.",
+    )
     front = _front(found)
     with rc_context(STYLE):
         figure = Figure(figsize=(6.6, 4.4), layout="constrained")
@@ -272,13 +308,21 @@ def _draw(found: Sequence[Point]) -> None:
             axes.plot([], [], "o", color=colour, label=method.words)
             for point, on in zip(found, front, strict=True):
                 if point.method == name:
-                    marker = "D" if point.name.startswith("profile") else "s" if point.is_whole else "o"
+                    marker = (
+                        "D" if point.name.startswith("profile") else "s" if point.is_whole else "o"
+                    )
                     at, face = (point.seconds, point.typical), colour if on else "white"
                     axes.plot(*at, marker, color=colour, markerfacecolor=face)
                     if marker == "D" or point.name.startswith("full"):
-                        text = point.name.removeprefix("profile-") if marker == "D" else "the paper's mesh and step"
+                        text = (
+                            point.name.removeprefix("profile-")
+                            if marker == "D"
+                            else "the paper's mesh and step"
+                        )
                         side = (5, 3 if marker == "D" else -3)
-                        axes.annotate(text, at, side, textcoords="offset points", fontsize=6.5, color="0.3")
+                        axes.annotate(
+                            text, at, side, textcoords="offset points", fontsize=6.5, color="0.3"
+                        )
         axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):
@@ -289,11 +333,17 @@ def _draw(found: Sequence[Point]) -> None:
 
 def main() -> None:
     """Run what is missing, and report."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--folder", type=Path, default=Path("results/work-precision"))
     parser.add_argument("--budget", type=float, default=5.0, help="longest expected run, seconds")
     parser.add_argument(
-        "--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run, without the page; default: all"
+        "--only",
+        nargs="+",
+        choices=PARTS,
+        default=PARTS,
+        help="parts to run, without the page; default: all",
     )
     parser.add_argument("--report", action="store_true", help="make the page from what is there")
     options = parser.parse_args()

@@ -44,10 +44,20 @@ from remodel_fenicsx.extend import CHAINS
 PRESET = "kuhl-holzapfel-2007"
 PERSISTENCE_LENGTHS = (0.1, 0.4, 0.8)  # Remark 1
 KAPPAS = (0.01, 0.025, 0.05, 0.1)  # those of the printed Fig. 5 cannot be read
-LOAD_CASES = ((0.10, 0.0), (0.10, 2.4), (0.10, 4.8), (0.05, 4.8), (0.0, 4.8))  # Fig. 9: (elongation, pressure)
+LOAD_CASES = (
+    (0.10, 0.0),
+    (0.10, 2.4),
+    (0.10, 4.8),
+    (0.05, 4.8),
+    (0.0, 4.8),
+)  # Fig. 9: (elongation, pressure)
 TENDON_TIMES = (1.0, 12.0, 25.0, 50.0, 150.0)
 ARTERY_TIMES = (1.0, 24.0, 50.0, 100.0, 150.0)
-WALL_LAYERS = {"intima": 0, "media": 3, "adventitia": 7}  # of eight layers of elements, from the inside
+WALL_LAYERS = {
+    "intima": 0,
+    "media": 3,
+    "adventitia": 7,
+}  # of eight layers of elements, from the inside
 PLACES = {"inner": ":", "middle": "--", "outer": "-"}
 
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e")
@@ -56,7 +66,10 @@ STYLE: dict[str, Any] = {
     "grid.color": "0.9", "grid.linewidth": 0.6, "lines.linewidth": 1.6, "legend.frameon": False,
 }  # fmt: skip
 DOTS_PER_INCH = 200
-ANGLES, LEVELS = "RdYlBu", 18  # red along the first direction, blue across it, in steps of 5 degrees
+ANGLES, LEVELS = (
+    "RdYlBu",
+    18,
+)  # red along the first direction, blue across it, in steps of 5 degrees
 ABOVE = (0.35, -1.0, 0.42)  # from where tubes are seen
 MARK = "remodel_fenicsx figures"  # in NAME.json
 SOLVED = "fields belong to the solved state of their time, before that time's remodeling pass"
@@ -70,7 +83,11 @@ Runs = Mapping[str, Recording]
 
 def case_name(elongation: float, pressure: float) -> str:
     """The run of one of Fig. 9's load cases."""
-    return "artery" if (elongation, pressure) == (0.10, 4.8) else f"artery-{100 * elongation:g}-{pressure:g}"
+    return (
+        "artery"
+        if (elongation, pressure) == (0.10, 4.8)
+        else f"artery-{100 * elongation:g}-{pressure:g}"
+    )
 
 
 def scenes() -> dict[str, Scene]:
@@ -82,7 +99,11 @@ def scenes() -> dict[str, Scene]:
         loads = {"loads.elongation.value": elongation, "loads.pressure.value": pressure}
         found.setdefault(case_name(elongation, pressure), artery.with_values(loads | last_only))
     for driver in ("pk2", "finger"):  # with these the printed pass over-corrects (docs/theory.md)
-        method = {"remodeling.driver": driver, "remodeling.frame": "material", "remodeling.coupling": "relaxed"}
+        method = {
+            "remodeling.driver": driver,
+            "remodeling.frame": "material",
+            "remodeling.coupling": "relaxed",
+        }
         found[f"artery-{driver}"] = artery.with_values(method | last_only)
     found["artery-rate"] = artery.with_values({"remodeling.law": "rate"} | last_only)
     for kappa in KAPPAS:  # a homogeneous body: one point of it is enough
@@ -93,7 +114,10 @@ def scenes() -> dict[str, Scene]:
 
 def run_folder(scene: Scene, folder: Path) -> Path:
     """NAME-KEY in the folder: another scene or version, another key."""
-    return folder / f"{scene.name}-{hashlib.sha256(f'{__version__} {scene.to_toml()}'.encode()).hexdigest()[:8]}"
+    return (
+        folder
+        / f"{scene.name}-{hashlib.sha256(f'{__version__} {scene.to_toml()}'.encode()).hexdigest()[:8]}"
+    )
 
 
 def run_all(wanted: Sequence[Scene], folder: Path, jobs: int) -> dict[str, Recording]:
@@ -109,7 +133,9 @@ def run_all(wanted: Sequence[Scene], folder: Path, jobs: int) -> dict[str, Recor
                 steps, place = scene.time.number_of_steps, folders[scene.name]
                 print(f"figures: runs {scene.name}, {steps} steps, in {place}", file=sys.stderr)
             clock.sleep(0.1)
-            for name, process in [(name, process) for name, process in running.items() if process.poll() is not None]:
+            for name, process in [
+                (name, process) for name, process in running.items() if process.poll() is not None
+            ]:
                 del running[name]
                 if process.returncode:
                     code = process.returncode  # its own last line has said why
@@ -151,7 +177,9 @@ def begin(scene: Scene, folder: Path) -> subprocess.Popen[bytes]:
 class Page:
     """Files of a figure: NAME.png, NAME.csv, NAME-PART.csv, and NAME.json with what is to be said of them."""
 
-    def __init__(self, folder: Path, name: str, title: str, caption: str, run: Recording | None) -> None:
+    def __init__(
+        self, folder: Path, name: str, title: str, caption: str, run: Recording | None
+    ) -> None:
         self.folder, self.name, self.title, self.caption = folder, name, title, caption
         self.made_with = "eq. (2), wormlike chain; no simulation" if run is None else made_with(run)
         self.notes: dict[str, list[str]] = {}
@@ -166,8 +194,15 @@ class Page:
             texts.add_text(key, value)
         self.folder.mkdir(parents=True, exist_ok=True)
         with Image.open(whole) as picture:  # 256 colours are enough, and a third of the bytes
-            small = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE)
-        small.save(self.folder / f"{self.name}.png", pnginfo=texts, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
+            small = picture.convert("RGB").quantize(
+                256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE
+            )
+        small.save(
+            self.folder / f"{self.name}.png",
+            pnginfo=texts,
+            optimize=True,
+            dpi=(DOTS_PER_INCH, DOTS_PER_INCH),
+        )
 
     def table(self, columns: Columns, note: str, part: str = "") -> None:
         """Write columns of one length, and what they are."""
@@ -177,24 +212,36 @@ class Page:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(columns)
             for row in zip(*columns.values(), strict=True):
-                writer.writerow([x if isinstance(x, (str, int, np.integer)) else f"{float(x):.7g}" for x in row])
+                writer.writerow(
+                    [x if isinstance(x, (str, int, np.integer)) else f"{float(x):.7g}" for x in row]
+                )
         self.notes[file] = [self.made_with, note]
         said = {"made by": f"{MARK} {__version__}", "notes": self.notes}
-        (self.folder / f"{self.name}.json").write_text(json.dumps(said, indent=1, ensure_ascii=False) + "\n")
+        (self.folder / f"{self.name}.json").write_text(
+            json.dumps(said, indent=1, ensure_ascii=False) + "\n"
+        )
 
 
 def made_with(run: Recording) -> str:
     """Versions and scene of a run, in a line."""
     scene = run.scene
-    libraries = ", ".join(f"{name} {run.versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx"))
-    kinematics = "" if scene.model.kinematics == "full" else f" with kinematics {scene.model.kinematics}"
+    libraries = ", ".join(
+        f"{name} {run.versions.get(name, '?')}" for name in ("remodel_fenicsx", "dolfinx")
+    )
+    kinematics = (
+        "" if scene.model.kinematics == "full" else f" with kinematics {scene.model.kinematics}"
+    )
     return f"{libraries}; preset {PRESET}{kinematics}, frame {scene.remodeling.frame}, {first_cells(run)}"
 
 
 def first_cells(run: Recording) -> str:
     """How the cells of a run were at first, in words."""
     cells = run.scene.cells
-    return f"random cells of seed {cells.seed}" if cells.initial == "random" else f"{cells.initial} cells"
+    return (
+        f"random cells of seed {cells.seed}"
+        if cells.initial == "random"
+        else f"{cells.initial} cells"
+    )
 
 
 def stacked(tables: Sequence[Columns]) -> Columns:
@@ -212,7 +259,9 @@ def angle_scale(figure: Figure, place: tuple[float, float, float, float], label:
     """The colours of angles."""
     steps = BoundaryNorm(np.linspace(0, 90, LEVELS + 1), LEVELS)
     colours = ScalarMappable(steps, matplotlib.colormaps[ANGLES].resampled(LEVELS))
-    bar = figure.colorbar(colours, cax=figure.add_axes(place), orientation="horizontal", label=label)
+    bar = figure.colorbar(
+        colours, cax=figure.add_axes(place), orientation="horizontal", label=label
+    )
     bar.set_ticks(list(range(0, 91, 15)), labels=[f"{angle}°" for angle in range(0, 91, 15)])
 
 
@@ -245,7 +294,13 @@ def display() -> Iterator[None]:
             server.terminate()
 
 
-def drawn(shown: Sequence[Shown], eye: Sequence[float], middle: float, height: float, pixels: Sequence[int]) -> list:
+def drawn(
+    shown: Sequence[Shown],
+    eye: Sequence[float],
+    middle: float,
+    height: float,
+    pixels: Sequence[int],
+) -> list:
     """Pictures of deformed bodies, seen from `eye`, at one scale: `height` from top to bottom, z = `middle` inside."""
     import pyvista
 
@@ -280,10 +335,21 @@ def show(axes: Axes, image: np.ndarray, below: str = "") -> None:
     axes.imshow(image, interpolation="lanczos")
     axes.set_anchor("N")
     axes.set_axis_off()
-    axes.text(0.5, -0.015, below, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="0.35")
+    axes.text(
+        0.5,
+        -0.015,
+        below,
+        transform=axes.transAxes,
+        ha="center",
+        va="top",
+        fontsize=7,
+        color="0.35",
+    )
 
 
-def tubes(figure: Figure, grids: Sequence[Any], shown: Sequence[Shown], below: Sequence[str]) -> list[Axes]:
+def tubes(
+    figure: Figure, grids: Sequence[Any], shown: Sequence[Shown], below: Sequence[str]
+) -> list[Axes]:
     """Five tubes beside each other, on one scale."""
     tallest = max(top(grid) for grid in grids)
     panels = []
@@ -305,14 +371,22 @@ def cylindrical(grid: Any) -> np.ndarray:
     """Circumferential, axial and radial direction at the reference centres of the elements, (elements, 3, 3)."""
     x, y, z = grid.cell_centers().points.T
     zero, radial = 0 * x, np.stack([x, y, 0 * z], axis=1) / np.hypot(x, y)[:, None]
-    return np.stack([np.stack([-radial[:, 1], radial[:, 0], zero], 1), np.stack([zero, zero, zero + 1], 1), radial], 1)
+    return np.stack(
+        [
+            np.stack([-radial[:, 1], radial[:, 0], zero], 1),
+            np.stack([zero, zero, zero + 1], 1),
+            radial,
+        ],
+        1,
+    )
 
 
 def radial_dimension(grid: Any) -> np.ndarray:
     """sqrt(e_r . A e_r) of each element's cell, A = sum l_I^2 n_I n_I^T."""
     axes = np.stack([grid.cell_data[f"axis_{i}"] for i in (1, 2, 3)], axis=1)
     return np.linalg.norm(
-        grid.cell_data["cell_dimensions"] * np.einsum("mij,mj->mi", axes, cylindrical(grid)[:, 2]), axis=1
+        grid.cell_data["cell_dimensions"] * np.einsum("mij,mj->mi", axes, cylindrical(grid)[:, 2]),
+        axis=1,
     )
 
 
@@ -324,7 +398,11 @@ def layer_table(grid: Any) -> Columns:
     number, fields = np.asarray(grid.cell_data["layer"]), grid.cell_data
     layers = [number == k for k in range(number.max() + 1)]
     nodes, directions = grid.cell_connectivity.reshape(-1, 8), cylindrical(grid)
-    local = directions @ fields["deformation_gradient"].reshape(-1, 3, 3) @ np.swapaxes(directions, 1, 2)
+    local = (
+        directions
+        @ fields["deformation_gradient"].reshape(-1, 3, 3)
+        @ np.swapaxes(directions, 1, 2)
+    )
     shear = local[:, ~np.eye(3, dtype=bool)]
 
     def means(values: np.ndarray) -> np.ndarray:
@@ -369,7 +447,12 @@ def draw_chain_force(runs: Runs, page: Page) -> None:
     for A, colour in zip(PERSISTENCE_LENGTHS, COLOURS, strict=False):
         axes.plot(extension, force[A], color=colour, label=f"$A$ = {A:g}")
     axes.axvline(1.0, color="0.5", lw=0.8, ls=":")
-    axes.set(xlabel="chain stretch $r/L$", ylabel=r"chain force $f$ for $k\theta$ = 1", xlim=(0, 1.02), ylim=(0, 30))
+    axes.set(
+        xlabel="chain stretch $r/L$",
+        ylabel=r"chain force $f$ for $k\theta$ = 1",
+        xlim=(0, 1.02),
+        ylim=(0, 30),
+    )
     axes.legend(title="persistence length", loc="upper left")
     page.save(figure)
     table = {"extension": extension} | {f"force_A_{A:g}": force[A] for A in PERSISTENCE_LENGTHS}
@@ -399,10 +482,15 @@ def draw_alignment(runs: Runs, page: Page) -> None:
         axes.plot(time, angle, color=colour, label=rf"$\kappa$ = {kappa:g}")
         axes.plot(time[marked], exact[marked], "o", ms=3.5, mfc="white", mec=colour)
     axes.plot([], [], "o", ms=3.5, mfc="white", mec="0.4", label="closed form")
-    axes.set(xlabel="time", ylabel="angle between chains and load (degrees)", xlim=(0, 100), ylim=(0, 60))
+    axes.set(
+        xlabel="time", ylabel="angle between chains and load (degrees)", xlim=(0, 100), ylim=(0, 60)
+    )
     axes.legend(loc="upper right")
     page.save(figure)
-    page.table(table, "angle_kappa_K: run with kappa = K; exact_kappa_K: closed form of the cells of the same row")
+    page.table(
+        table,
+        "angle_kappa_K: run with kappa = K; exact_kappa_K: closed form of the cells of the same row",
+    )
 
 
 def draw_tendon(runs: Runs, page: Page) -> None:
@@ -421,17 +509,28 @@ def draw_tendon(runs: Runs, page: Page) -> None:
     axes.set(xlabel="time", ylabel="stretch", xlim=(0, run.scene.time.end), ylim=(1.0, None))
     axes.legend(loc="upper right")
     images = drawn(
-        [Shown(run, time) for time in TENDON_TIMES], (0.3, -1.0, 0.14), 0.495 * longest, 1.1 * longest, (270, 1000)
+        [Shown(run, time) for time in TENDON_TIMES],
+        (0.3, -1.0, 0.14),
+        0.495 * longest,
+        1.1 * longest,
+        (270, 1000),
     )
     for number, (time, image) in enumerate(zip(TENDON_TIMES, images, strict=True)):
         panels.append(figure.add_axes((0.45 + 0.109 * number, 0.145, 0.109, 0.795)))
         show(panels[-1], image)
         panels[-1].set_title(f"$t$ = {time:g}")
-    angle_scale(figure, (0.50, 0.115, 0.44, 0.022), "deformed angle to the load axis: 0° along it, 90° across")
+    angle_scale(
+        figure,
+        (0.50, 0.115, 0.44, 0.022),
+        "deformed angle to the load axis: 0° along it, 90° across",
+    )
     lettered(panels)
     page.save(figure)
     names = ("time", "force", "mean_stretch", "min_stretch", "max_stretch", "mean_fibre_angle")
-    page.table({name: rows[name] for name in names}, "stretches 1 = undeformed; reference angle to the load axis")
+    page.table(
+        {name: rows[name] for name in names},
+        "stretches 1 = undeformed; reference angle to the load axis",
+    )
     summaries = [tendon_summary(*one) for one in zip(TENDON_TIMES, grids, strict=True)]
     summary = {name: [row[name] for row in summaries] for name in summaries[0]}
     page.table(summary, f"over all elements; {SOLVED}", "snapshots")
@@ -462,21 +561,39 @@ def draw_artery(runs: Runs, page: Page) -> None:
     """Fig. 7: the artery at five times."""
     run = runs["artery"]
     grids = [run.grid(time) for time in ARTERY_TIMES]
-    loads = [(run.value("axial_elongation", time), run.value("pressure", time)) for time in ARTERY_TIMES]
+    loads = [
+        (run.value("axial_elongation", time), run.value("pressure", time)) for time in ARTERY_TIMES
+    ]
     figure = Figure(figsize=(8.2, 3.5))
     panels = tubes(
-        figure, grids, [Shown(run, time) for time in ARTERY_TIMES], [loads_in_words(*pair) for pair in loads]
+        figure,
+        grids,
+        [Shown(run, time) for time in ARTERY_TIMES],
+        [loads_in_words(*pair) for pair in loads],
     )
     for axes, time in zip(panels, ARTERY_TIMES, strict=True):
         axes.set_title(f"$t$ = {time:g}")
     angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(""))
     lettered(panels)
     page.save(figure)
-    names = ("pressure", "axial_elongation", "inner_radius", "outer_radius", *(f"fibre_angle_{p}" for p in PLACES))
-    summary = {"time": ARTERY_TIMES} | {name: [run.value(name, time) for time in ARTERY_TIMES] for name in names}
+    names = (
+        "pressure",
+        "axial_elongation",
+        "inner_radius",
+        "outer_radius",
+        *(f"fibre_angle_{p}" for p in PLACES),
+    )
+    summary = {"time": ARTERY_TIMES} | {
+        name: [run.value(name, time) for time in ARTERY_TIMES] for name in names
+    }
     summary["mean_l_radial"] = [radial_dimension(grid).mean() for grid in grids]
-    page.table(summary, "rows of the history, reference angles; mean_l_radial: radial component, all elements")
-    page.table({name: run.history[name] for name in ("time", *names)}, "the whole history", "history")
+    page.table(
+        summary,
+        "rows of the history, reference angles; mean_l_radial: radial component, all elements",
+    )
+    page.table(
+        {name: run.history[name] for name in ("time", *names)}, "the whole history", "history"
+    )
 
 
 def draw_layers(runs: Runs, page: Page) -> None:
@@ -502,13 +619,16 @@ def draw_load_cases(runs: Runs, page: Page) -> None:
     cases = [runs[case_name(*case)] for case in LOAD_CASES]
     grids = [run.grid() for run in cases]
     figure = Figure(figsize=(8.2, 3.4))
-    panels = tubes(figure, grids, list(map(peeled, cases)), [loads_in_words(*case) for case in LOAD_CASES])
+    panels = tubes(
+        figure, grids, list(map(peeled, cases)), [loads_in_words(*case) for case in LOAD_CASES]
+    )
     angle_scale(figure, (0.25, 0.125, 0.5, 0.026), AT_END)
     lettered(panels)
     page.save(figure)
     tables = [layer_table(grid) for grid in grids]
     loads = [
-        {"stretch": np.full(8, elongation), "pressure": np.full(8, pressure)} for elongation, pressure in LOAD_CASES
+        {"stretch": np.full(8, elongation), "pressure": np.full(8, pressure)}
+        for elongation, pressure in LOAD_CASES
     ]
     together = stacked([one | table for one, table in zip(loads, tables, strict=True)])
     page.table(together, f"means over element layers at the end; stretch: the elongation; {SOLVED}")
@@ -518,12 +638,18 @@ def draw_drivers(runs: Runs, page: Page) -> None:
     """Figs. 10 and 11: the Cauchy stress and another driver."""
     pair = {run.scene.remodeling.driver: run for run in runs.values()}
     symbols = {"cauchy": r"$\sigma$", "pk2": "$S$", "finger": "$b$"}
-    words = {"cauchy": "Cauchy stress", "pk2": "second Piola-Kirchhoff stress", "finger": "Finger tensor"}
+    words = {
+        "cauchy": "Cauchy stress",
+        "pk2": "second Piola-Kirchhoff stress",
+        "finger": "Finger tensor",
+    }
     ends = {driver: run.grid() for driver, run in pair.items()}
     tables = {driver: layer_table(grid) for driver, grid in ends.items()}
     figure = Figure(figsize=(8.2, 3.5))
     panels = [figure.add_axes((0.065, 0.145, 0.40, 0.79))]
-    profiles(panels[0], {f"{words[driver]} {symbols[driver]}": table for driver, table in tables.items()})
+    profiles(
+        panels[0], {f"{words[driver]} {symbols[driver]}": table for driver, table in tables.items()}
+    )
     panels[0].legend(loc="upper left", title="driven by", alignment="left")
     tallest = max(map(top, ends.values()))
     images = drawn(list(map(peeled, pair.values())), ABOVE, tallest / 2, 1.25 * tallest, (390, 560))
@@ -531,17 +657,43 @@ def draw_drivers(runs: Runs, page: Page) -> None:
         panels.append(figure.add_axes((0.50 + 0.245 * number, 0.215, 0.24, 0.72)))
         show(panels[-1], image)
         panels[-1].set_title(f"driven by {symbols[driver]}")
-    angle_scale(figure, (0.545, 0.15, 0.40, 0.026), "deformed angle at $t$ = 150: 0° circumferential, 90° axial")
+    angle_scale(
+        figure,
+        (0.545, 0.15, 0.40, 0.026),
+        "deformed angle at $t$ = 150: 0° circumferential, 90° axial",
+    )
     lettered(panels)
     page.save(figure)
-    shown = ("fibre_angle", "fibre_angle_least", "fibre_angle_most", "fibre_angle_deformed", "l_3", "l_radial", "shear")
-    recorded = ("inner_radius", "outer_radius", *(f"fibre_angle_{place}" for place in PLACES), "substeps")
-    page.table(side_by_side(tables, ("layer", "radius"), shown), f"element layers, reference angles; {SOLVED}")
+    shown = (
+        "fibre_angle",
+        "fibre_angle_least",
+        "fibre_angle_most",
+        "fibre_angle_deformed",
+        "l_3",
+        "l_radial",
+        "shear",
+    )
+    recorded = (
+        "inner_radius",
+        "outer_radius",
+        *(f"fibre_angle_{place}" for place in PLACES),
+        "substeps",
+    )
+    page.table(
+        side_by_side(tables, ("layer", "radius"), shown),
+        f"element layers, reference angles; {SOLVED}",
+    )
     histories = {driver: run.history for driver, run in pair.items()}
-    page.table(side_by_side(histories, ("time",), recorded), "rows of the two histories, reference angles", "history")
+    page.table(
+        side_by_side(histories, ("time",), recorded),
+        "rows of the two histories, reference angles",
+        "history",
+    )
 
 
-def side_by_side(tables: Mapping[str, Columns], common: Sequence[str], each: Sequence[str]) -> Columns:
+def side_by_side(
+    tables: Mapping[str, Columns], common: Sequence[str], each: Sequence[str]
+) -> Columns:
     """Columns NAME_LABEL of several tables, beside those that they have in common."""
     first = next(iter(tables.values()))
     labelled = {f"{name}_{label}": table[name] for label, table in tables.items() for name in each}
@@ -558,8 +710,17 @@ def draw_rate(runs: Runs, page: Page) -> None:
     for (law, run), colour in zip(pair.items(), COLOURS, strict=False):
         for place, dashes in PLACES.items():
             angle = run.history[f"fibre_angle_{place}"]
-            over_time.plot(run.history["time"], angle, dashes, color=colour, lw=1.4, label=f"{label[law]}, {place}")
-    over_time.set(xlabel="time", ylabel="reference fibre angle (degrees)", xlim=(0, 150), ylim=(-2, 92))
+            over_time.plot(
+                run.history["time"],
+                angle,
+                dashes,
+                color=colour,
+                lw=1.4,
+                label=f"{label[law]}, {place}",
+            )
+    over_time.set(
+        xlabel="time", ylabel="reference fibre angle (degrees)", xlim=(0, 150), ylim=(-2, 92)
+    )
     over_time.set_yticks(range(0, 91, 15))
     over_time.legend(loc="upper left", ncols=2)
     profiles(over_radius, {label[law]: table for law, table in tables.items()})
@@ -567,9 +728,17 @@ def draw_rate(runs: Runs, page: Page) -> None:
     lettered([over_time, over_radius])
     page.save(figure)
     shown = ("fibre_angle", "fibre_angle_least", "fibre_angle_most")
-    page.table(side_by_side(tables, ("layer", "radius"), shown), f"element layers at the end; {SOLVED}")
-    histories, places = {law: run.history for law, run in pair.items()}, [f"fibre_angle_{place}" for place in PLACES]
-    page.table(side_by_side(histories, ("time",), places), "rows of the two histories, reference angles", "history")
+    page.table(
+        side_by_side(tables, ("layer", "radius"), shown), f"element layers at the end; {SOLVED}"
+    )
+    histories, places = {law: run.history for law, run in pair.items()}, [
+        f"fibre_angle_{place}" for place in PLACES
+    ]
+    page.table(
+        side_by_side(histories, ("time",), places),
+        "rows of the two histories, reference angles",
+        "history",
+    )
 
 
 def draw_energy(runs: Runs, page: Page) -> None:
@@ -579,7 +748,10 @@ def draw_energy(runs: Runs, page: Page) -> None:
     figure = Figure(figsize=(8.2, 4.2), layout="constrained")
     panels = figure.subplots(2, 3)
     for (above, below), (name, run) in zip(panels.T, demos.items(), strict=True):
-        time, power = run.history["time"], run.history["remodeling_power"][1:]  # no pass comes before t = 0
+        time, power = (
+            run.history["time"],
+            run.history["remodeling_power"][1:],
+        )  # no pass comes before t = 0
         above.plot(time, run.history["stored_energy"], color=COLOURS[0])
         for sign, colour in ((1, COLOURS[2]), (-1, COLOURS[1])):  # released, taken in
             part = sign * np.maximum(sign * power, 0.0)
@@ -605,9 +777,7 @@ def draw_energy(runs: Runs, page: Page) -> None:
 
 # ---------------------------------------------------------------- which figures there are
 
-CHAINS_DRAWN = (
-    "Black: the four chains of each element's mean cell, deformed and projected on its face, cut off before its edge."
-)
+CHAINS_DRAWN = "Black: the four chains of each element's mean cell, deformed and projected on its face, cut off before its edge."
 PEELED = "the outer layers of elements cut shorter than the inner ones"
 WALL = "coloured by the deformed angle of the chains in the wall"
 PROFILE = "Reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
@@ -704,7 +874,8 @@ def draw(names: Sequence[str], folder: Path, runs: Path, jobs: int) -> None:
         for name in names:
             title, caption, of, draw_it = FIGURES[name]
             draw_it(
-                {run: recorded[run] for run in of}, Page(folder, name, title, caption, recorded[of[0]] if of else None)
+                {run: recorded[run] for run in of},
+                Page(folder, name, title, caption, recorded[of[0]] if of else None),
             )
             print(folder / f"{name}.png")
 
@@ -712,18 +883,30 @@ def draw(names: Sequence[str], folder: Path, runs: Path, jobs: int) -> None:
 def main() -> None:
     """The command line; bad input ends it with one line and exit code 2."""
     parser = argparse.ArgumentParser(description="Draw figures of Kuhl & Holzapfel 2007.")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"Of {', '.join(FIGURES)}; none: all.")
-    parser.add_argument("-o", dest="folder", type=Path, default=Path("figures"), help="For the figures: figures.")
-    parser.add_argument("--runs", type=Path, default=Path("results/figures"), help="For the runs: results/figures.")
-    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="Runs at a time: all cores.")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"Of {', '.join(FIGURES)}; none: all."
+    )
+    parser.add_argument(
+        "-o", dest="folder", type=Path, default=Path("figures"), help="For the figures: figures."
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=Path("results/figures"), help="For the runs: results/figures."
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=len(os.sched_getaffinity(0)), help="Runs at a time: all cores."
+    )
     options = parser.parse_args()
     names = options.names or list(FIGURES)
     said = None
     for name in names:
         if name not in FIGURES:
             said = f"{name}: no such figure; allowed are {', '.join(FIGURES)}"
-        elif any(options.folder.glob(f"{name}[.-]*")) and not is_own(options.folder / f"{name}.json"):
-            said = f"-o {options.folder}: has files {name}* of another origin; choose another folder"
+        elif any(options.folder.glob(f"{name}[.-]*")) and not is_own(
+            options.folder / f"{name}.json"
+        ):
+            said = (
+                f"-o {options.folder}: has files {name}* of another origin; choose another folder"
+            )
     for option, path in (("-o", options.folder), ("--runs", options.runs)):
         if path.exists() and not path.is_dir():
             said = f"{option} {path}: is a file; allowed is a folder"

@@ -31,8 +31,14 @@ Array = NDArray[np.float64]
 Stress = Callable[[Array], Array]  # lambda_i dW/dlambda_i of three stretches with product 1
 CHAIN = CHAINS["wormlike"]
 POINTS = 25
-MOST, NEAREST = 300.0, 1 - 1e-6  # of an exponent, and of r/L: beyond, searches leave what a computer can say
-DECADES, SMALL_STRETCH = 6.0, 1.01  # of stresses over those near 1 that one tissue may have: 1 kPa and 1 GPa
+MOST, NEAREST = (
+    300.0,
+    1 - 1e-6,
+)  # of an exponent, and of r/L: beyond, searches leave what a computer can say
+DECADES, SMALL_STRETCH = (
+    6.0,
+    1.01,
+)  # of stresses over those near 1 that one tissue may have: 1 kPa and 1 GPa
 # ends of the logarithms of c, of L over the longest chain less 1, and of mu; stresses over the largest one
 ENDS = np.array([[-14.0, -7.0, -12.0], [14.0, 5.0, 7.0]])
 UNSEEN = 1e-4  # of the sum of squares, and of the largest stress: what nobody measures
@@ -46,7 +52,9 @@ def of_papers(k1: float, k2: float, cells: Array, kappa: float, c: float) -> Str
     def stress(stretches: Array) -> Array:
         squared = stretches**2
         strain = float(cells @ squared - 1)  # kappa (I1 - 3) + (1 - 3 kappa) (I_i - 1)
-        return np.asarray(c * squared + 4 * k1 * strain * np.exp(min(k2 * strain**2, MOST)) * cells * squared)
+        return np.asarray(
+            c * squared + 4 * k1 * strain * np.exp(min(k2 * strain**2, MOST)) * cells * squared
+        )
 
     return stress
 
@@ -102,10 +110,16 @@ def fitted(
     for k, name in enumerate(NAMES[: 3 if mu is None else 2]):
         for end in ENDS[:, k]:
             moved = np.where(np.arange(3) == k, end, best.x)
-            if np.sum(error(moved) ** 2) / 2 <= (1 + UNSEEN) * best.cost + known.sum() * UNSEEN**2 / 2:
+            if (
+                np.sum(error(moved) ** 2) / 2
+                <= (1 + UNSEEN) * best.cost + known.sum() * UNSEEN**2 / 2
+            ):
                 raise ValueError(f"the stresses do not determine {name}: {'any smaller' if end < 0 else 'any larger'} "
                                  f"number than {numbers(best.x)[k]:.2g} fits as well")  # fmt: skip
-    shares = [np.sqrt(np.mean(error(best.x)[known[:, i], i] ** 2)) if known[:, i].any() else np.nan for i in (0, 1)]
+    shares = [
+        np.sqrt(np.mean(error(best.x)[known[:, i], i] ** 2)) if known[:, i].any() else np.nan
+        for i in (0, 1)
+    ]
     return numbers(best.x), np.array(shares)
 
 
@@ -162,16 +176,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ):  # fmt: skip
         parser.add_argument(f"--{name}", type=float, default=default, help=text)
     parser.add_argument("--table", type=Path, help="a csv of stretches and nominal stresses")
-    parser.add_argument("--unit", choices=("Pa", "kPa", "MPa"), default="kPa", help="of all stresses")
+    parser.add_argument(
+        "--unit", choices=("Pa", "kPa", "MPa"), default="kPa", help="of all stresses"
+    )
     given = parser.parse_args(arguments)
     if not 0 <= given.kappa <= 1 / 3:
         parser.error(f"--kappa {given.kappa:g}: must be from 0 to 1/3")
     turn = np.radians(given.angle)
-    cells = given.kappa + (1 - 3 * given.kappa) * np.array([np.cos(turn) ** 2, np.sin(turn) ** 2, 0.0])
+    cells = given.kappa + (1 - 3 * given.kappa) * np.array(
+        [np.cos(turn) ** 2, np.sin(turn) ** 2, 0.0]
+    )
     assumed = f"cells of dispersion kappa = {given.kappa:.3g}{' (isotropic)' if given.kappa == 1 / 3 else ''}, "
     assumed += f"families at +-{given.angle:g} degrees to x; a volume that stays"
     if given.table is None:
-        if None in (given.k1, given.k2, given.c) or min(given.k1, given.k2, given.c) <= 0 or not 1 < given.up_to <= 3:
+        if (
+            None in (given.k1, given.k2, given.c)
+            or min(given.k1, given.k2, given.c) <= 0
+            or not 1 < given.up_to <= 3
+        ):
             parser.error("needs --k1, --k2 and --c above 0 and --up-to from 1 to 3, or --table")
         stress = of_papers(given.k1, given.k2, cells, given.kappa, given.c)
         curves = [lambda x: nominal(stress, x, x), lambda x: nominal(stress, x, None)]
@@ -192,7 +214,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sizes = np.nanmax(np.abs(wanted), axis=1)
         small = np.median(sizes[np.argsort([abs(x - 1) for x, _ in rows])[:3]])  # of noise too
         if 0 < (limit := small * 10**DECADES) < sizes.max():
-            last = max((x for (x, _), size in zip(rows, sizes, strict=True) if size <= limit), default=1.0)
+            last = max(
+                (x for (x, _), size in zip(rows, sizes, strict=True) if size <= limit), default=1.0
+            )
             parser.error(f"--table: stresses reach {sizes.max():.2g} {given.unit}, more than {DECADES:g} decades over "
                          f"those of the smallest stretches; leave out rows beyond stretch_x = {last:.4g}")  # fmt: skip
     wanted[[y is None for _, y in rows], 1] = np.nan  # 0, whatever the numbers
@@ -200,10 +224,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         numbers, misfit = fitted(rows, wanted, cells, given.c)
     except ValueError as error:
         more = "" if given.c else "--c, "
-        parser.error(f"{error}, with {assumed}; give {more}other cells (--kappa, --angle) or larger stretches")
+        parser.error(
+            f"{error}, with {assumed}; give {more}other cells (--kappa, --angle) or larger stretches"
+        )
     print(f"# Assumed: {assumed}.\n{in_words(*numbers, cells, given.unit)}")
     words = [
-        f"{100 * share:.2g} % along {axis}" for axis, share in zip("xy", misfit, strict=True) if np.isfinite(share)
+        f"{100 * share:.2g} % along {axis}"
+        for axis, share in zip("xy", misfit, strict=True)
+        if np.isfinite(share)
     ]
     print(f"\nmisfit, root mean square over the largest stress: {', '.join(words)}")
 

@@ -81,7 +81,10 @@ def with_old_arguments(owner: str, function: Wrapped) -> Wrapped:
 
     @functools.wraps(function)
     def translated(*positional: object, **keywords: object) -> object:
-        known = {new_name(owner, key) if key in OLD_NAMES[owner] else key: keywords[key] for key in keywords}
+        known = {
+            new_name(owner, key) if key in OLD_NAMES[owner] else key: keywords[key]
+            for key in keywords
+        }
         return function(*positional, **known)
 
     return cast(Wrapped, translated)

@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx._version import __version__
-from remodel_fenicsx.errors import BAD_ENVIRONMENT, BAD_INPUT, PAUSED, RemodelError, SOLVE_FAILED, printable, shortened
+from remodel_fenicsx.errors import (
+    BAD_ENVIRONMENT,
+    BAD_INPUT,
+    PAUSED,
+    RemodelError,
+    SOLVE_FAILED,
+    printable,
+    shortened,
+)
 from remodel_fenicsx.system import interrupts
 from remodel_fenicsx.system.children import PART, SERVE, serve
 from remodel_fenicsx.system.environment import (
@@ -89,7 +97,9 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {}  # by name, in the order of the help
 
 
-def command(example: str, *usage: str, needs: Needs = (), alone: bool = False) -> Callable[[Do], Do]:
+def command(
+    example: str, *usage: str, needs: Needs = (), alone: bool = False
+) -> Callable[[Do], Do]:
     """Make a decorator that registers a function as a command; its docstring is the help text."""
 
     # The function receives the options, with `scene` if the command takes a scene file, and returns
@@ -113,9 +123,13 @@ def parser() -> argparse.ArgumentParser:
     """Make the parser of all commands."""
     raw = argparse.RawDescriptionHelpFormatter
     text = "Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007)."
-    found = _Parser(prog="remodel-fenicsx", description=text, epilog=MAIN_EPILOG, formatter_class=raw)
+    found = _Parser(
+        prog="remodel-fenicsx", description=text, epilog=MAIN_EPILOG, formatter_class=raw
+    )
     _add(found, WITH)
-    found.add_argument("--version", action="version", version=__version__, help="Print the version and exit.")
+    found.add_argument(
+        "--version", action="version", version=__version__, help="Print the version and exit."
+    )
     commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, each in COMMANDS.items():
         text, epilog = each.function.__doc__ or "", f"example:\n  remodel-fenicsx {each.example}"
@@ -140,8 +154,13 @@ def _add(found: argparse.ArgumentParser, *usage: str) -> None:
                 settings |= {"action": "store_false", "dest": value[5:].replace("-", "_")}
         else:
             kind = value.rstrip("!?+*")
-            settings |= {"default": default or None, "type": TYPE_OF_METAVAR.get(kind, str)} | MARKS[value[len(kind) :]]
-            settings["choices" if "|" in kind else "metavar"] = kind.split("|") if "|" in kind else kind
+            settings |= {
+                "default": default or None,
+                "type": TYPE_OF_METAVAR.get(kind, str),
+            } | MARKS[value[len(kind) :]]
+            settings["choices" if "|" in kind else "metavar"] = (
+                kind.split("|") if "|" in kind else kind
+            )
         found.add_argument(*names, **settings)
 
 
@@ -153,7 +172,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.fstat(stream)
             continue
         os.open(os.devnull, os.O_RDWR)
-    sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
+    sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(
+        os.devnull, "w"
+    )
     with interrupts.exit_on_signal():
         return _run_command(list(sys.argv[1:] if arguments is None else arguments))
 
@@ -179,16 +200,22 @@ def _run_command(arguments: list[str]) -> int:
         text, code = f"cannot write the results: {refusal_in_words(error)}", BAD_ENVIRONMENT
         if error.errno == errno.ENAMETOOLONG:
             text, code = refusal_in_words(error), BAD_INPUT
-        if getattr(options, "output", None) and isinstance(error, (FileExistsError, NotADirectoryError)):
+        if getattr(options, "output", None) and isinstance(
+            error, (FileExistsError, NotADirectoryError)
+        ):
             # The path lies in a file, or was created meanwhile.
-            text = f"-o {options.output}: {refusal_in_words(error)}; must be a new or an empty folder"
+            text = (
+                f"-o {options.output}: {refusal_in_words(error)}; must be a new or an empty folder"
+            )
             code = BAD_INPUT
         return _fail(text, code, on_all_ranks=False)
     except Exception as error:
         if words := blamed(error):
             return _fail(words, BAD_INPUT, on_all_ranks=False)
         traceback.print_exc()
-        return _fail("internal error (traceback above); please report it with run.log", 1, on_all_ranks=False)
+        return _fail(
+            "internal error (traceback above); please report it with run.log", 1, on_all_ranks=False
+        )
 
 
 def _parsed(arguments: list[str]) -> argparse.Namespace:
@@ -448,7 +475,12 @@ def _wall(options: argparse.Namespace) -> None:
     path = options.output or options.surface.with_suffix(".msh")
     with _stopping("nothing is written"):
         lines = write_wall(
-            options.surface, path, options.thickness, options.layers or (), options.size, options.through
+            options.surface,
+            path,
+            options.thickness,
+            options.layers or (),
+            options.size,
+            options.through,
         )
     _print(*lines)
 
@@ -508,7 +540,9 @@ def _unload(options: argparse.Namespace) -> None:
     from remodel_fenicsx.running import write_unloaded
 
     if not options.scene.geometry.is_loaded:
-        raise scenes.SceneError("geometry.is = 'unloaded': must be 'loaded' to compute the unloaded body")
+        raise scenes.SceneError(
+            "geometry.is = 'unloaded': must be 'loaded' to compute the unloaded body"
+        )
     place = options.output or Path(f"{options.scene.name}-unloaded")
     with _stopping("nothing is written"):
         write_unloaded(options.scene, place)
@@ -559,7 +593,9 @@ def _sweep(options: argparse.Namespace) -> int:
 
     is_sampled = options.latin is not None
     axes = study.read_axes(options.axes, is_sampled)
-    points = study.latin_hypercube(axes, options.latin, options.seed) if is_sampled else study.grid(axes)
+    points = (
+        study.latin_hypercube(axes, options.latin, options.seed) if is_sampled else study.grid(axes)
+    )
     wishes = options.output, options.jobs, options.quiet, is_sampled
     return _run_study(study.sweep, options.scene, points, *wishes)
 
@@ -575,7 +611,9 @@ def _ensemble(options: argparse.Namespace) -> int:
     """Run a scene of random cells with many seeds."""
     from remodel_fenicsx.studies.sweep import ensemble
 
-    return _run_study(ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet)
+    return _run_study(
+        ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet
+    )
 
 
 @command(
@@ -592,7 +630,9 @@ def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings, and show the cost and error of each."""
     from remodel_fenicsx.studies.trade import trade
 
-    return _run_study(trade, options.scene, options.output, options.budget, options.jobs, options.quiet)
+    return _run_study(
+        trade, options.scene, options.output, options.budget, options.jobs, options.quiet
+    )
 
 
 @command(

@@ -88,10 +88,18 @@ from remodel_fenicsx.fem.kinematics import (
     FullKinematics as FullKinematics,
     Kinematics as Kinematics,
 )
-from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS as SOLVER_METHODS, SolverMethod as SolverMethod
+from remodel_fenicsx.fem.solver_methods import (
+    SOLVER_METHODS as SOLVER_METHODS,
+    SolverMethod as SolverMethod,
+)
 from remodel_fenicsx.model.cells import UnitCell as UnitCell, angle_to_axis as angle_to_axis
 from remodel_fenicsx.model.chains import CHAINS as CHAINS, Chain as Chain, Parameter as Parameter
-from remodel_fenicsx.model.drivers import DRIVERS as DRIVERS, FRAMES as FRAMES, Driver as Driver, Frame as Frame
+from remodel_fenicsx.model.drivers import (
+    DRIVERS as DRIVERS,
+    FRAMES as FRAMES,
+    Driver as Driver,
+    Frame as Frame,
+)
 from remodel_fenicsx.model.energy import (
     MATRICES as MATRICES,
     REPULSIONS as REPULSIONS,
@@ -127,7 +135,11 @@ from remodel_fenicsx.schema.units import (
 from remodel_fenicsx.watch import WATCHERS as WATCHERS, WatcherKind as WatcherKind
 
 if TYPE_CHECKING:
-    from remodel_fenicsx.evolution.coupling import Coupling as Coupling, Staggered as Staggered, Traits as Traits
+    from remodel_fenicsx.evolution.coupling import (
+        Coupling as Coupling,
+        Staggered as Staggered,
+        Traits as Traits,
+    )
     from remodel_fenicsx.evolution.life_cycle import Remodels as Remodels
     from remodel_fenicsx.fem.jit import form as form
     from remodel_fenicsx.results.columns import Measurement as Measurement
@@ -145,4 +157,6 @@ _LATE = {
 __getattr__ = on_demand(__name__, _LATE)
 if not TYPE_CHECKING:  # type checkers use the imports
     _HELPERS = ("annotations", "TYPE_CHECKING", "on_demand")
-    __all__ = sorted(name for name in {*globals(), *_LATE} if name not in _HELPERS and not name.startswith("_"))
+    __all__ = sorted(
+        name for name in {*globals(), *_LATE} if name not in _HELPERS and not name.startswith("_")
+    )

@@ -59,9 +59,13 @@ ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
 def meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Scene, Domain]:
     """Resolve and log the scene's choices; return the resolved scene and its mesh. Collective."""
     if scene.geometry.is_loaded:
-        raise SceneError(f"geometry.is = 'loaded': needs the unloaded body, from {command_name()} unload SCENE")
+        raise SceneError(
+            f"geometry.is = 'loaded': needs the unloaded body, from {command_name()} unload SCENE"
+        )
     if domain is None and comm.rank == 0:
-        for line in describe_choice(scene) if scene.model.kinematics == AUTO else only_for_means(scene):
+        for line in (
+            describe_choice(scene) if scene.model.kinematics == AUTO else only_for_means(scene)
+        ):
             log.info("%s", line)
     if scene.mesh.formulation == AUTO and comm.rank == 0:
         log.info("%s", scene.describe_formulation())
@@ -81,10 +85,14 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
         values, closed = np.eye(3), None
         if not scene.natural.is_trivial:
             values, closed = natural_gradient(scene, quadrature, domain, local_axes, fibres)
-        present, initial = (quadrature.function(f"{name}_gradient", (3, 3)) for name in ("natural", "initial"))
+        present, initial = (
+            quadrature.function(f"{name}_gradient", (3, 3)) for name in ("natural", "initial")
+        )
         for function in (present, initial):
             quadrature.values(function, (3, 3))[:] = values
-        made = [NaturalConfiguration(one, present, closed, initial if grows else None) for one in made]
+        made = [
+            NaturalConfiguration(one, present, closed, initial if grows else None) for one in made
+        ]
     cells = UnitCells(quadrature, domain, scene.cells, local_axes, own, fibres)
     return [make_state(scene, u, k, cells, domain) for u, k in zip(unknowns, made, strict=True)]
 
@@ -112,7 +120,11 @@ def make_state(
 
 
 def natural_gradient(
-    scene: Scene, quadrature: Quadrature, domain: Domain, local_axes: LocalAxes, fibres: Fibres = NO_FIBRES
+    scene: Scene,
+    quadrature: Quadrature,
+    domain: Domain,
+    local_axes: LocalAxes,
+    fibres: Fibres = NO_FIBRES,
 ) -> tuple[Array, ClosedRing | None]:
     """Return G of the natural configuration (elements, points, 3, 3); the closed ring or None."""
     from remodel_fenicsx.body.wall import gradient, prestretch
@@ -120,26 +132,45 @@ def natural_gradient(
 
     natural, shape, found = scene.natural, scene.geometry, None
     if natural.fibres:
-        present, ratio = (field_from_files(fibres, name, quadrature, domain) for name in (NATURAL_GRADIENT, GROWTH))
+        present, ratio = (
+            field_from_files(fibres, name, quadrature, domain)
+            for name in (NATURAL_GRADIENT, GROWTH)
+        )
         across = np.einsum("...j,...k->...jk", *(2 * [local_axes.axes[..., 2, :]]))
         # G_0 of `evolution.turnover`
         return present @ (np.eye(3) + (ratio - 1.0)[..., None, None] * across), None
     for index, layer in enumerate(natural.layers):
         if layer.region is not None and layer.region not in domain.regions:
             known = ", ".join(map(repr, domain.regions))
-            raise SceneError(f"natural.layers[{index}].region = {layer.region!r}: no such region; there are {known}")
+            raise SceneError(
+                f"natural.layers[{index}].region = {layer.region!r}: no such region; there are {known}"
+            )
     if isinstance(shape, RoundWall):
         tissues = {name: properties.tissue for name, properties in scene.properties().items()}
         try:
-            found = close_ring(shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle)
+            found = close_ring(
+                shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle
+            )
         except ArithmeticError as error:
             asked = f"natural.opening_angle = {natural.opening_angle:g}"
-            raise SceneError(f"{asked}: must be smaller, or natural.layers nearer to 1: {error}") from error
-        radii, (inner, next_one, *_) = np.linalg.norm(local_axes.coordinates[..., :2], axis=-1), found.panels.edges
+            raise SceneError(
+                f"{asked}: must be smaller, or natural.layers nearer to 1: {error}"
+            ) from error
+        radii, (inner, next_one, *_) = (
+            np.linalg.norm(local_axes.coordinates[..., :2], axis=-1),
+            found.panels.edges,
+        )
         stretches = found.stretches(radii)
-        beyond = quadrature.maximum(((inner - radii) / (next_one - inner)).reshape(quadrature.shape))
-        if beyond > MAX_EXTRAPOLATION or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0:
-            rule = "must be smaller, or mesh.refinement larger: straight element sides leave the wall"
+        beyond = quadrature.maximum(
+            ((inner - radii) / (next_one - inner)).reshape(quadrature.shape)
+        )
+        if (
+            beyond > MAX_EXTRAPOLATION
+            or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0
+        ):
+            rule = (
+                "must be smaller, or mesh.refinement larger: straight element sides leave the wall"
+            )
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
         stretches = prestretch(natural, local_axes, domain)
@@ -189,25 +220,41 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh is a {domain.shape!r}")
     element = KINEMATICS[scene.model.kinematics].element(scene.mesh.element)
     if kind != element:
-        raise SceneError(f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}")
+        raise SceneError(
+            f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}"
+        )
     if degree != scene.mesh.degree:
         raise SceneError(f"mesh.degree = {scene.mesh.degree}: the mesh has degree {degree}")
     for name in scene.regions:
         if name not in domain.regions:
-            raise SceneError(f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}")
-    if isinstance(shape, RoundWall) and scene.regions and (others := set(domain.regions) - set(scene.regions)):
+            raise SceneError(
+                f"regions.{name}: the mesh has no such region; it has {', '.join(domain.regions)}"
+            )
+    if (
+        isinstance(shape, RoundWall)
+        and scene.regions
+        and (others := set(domain.regions) - set(scene.regions))
+    ):
         raise SceneError(f"regions.{min(others)}: missing; it is a region of the mesh")
     needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.face_names
     missing = [face for face in needed if face not in domain.faces]
     if missing:
-        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}")
+        raise SceneError(
+            f"geometry.shape = {shape.name!r}: the mesh has no face {', '.join(missing)}"
+        )
     for name, value in domain.dimensions.items():
         wanted = getattr(shape, name, value)
         if not abs(wanted - value) <= 1e-9 * abs(wanted):  # NaN too
             raise SceneError(f"geometry.{name} = {wanted:g}: the mesh has {value:g}")
-    empty = [name for name in needed if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)]
+    empty = [
+        name
+        for name in needed
+        if not domain.comm.allreduce(domain.facet_tags.find(domain.faces[name]).size)
+    ]
     if empty:
-        raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}")
+        raise SceneError(
+            f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}"
+        )
     if not domain.comm.allreduce(bool(np.isfinite(mesh.geometry.x).all()), MPI.LAND):
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has nodes that are not finite")
     return domain
@@ -230,9 +277,13 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Array]]
             return None
         found = {}
         for name, cells in scene.measured_cells.items():
-            chosen = regions == domain.regions[name] if name else np.ones(len(regions), dtype=np.bool_)
+            chosen = (
+                regions == domain.regions[name] if name else np.ones(len(regions), dtype=np.bool_)
+            )
             measured = _fibres_of(cells, name, points[elements], chosen)
-            found[name] = _with_prestretch(measured, f"{in_region(name)}cells.fibres = {cells.fibres!r}", scene)
+            found[name] = _with_prestretch(
+                measured, f"{in_region(name)}cells.fibres = {cells.fibres!r}", scene
+            )
         return found
 
     return domain.comm.bcast(raise_on_all_ranks(domain.comm, read)) or {}
@@ -241,7 +292,11 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Array]]
 def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict[str, Array]:
     """Select the fields of a fibre file that the scene starts with (natural.fibres)."""
     wanted, held = scene.natural.fibres, [name for name in INITIAL_VALUES if name in measured]
-    changed = [name for name in held if not np.allclose(measured[name], np.reshape(INITIAL_VALUES[name], -1))]
+    changed = [
+        name
+        for name in held
+        if not np.allclose(measured[name], np.reshape(INITIAL_VALUES[name], -1))
+    ]
     if changed and wanted is None:
         rule = "set natural.fibres = true to start with them, or false to ignore them"
         raise SceneError(f"{key}: has {', '.join(changed)} of an earlier run; {rule}")
@@ -256,10 +311,14 @@ def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict
 def _check_growth(growth: Array, key: str, turnover: Turnover) -> None:
     """Check that the scene can continue the growth of an earlier run."""
     if turnover.start:
-        raise SceneError(f"{key}: has {GROWTH} of an earlier run; remodeling.turnover.from must be 0 with it")
+        raise SceneError(
+            f"{key}: has {GROWTH} of an earlier run; remodeling.turnover.from must be 0 with it"
+        )
     if growth.min() <= 1.0 - turnover.volume:
         volume = f"remodeling.turnover.volume must be above {1.0 - growth.min():.3g} with it"
-        raise SceneError(f"{key}: has {GROWTH} of an earlier run, minimum {growth.min():.3g}; {volume}")
+        raise SceneError(
+            f"{key}: has {GROWTH} of an earlier run, minimum {growth.min():.3g}; {volume}"
+        )
 
 
 def read_fibres(cells: Cells, region: str) -> FibreFile:
@@ -292,6 +351,12 @@ def field_from_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: 
     found = np.tile(plain, (*quadrature.shape, *(1 for _ in plain.shape)))
     for region, measured in fibres.items():
         if name in measured:
-            chosen = domain.element_region == domain.regions[region] if region else np.ones(len(found), dtype=np.bool_)
-            found[chosen] = measured[name][domain.element_number[chosen]].reshape(-1, 1, *plain.shape)
+            chosen = (
+                domain.element_region == domain.regions[region]
+                if region
+                else np.ones(len(found), dtype=np.bool_)
+            )
+            found[chosen] = measured[name][domain.element_number[chosen]].reshape(
+                -1, 1, *plain.shape
+            )
     return found

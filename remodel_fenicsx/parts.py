@@ -20,7 +20,12 @@ from remodel_fenicsx.body.loading import Loading as Loading
 from remodel_fenicsx.body.shape import columns_of as columns_of
 from remodel_fenicsx.body.tendon import Tendon as Tendon
 from remodel_fenicsx.body.tube import Tube as Tube
-from remodel_fenicsx.evolution.stepper import Step as Step, Stepper as Stepper, Watcher as Watcher, times as times
+from remodel_fenicsx.evolution.stepper import (
+    Step as Step,
+    Stepper as Stepper,
+    Watcher as Watcher,
+    times as times,
+)
 from remodel_fenicsx.fem.kinematics import FullKinematics as FullKinematics
 from remodel_fenicsx.fem.quadrature import Quadrature as Quadrature
 from remodel_fenicsx.model.energy import Tissue as Tissue
@@ -40,7 +45,11 @@ from remodel_fenicsx.schema.settings import (
 )
 from remodel_fenicsx.solver.continuation import StepFailure as StepFailure
 from remodel_fenicsx.state import State as State, UnitCells as UnitCells
-from remodel_fenicsx.system.interrupts import end_all_ranks_on_exception as end_all_ranks_on_exception
+from remodel_fenicsx.system.interrupts import (
+    end_all_ranks_on_exception as end_all_ranks_on_exception,
+)
 
 if not TYPE_CHECKING:  # type checkers use the imports
-    __all__ = sorted(name for name in globals() if name != "TYPE_CHECKING" and not name.startswith("_"))
+    __all__ = sorted(
+        name for name in globals() if name != "TYPE_CHECKING" and not name.startswith("_")
+    )

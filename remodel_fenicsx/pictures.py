@@ -128,7 +128,9 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
     normal = surface.cell_data["Normals"]
     arms -= np.einsum("mki,mi->mk", arms, normal)[..., None] * normal[:, None]
     middle += LIFT * size[:, None] * normal
-    drawn = pyvista.PolyData((middle[:, None] + arms).reshape(-1, 3), lines=np.insert(lines, 0, 2, axis=1))
+    drawn = pyvista.PolyData(
+        (middle[:, None] + arms).reshape(-1, 3), lines=np.insert(lines, 0, 2, axis=1)
+    )
     return drawn.tube(radius=CHAIN_LOOK["width"] / 2 * float(np.median(size[size > 0])), n_sides=6)
 
 
@@ -167,12 +169,20 @@ def render(job: Job) -> list[Pixels]:
         environment = environment_of_child() | {"PYVISTA_OFF_SCREEN": "true", "MPLBACKEND": "agg"}
         # Python imports modules from the working folder first, which must not be a user's folder.
         child = subprocess.run(
-            command, env=environment, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True
+            command,
+            env=environment,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
         )
         result = file.with_suffix(".npy")
         if child.returncode != 0 or not result.exists():
             said = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"
-            raise FigureError(f"rendering failed: {said}; check that xvfb and xauth are installed", BAD_ENVIRONMENT)
+            raise FigureError(
+                f"rendering failed: {said}; check that xvfb and xauth are installed",
+                BAD_ENVIRONMENT,
+            )
         return list(np.load(result))
 
 
@@ -184,7 +194,9 @@ def main(file: str) -> None:
     np.save(f"{file}.npy", [_drawn(job, sheet, extent) for sheet in job.sheets])
 
 
-def _drawn(job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], bounds: Array) -> Pixels:
+def _drawn(
+    job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], bounds: Array
+) -> Pixels:
     """Draw the bodies of a sheet next to each other, at one scale."""
     columns = min(len(sheet), MOST_COLUMNS)
     rows = math.ceil(len(sheet) / columns)
@@ -208,7 +220,13 @@ def _drawn(job: Job, sheet: Sequence[tuple[str, pyvista.UnstructuredGrid]], boun
     plotter.view_vector(job.direction, up)
     look = {"n_labels": 7, "fmt": "%.0f", "color": "black", "label_font_size": LETTER}
     plotter.add_scalar_bar(
-        job.scale, mapper=actor.mapper, width=0.6, height=0.45, position_x=0.2, position_y=0.5, **look
+        job.scale,
+        mapper=actor.mapper,
+        width=0.6,
+        height=0.45,
+        position_x=0.2,
+        position_y=0.5,
+        **look,
     )
     plotter.add_text(job.notes, "lower_edge", NOTE, "black")
     plotter.add_axes(viewport=(0.84, 0.0, 1.0, 1.0), color="black")
@@ -286,14 +304,18 @@ def draw_picture(
     for time in times or ():
         if not recorded[0] <= time <= recorded[-1]:
             raise FigureError(f"times {time:g}: must be from {recorded[0]:g} to {recorded[-1]:g}")
-    shown = dict.fromkeys(float(recorded[np.abs(recorded - time).argmin()]) for time in times or recorded[-1:])
+    shown = dict.fromkeys(
+        float(recorded[np.abs(recorded - time).argmin()]) for time in times or recorded[-1:]
+    )
     if len(shown) > MOST_PANELS:
         rule = f"must be at most {MOST_PANELS} (animate shows more)"
         raise FigureError(f"times: {len(shown)} times; {rule}")
     return _draw(whole, [[*shown]], viewing, path, ".png")
 
 
-def draw_animation(folder: str | os.PathLike[str], frames: int, viewing: ViewOptions, path: Path | None) -> Path:
+def draw_animation(
+    folder: str | os.PathLike[str], frames: int, viewing: ViewOptions, path: Path | None
+) -> Path:
     """Draw the body of a run over time."""
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
         rule = f"must be an integer from {FEWEST_FRAMES} to {MOST_FRAMES}"
@@ -303,10 +325,14 @@ def draw_animation(folder: str | os.PathLike[str], frames: int, viewing: ViewOpt
     if len(recorded) == 1:
         fault = "fields are recorded at one time only; an animation needs two"
         raise FigureError(f"{whole.recording.path}: {fault}")
-    return _draw(whole, [[float(time)] for time in kept_times(recorded, frames)], viewing, path, ".gif")
+    return _draw(
+        whole, [[float(time)] for time in kept_times(recorded, frames)], viewing, path, ".gif"
+    )
 
 
-def _body_for(folder: str | os.PathLike[str], path: Path | None, endings: Sequence[str]) -> WholeBody:
+def _body_for(
+    folder: str | os.PathLike[str], path: Path | None, endings: Sequence[str]
+) -> WholeBody:
     """Read the body of a run; first check that the output file can be written."""
     if path is not None:
         if path.suffix.lower() not in endings:
@@ -319,13 +345,24 @@ def _body_for(folder: str | os.PathLike[str], path: Path | None, endings: Sequen
 
 
 def _draw(
-    whole: WholeBody, sheets: Sequence[Sequence[float]], viewing: ViewOptions, path: Path | None, ending: str
+    whole: WholeBody,
+    sheets: Sequence[Sequence[float]],
+    viewing: ViewOptions,
+    path: Path | None,
+    ending: str,
 ) -> Path:
     """Draw sheets, each with some times, and write them to a new file."""
-    recording, scene, shown = whole.recording, whole.recording.scene, visible_elements(whole, viewing)
+    recording, scene, shown = (
+        whole.recording,
+        whole.recording.scene,
+        visible_elements(whole, viewing),
+    )
     if ANGLE not in recording.fields(sheets[0][0], {ANGLE}):
         raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)")
-    drawn = [[(f"t = {t:g}", deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times] for times in sheets]
+    drawn = [
+        [(f"t = {t:g}", deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times]
+        for times in sheets
+    ]
     along, across = scene.geometry.angle_in_words
     scale = f"angle of the collagen, deformed: 0 {along}, 90 {across} (degrees)"
     notes = f"{scene.name}: {len(whole.elements):,} elements. "
@@ -334,15 +371,27 @@ def _draw(
     first, *others = map(Image.fromarray, images)
     texts, title = PngInfo(), f"{scene.name}: angle of the collagen"
     source = "; ".join(f"{name} {version}" for name, version in recording.versions.items())
-    about = {"Title": title, "Description": notes, "Software": f"remodel_fenicsx {__version__}", "Source": source}
+    about = {
+        "Title": title,
+        "Description": notes,
+        "Software": f"remodel_fenicsx {__version__}",
+        "Source": source,
+    }
     for key, value in about.items():
         texts.add_text(key, value)
     durations = [FRAME_TIME] * len(others) + [LAST_TIME]
-    moving: dict[str, Any] = {"save_all": True, "append_images": others, "loop": 0, "duration": durations}
+    moving: dict[str, Any] = {
+        "save_all": True,
+        "append_images": others,
+        "loop": 0,
+        "duration": durations,
+    }
     file = io.BytesIO()
     kind = (path.suffix.lower() if path else ending)[1:]
     first.save(file, kind, pnginfo=texts, title=title, **(moving if others else {}))
-    stem = "-".join([scene.name, *dict.fromkeys(f"t{times[0]:g}" for times in (sheets[0], sheets[-1][-1:]))])
+    stem = "-".join(
+        [scene.name, *dict.fromkeys(f"t{times[0]:g}" for times in (sheets[0], sheets[-1][-1:]))]
+    )
     for free in [path] if path else numbered(recording.path / f"{stem}{ending}"):
         try:
             write_new(free, file.getvalue())

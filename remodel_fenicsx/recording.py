@@ -221,7 +221,9 @@ class Recording(RecordedRun):
         """
         from remodel_fenicsx.pictures import ViewOptions, draw_picture
 
-        return draw_picture(self.path, times, ViewOptions(layers, cut, view), None if path is None else Path(path))
+        return draw_picture(
+            self.path, times, ViewOptions(layers, cut, view), None if path is None else Path(path)
+        )
 
     def _time(self, time: float | None) -> float:
         """Return this time, or the last one by default."""

@@ -26,7 +26,15 @@ from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
 from remodel_fenicsx.results.export import write_vtu
 from remodel_fenicsx.results.fields import Fields, field_names, local_fields
-from remodel_fenicsx.results.recording import LOCK, LOG, RecordingError, RunLock, SCENE, scene_as_run, versions_as_run
+from remodel_fenicsx.results.recording import (
+    LOCK,
+    LOG,
+    RecordingError,
+    RunLock,
+    SCENE,
+    scene_as_run,
+    versions_as_run,
+)
 from remodel_fenicsx.results.run_folder import (
     LastStep,
     RunFolder,
@@ -122,7 +130,11 @@ def run(
     with interrupts.StopRequest() as stop, ExitStack() as body:
         with buffer_log(comm.rank, quiet=quiet) as held:
             scene = body.enter_context(as_unloaded(scene, comm, quiet))
-            found = comm.bcast(raise_on_all_ranks(comm, lambda: _files_to_store(scene)[0] if comm.rank == 0 else {}))
+            found = comm.bcast(
+                raise_on_all_ranks(
+                    comm, lambda: _files_to_store(scene)[0] if comm.rank == 0 else {}
+                )
+            )
             # A file that is replaced after this point is refused, so the stored files are those
             # that are read.
             if sums := {key: value for key, value in found.items() if key.endswith("sha256")}:
@@ -156,7 +168,9 @@ def resume(
     return place
 
 
-def _read_run(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tuple[Scene, Checkpoint | None]:
+def _read_run(
+    place: Path, overrides: Sequence[str], comm: MPI.Intracomm
+) -> tuple[Scene, Checkpoint | None]:
     """Return scene, and checkpoint on rank 0, of a run to resume; raise errors on all ranks."""
 
     def read() -> tuple[Scene, Checkpoint | None]:
@@ -178,12 +192,18 @@ def _read_run(place: Path, overrides: Sequence[str], comm: MPI.Intracomm) -> tup
                 raise CheckpointError(f"the checkpoint's scene is not TOML: {error}") from error
             check_continuation(scene_from_dict(before), scene, checkpoint.time)
             _check_complete(values, before, place)
-            log.info("resumes from the checkpoint of time %g, step %d", checkpoint.time, checkpoint.number)
+            log.info(
+                "resumes from the checkpoint of time %g, step %d",
+                checkpoint.time,
+                checkpoint.number,
+            )
             begun = checkpoint.versions
         now = versions()
         for name, version in begun.items():
             if now.get(name) != version:
-                log.warning("resumes with %s %s, but was started with %s", name, now.get(name), version)
+                log.warning(
+                    "resumes with %s %s, but was started with %s", name, now.get(name), version
+                )
         return scene, checkpoint
 
     scene, checkpoint = raise_on_all_ranks(comm, lambda: read() if comm.rank == 0 else (None, None))
@@ -249,22 +269,32 @@ def _record(
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
-    scene, files = raise_on_all_ranks(comm, lambda: with_stored_files(scene) if comm.rank == 0 else (scene, {}))
+    scene, files = raise_on_all_ranks(
+        comm, lambda: with_stored_files(scene) if comm.rank == 0 else (scene, {})
+    )
     text = scene.to_toml(header)
     columns = [column.name for column in simulation.observer.columns]
     wants_report = report and scene.output.report and comm.rank == 0
     after = LastStep(columns, state.number, state.time) if state.number else None
     if resumes:
         wanted = bool(scene.output.fields)
-        raise_on_all_ranks(comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None)
+        raise_on_all_ranks(
+            comm, lambda: check_before_resuming(place, after, wanted) if comm.rank == 0 else None
+        )
         if after is None and comm.rank == 0:
             remove_partial_results(place)
     with ExitStack() as stack:
         record = stack.enter_context(
-            raise_on_all_ranks(comm, lambda: RunFolder(place, text, comm.rank, after, {} if resumes else files))
+            raise_on_all_ranks(
+                comm, lambda: RunFolder(place, text, comm.rank, after, {} if resumes else files)
+            )
         )
         stack.enter_context(open_log(place / LOG, comm.rank, quiet=quiet, held=held))
-        steps = scene.time.number_of_steps if scene.time.is_adaptive else state.number + len(simulation.way.remaining())
+        steps = (
+            scene.time.number_of_steps
+            if scene.time.is_adaptive
+            else state.number + len(simulation.way.remaining())
+        )
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
         ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"
@@ -272,14 +302,27 @@ def _record(
         log.info("%s", scene.summary())
         unknowns = simulation.unknown.x.petsc_vec.getSize()
         if comm.size > 1 and unknowns < MIN_PARALLEL_UNKNOWNS:
-            log.info("%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)", unknowns, comm.size)
+            log.info(
+                "%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)",
+                unknowns,
+                comm.size,
+            )
         # This scene has the paths of its files; `scene` has their names in the run's folder.
         for warning in simulation.scene.warnings(simulation.domain):
             log.warning("%s", warning)
         followers, kept = list(watchers), [record.flush]
         if scene.output.fields:
-            names = field_names(scene.output.fields, scene.lacking_fields, scene.geometry.constant_fields)
-            parts = place, scene.geometry, simulation.stepper, scene.output.every, after and after.time, names
+            names = field_names(
+                scene.output.fields, scene.lacking_fields, scene.geometry.constant_fields
+            )
+            parts = (
+                place,
+                scene.geometry,
+                simulation.stepper,
+                scene.output.every,
+                after and after.time,
+                names,
+            )
             times = scene.output.times
             fields = stack.enter_context(raise_on_all_ranks(comm, lambda: Fields(*parts, times)))
             followers, kept = [*followers, fields], [*kept, fields.close]
@@ -327,10 +370,14 @@ def _files_to_store(scene: Scene) -> tuple[dict[str, object], dict[str, bytes]]:
         try:
             files[name] = read_regular(path, LARGEST_FILE)
         except OSError as error:
-            raise SceneError(f"{key} = {cells.fibres!r}: cannot be read: {error.strerror or error}") from error
+            raise SceneError(
+                f"{key} = {cells.fibres!r}: cannot be read: {error.strerror or error}"
+            ) from error
         found = hashlib.sha256(files[name]).hexdigest()
         if cells.fibres_sha256 not in (None, found):
-            raise SceneError(f"{key} = {cells.fibres!r}: has changed: its SHA-256 was {cells.fibres_sha256}")
+            raise SceneError(
+                f"{key} = {cells.fibres!r}: has changed: its SHA-256 was {cells.fibres_sha256}"
+            )
         changes |= {key: name, f"{key}_sha256": found}
     return changes, files
 
@@ -363,7 +410,9 @@ class _StepLog(Watcher):
             log.log(NOTICE, "time %g solved in %d substeps", step.time, parts)
         loads = [f"{name} {step.row[name]:.4g}" for name in self.loads if name in step.row]
         state = ", ".join([f"t = {step.time:g}", *loads, f"{step.work.newton_iterations} Newton"])
-        count = f"{step.number} at {step.time / self.time.end:.0%}" if self.time.is_adaptive else None
+        count = (
+            f"{step.number} at {step.time / self.time.end:.0%}" if self.time.is_adaptive else None
+        )
         self.progress.step(self.time.progress(step.number, step.time), state, count)
 
 
@@ -379,10 +428,14 @@ def write_unloaded(scene: Scene, folder: Path) -> None:
             if folder.exists():
                 raise TakenError(folder, "folder")
             with TemporaryDirectory(prefix="remodel-fenicsx-") as temporary:
-                kept, files = with_stored_files(unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False))
+                kept, files = with_stored_files(
+                    unloaded(scene, MPI.COMM_SELF, Path(temporary), quiet=False)
+                )
             for name, data in files.items():
                 (part / name).write_bytes(data)
-            (part / SCENE).write_text(kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8")
+            (part / SCENE).write_text(
+                kept.to_toml(f"the unloaded body of {scene.name}"), encoding="utf-8"
+            )
             (part / LOCK).unlink()
             part.rename(folder)
         finally:
@@ -397,11 +450,15 @@ def write_axes(scene: Scene, path: Path) -> str:
     weight = KINEMATICS[scene.model.kinematics].for_mesh(mesh, shape).weight(mesh)
     quadrature = Quadrature(mesh, scene.mesh.degree, weight)
     local_axes = shape.local_axes(domain, quadrature)
-    fields = local_fields(local_axes, quadrature) | {"region": domain.element_region.astype(np.int64)}
+    fields = local_fields(local_axes, quadrature) | {
+        "region": domain.element_region.astype(np.int64)
+    }
     words = [f"{domain.number_of_elements} elements"]
     if local_axes.thickness is not None:
         fields["thickness"] = quadrature.element_mean(local_axes.thickness)
-        least, most = quadrature.minimum(local_axes.thickness), quadrature.maximum(local_axes.thickness)
+        least, most = quadrature.minimum(local_axes.thickness), quadrature.maximum(
+            local_axes.thickness
+        )
         words.append(f"wall {least:.4g} to {most:.4g} thick")
     if local_axes.undefined is not None:
         undefined = local_axes.undefined.astype(np.float64)
@@ -411,5 +468,7 @@ def write_axes(scene: Scene, path: Path) -> str:
     points, elements = domain.gather_mesh()
     if points is not None and elements is not None:
         cell_type, cells = vtk_cells(mesh.topology.cell_name(), mesh.geometry.cmap.degree, elements)
-        write_vtu(path, points, cells, cell_type, {n: v for n, v in gathered.items() if v is not None})
+        write_vtu(
+            path, points, cells, cell_type, {n: v for n, v in gathered.items() if v is not None}
+        )
     return "; ".join(words)

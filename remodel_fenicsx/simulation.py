@@ -15,7 +15,13 @@ from remodel_fenicsx.body.loading import LoadValues, values_of_loads
 from remodel_fenicsx.evolution.coupling import CouplingFactory
 from remodel_fenicsx.evolution.stepper import FixedSteps, Step, Stepper, Watcher, Way
 from remodel_fenicsx.fem.kinematics import NaturalConfiguration
-from remodel_fenicsx.initial import field_from_files, initial_states, measured_fibres, meshed, natural_gradient
+from remodel_fenicsx.initial import (
+    field_from_files,
+    initial_states,
+    measured_fibres,
+    meshed,
+    natural_gradient,
+)
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Remodeling, Solver
@@ -150,7 +156,10 @@ class SimulationParts:
 
 
 def build(
-    scene: Scene, comm: MPI.Intracomm, domain: Domain | None = None, coupling: CouplingFactory | None = None
+    scene: Scene,
+    comm: MPI.Intracomm,
+    domain: Domain | None = None,
+    coupling: CouplingFactory | None = None,
 ) -> SimulationParts:
     """Build the components of a scene in their order. Collective."""
     scene, domain = meshed(scene, comm, domain)
@@ -159,17 +168,25 @@ def build(
     if others and coupling is not None:
         raise SceneError("cases: a custom coupling solves one load case; remove [[cases]]")
     tissue, kappa = parameters_of(scene.properties(), domain)
-    solver, (first, *more) = _solver(scene), (partial(values_of_loads, case.loads) for case in scene.each_case())
+    solver, (first, *more) = _solver(scene), (
+        partial(values_of_loads, case.loads) for case in scene.each_case()
+    )
     stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, first, coupling, kappa)
     for process in stepper.remodels:
-        process.set_initial(partial(field_from_files, fibres, quadrature=state.cells.quadrature, domain=domain))
+        process.set_initial(
+            partial(field_from_files, fibres, quadrature=state.cells.quadrature, domain=domain)
+        )
     if others:
         from remodel_fenicsx.evolution import load_cases
 
         load_cases.join(stepper, others, more, [case.weight for case in scene.cases], solver, kappa)
     way = _way(scene, stepper)
-    estimated = [TIME_ERROR] if scene.time.is_adaptive and TIME_ERROR not in scene.output.columns else []
-    return SimulationParts(scene, domain, stepper, Observer(scene.geometry, stepper, scene.columns(estimated)), way)
+    estimated = (
+        [TIME_ERROR] if scene.time.is_adaptive and TIME_ERROR not in scene.output.columns else []
+    )
+    return SimulationParts(
+        scene, domain, stepper, Observer(scene.geometry, stepper, scene.columns(estimated)), way
+    )
 
 
 def _solver(scene: Scene) -> Solver:
@@ -217,9 +234,14 @@ def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
     """Return the watchers in order: eigenvalues before the row, warnings after the row."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
-    candidates: list[Watcher | None] = [EquilibriumStability(stepper, unstable, every_step=counted), parts.observer]
+    candidates: list[Watcher | None] = [
+        EquilibriumStability(stepper, unstable, every_step=counted),
+        parts.observer,
+    ]
     candidates += [kind.make(scene, stepper) for kind in WATCHERS.values()]
-    candidates += [make(scene, stepper) for process in stepper.remodels for make in process.watchers]
+    candidates += [
+        make(scene, stepper) for process in stepper.remodels for make in process.watchers
+    ]
     for case in stepper.each_case[1:]:
         case_watchers: list[Watcher | None] = [EquilibriumStability(case, unstable)]
         case_watchers += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
@@ -237,16 +259,24 @@ def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> b
     # Adaptive time stepping, growth and the stability check hold numbers of the scene.
     chosen = not isinstance(simulation.way, FixedSteps)
     watched = chosen or kinematics.grows or scene.solver.unstable == "stop"
-    if watched or any(varies[name] and not isinstance(parameters[name], Function) for name in varies):
+    if watched or any(
+        varies[name] and not isinstance(parameters[name], Function) for name in varies
+    ):
         return False
     for name, value in tissue.parameters.items():
-        numbers = parameters[name].x.array if isinstance(parameters[name], Function) else parameters[name].value
+        numbers = (
+            parameters[name].x.array
+            if isinstance(parameters[name], Function)
+            else parameters[name].value
+        )
         numbers[...] = value.x.array if varies[name] else value
     stepper.take(partial(values_of_loads, scene.loads), kappa)
     simulation.state.restore(start)
     if isinstance(kinematics, NaturalConfiguration) and not scene.natural.fibres:
         cells, quadrature = simulation.cells, simulation.quadrature
-        values, kinematics.closing = natural_gradient(scene, quadrature, simulation.domain, cells.local_axes)
+        values, kinematics.closing = natural_gradient(
+            scene, quadrature, simulation.domain, cells.local_axes
+        )
         quadrature.values(kinematics.gradient, (3, 3))[:] = values
     simulation.scene = scene
     return True

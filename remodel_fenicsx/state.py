@@ -57,7 +57,9 @@ class CellField:
         self.axes = quadrature.function(f"{name}_axes", (3, 3))
         self.dimension_values: Array = quadrature.values(self.dimensions, (3,))
         self.axis_values: Array = quadrature.values(self.axes, (3, 3))
-        self.point_cells = UnitCell(self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3))
+        self.point_cells = UnitCell(
+            self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3)
+        )
 
     @property
     def symbolic_cell(self) -> UnitCell:
@@ -154,7 +156,10 @@ class UnitCells(CellField):
         for name, cells in {"": settings, **regions}.items():
             chosen = domain.element_region == domain.regions[name] if name else everywhere
             if name in fibres:
-                measured = {key: values[domain.element_number[chosen]] for key, values in fibres[name].items()}
+                measured = {
+                    key: values[domain.element_number[chosen]]
+                    for key, values in fibres[name].items()
+                }
                 self._take(measured, chosen, axes[chosen], cells.end_to_end_length)
             elif cells.initial != MEASURED_CELLS:
                 drawn = cells.dimensions(domain.number_of_elements)
@@ -162,11 +167,17 @@ class UnitCells(CellField):
                 self.axis_values[chosen] = axes[chosen]
         self.initial_dimensions: Array = self.dimension_values.copy()
 
-    def _take(self, measured: Mapping[str, Array], chosen: NDArray[np.bool_], axes: Array, length: float) -> None:
+    def _take(
+        self, measured: Mapping[str, Array], chosen: NDArray[np.bool_], axes: Array, length: float
+    ) -> None:
         """Set cells of chosen elements from measured fibres; `axes` replace undetermined axes."""
         at_points = {name: values[:, None, :] for name, values in measured.items()}
-        tensors = np.broadcast_to(structure_tensors(at_points, self.local_axes.axes[chosen]), axes.shape)
-        self.dimension_values[chosen], self.axis_values[chosen] = cells_from_tensors(tensors, length, axes)
+        tensors = np.broadcast_to(
+            structure_tensors(at_points, self.local_axes.axes[chosen]), axes.shape
+        )
+        self.dimension_values[chosen], self.axis_values[chosen] = cells_from_tensors(
+            tensors, length, axes
+        )
 
     def initial_axes(self) -> Array:
         """Return the initial axes n_I as rows, (elements, points, 3, 3)."""
@@ -270,7 +281,13 @@ class State:
         solved = self.equilibrium_cells
         self._functions: dict[str, dolfinx.fem.Function] = {}
         self._arrays: dict[str, NDArray[np.float64]] = {}  # the functions' own memory
-        for function in (self.unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes):
+        for function in (
+            self.unknown,
+            cells.dimensions,
+            cells.axes,
+            solved.dimensions,
+            solved.axes,
+        ):
             self._add(function)
         self.time, self.number = 0.0, 0
         self.numbers: dict[str, float] = {}
@@ -302,7 +319,9 @@ class State:
         array (n, 3) or None
             None on other ranks.
         """
-        return self.loading.domain.gather_nodes(self.kinematics.nodal_displacement(self.unknown)[self._dof_of_node])
+        return self.loading.domain.gather_nodes(
+            self.kinematics.nodal_displacement(self.unknown)[self._dof_of_node]
+        )
 
     def deformation_gradient(self) -> NDArray[np.float64]:
         """Return F of the present unknowns, flattened over the quadrature points of this rank.
@@ -314,12 +333,16 @@ class State:
         """
         quadrature = self.cells.quadrature
         expression = self._deformation_gradient
-        return self._cached_gradient(lambda: quadrature.evaluate(expression, (3, 3)).reshape(-1, 3, 3))
+        return self._cached_gradient(
+            lambda: quadrature.evaluate(expression, (3, 3)).reshape(-1, 3, 3)
+        )
 
     @property
     def natural_gradient(self) -> NDArray[np.float64] | None:
         """G at all points, (elements, points, 3, 3); None if the mesh is stress-free."""
-        return None if self._natural is None else self.cells.quadrature.values(self._natural, (3, 3))
+        return (
+            None if self._natural is None else self.cells.quadrature.values(self._natural, (3, 3))
+        )
 
     def elastic(self, deformation_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F_e = F G, or F if the mesh is stress-free.
@@ -344,7 +367,11 @@ class State:
         deformation_gradient
             F, (elements, points, 3, 3), or None.
         """
-        gradient = self.natural_gradient if deformation_gradient is None else self.elastic(deformation_gradient)
+        gradient = (
+            self.natural_gradient
+            if deformation_gradient is None
+            else self.elastic(deformation_gradient)
+        )
         return axes if gradient is None else axes @ np.swapaxes(gradient, -1, -2)
 
     def elastic_gradient(self) -> NDArray[np.float64]:
@@ -386,14 +413,22 @@ class State:
         """
         quadrature = self.cells.quadrature
         values = values.reshape(quadrature.shape)
-        return values if self._initial is None else values / np.linalg.det(quadrature.values(self._initial, (3, 3)))
+        return (
+            values
+            if self._initial is None
+            else values / np.linalg.det(quadrature.values(self._initial, (3, 3)))
+        )
 
     def functions(self) -> dict[str, dolfinx.fem.Function]:
         """Return all dolfinx functions of the state by name; further load cases add "@2", ..."""
         shared = {self.cells.dimensions.name, self.cells.axes.name}
         functions = dict(self._functions)
         for mark, case in list(self.each_case().items())[1:]:
-            functions |= {f"{name}{mark}": function for name, function in case._functions.items() if name not in shared}
+            functions |= {
+                f"{name}{mark}": function
+                for name, function in case._functions.items()
+                if name not in shared
+            }
         return functions
 
     def join(self, others: Sequence[State], weights: Sequence[float]) -> None:
@@ -410,7 +445,9 @@ class State:
 
     def each_case(self) -> dict[str, State]:
         """Return the states of all load cases by suffix: "" for this state, then "@2", ..."""
-        return {"": self} | {f"@{number}": case for number, case in enumerate(self.other_cases, start=2)}
+        return {"": self} | {
+            f"@{number}": case for number, case in enumerate(self.other_cases, start=2)
+        }
 
     def complete_step(self, time: float, number: int) -> None:
         """Set time and number of a completed step in all load cases.
@@ -461,7 +498,9 @@ class State:
         """Return a copy of all values."""
         arrays = {name: array.copy() for name, array in self._arrays.items()}
         others = tuple(case.snapshot() for case in self.other_cases)
-        return Snapshot(arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers), others)
+        return Snapshot(
+            arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers), others
+        )
 
     def restore(self, snapshot: Snapshot) -> None:
         """Restore all values from a snapshot.
@@ -596,7 +635,9 @@ def region_function(domain: Domain, values: Mapping[str, float]) -> dolfinx.fem.
     dofmap = function.function_space.dofmap
     dofs = dofmap.list.reshape(-1)
     for name, number in domain.regions.items():
-        function.x.array[dofs[domain.element_region == number]] = values[name if name in values else ""]
+        function.x.array[dofs[domain.element_region == number]] = values[
+            name if name in values else ""
+        ]
     return function
 
 
@@ -616,7 +657,9 @@ class Parameters:
         self.given, self.quadrature = tissue, quadrature
         mesh = quadrature.mesh
         self.tissue = tissue.map(
-            lambda name, value: value if name in TURNED_OVER else assembly.coefficient(mesh, name, value)
+            lambda name, value: (
+                value if name in TURNED_OVER else assembly.coefficient(mesh, name, value)
+            )
         )
         self.compiled = with_kernels(self.tissue, mesh.comm)
         values = list(self.tissue.parameters.values())
@@ -628,7 +671,9 @@ class Parameters:
 
         def largest_values() -> Tissue:
             maxima = self.compiled.map(
-                lambda name, value: self.quadrature.maximum(assembly.point_values(value, self.quadrature))
+                lambda name, value: self.quadrature.maximum(
+                    assembly.point_values(value, self.quadrature)
+                )
             )
             if not isinstance(self.tissue.contour_length, dolfinx.fem.Function):
                 return maxima
@@ -669,11 +714,15 @@ def parameters_of(
     domain: Domain,
 ) -> tuple[Tissue, float | dolfinx.fem.Function]:
     """Return tissue and kappa of a scene's regions: numbers if equal, else DG0 Functions."""
-    tissues, kappas = _tissues(properties), {name: region.kappa for name, region in properties.items()}
+    tissues, kappas = _tissues(properties), {
+        name: region.kappa for name, region in properties.items()
+    }
     tissue, kappa = next(iter(tissues.values())), next(iter(kappas.values()))
     if any(region_tissue != tissue for region_tissue in tissues.values()):
         tissue = tissue.map(
-            lambda key, _: region_function(domain, {name: t.parameters[key] for name, t in tissues.items()})
+            lambda key, _: region_function(
+                domain, {name: t.parameters[key] for name, t in tissues.items()}
+            )
         )
     return tissue, kappa if len(set(kappas.values())) == 1 else region_function(domain, kappas)
 
@@ -700,5 +749,7 @@ def _with_one_matrix(
     for name, tissue in tissues.items():
         weight = {f"share_{matrices.index(properties[name].material.matrix)}": 1.0}
         own = getattr(tissue.matrix, "values", {})
-        mixtures[name] = replace(tissue, matrix=mixture.with_parameters({**defaults, **own, **weight}))
+        mixtures[name] = replace(
+            tissue, matrix=mixture.with_parameters({**defaults, **own, **weight})
+        )
     return mixtures

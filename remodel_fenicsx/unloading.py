@@ -45,7 +45,10 @@ def as_unloaded(scene: Scene, comm: MPI.Intracomm, quiet: bool = True) -> Iterat
 
 
 def unloaded(
-    scene: Scene, comm: MPI.Intracomm = MPI.COMM_WORLD, folder: Path | None = None, quiet: bool = True
+    scene: Scene,
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    folder: Path | None = None,
+    quiet: bool = True,
 ) -> Scene:
     """Compute the unloaded body that the loads, after their ramps, deform to this one. Collective.
 
@@ -153,7 +156,11 @@ def found_unloaded(
             reason = f"no convergence in {MAX_FORWARD_RUNS} iterations{words}"
             if not isinstance(refusal, NoConvergence):
                 reason = " ".join(str(refusal).split())
-            log.info("unloading at %g %% of the loads failed (%s); using smaller load increments", 100 * share, reason)
+            log.info(
+                "unloading at %g %% of the loads failed (%s); using smaller load increments",
+                100 * share,
+                reason,
+            )
             step /= 2
             if step < LEAST_SHARE:
                 raise NoUnloadedShape(
@@ -190,17 +197,27 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
         return np.log(given / _load_forward(scene, comm, np.exp(numbers), share))
 
     numbers, runs = found_unloaded(
-        lambda share: np.log(_inverse_elastostatics(scene, given, share)), missed, GEOMETRY_TOLERANCE, said
+        lambda share: np.log(_inverse_elastostatics(scene, given, share)),
+        missed,
+        GEOMETRY_TOLERANCE,
+        said,
     )
     found = np.exp(numbers)
-    unloaded, loaded = (f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}" for *radii, l in (found, given))
+    unloaded, loaded = (
+        f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}"
+        for *radii, l in (found, given)
+    )
     log.log(NOTICE, "unloaded: %s; under the loads: %s (%d runs)", unloaded, loaded, runs)
     return _with_dimensions(scene, found)
 
 
 def _outer_radii(scene: Scene) -> dict[str, float]:
     """Return the outer radii of the regions that set one, from the lumen outwards."""
-    said = {name: region.outer_radius for name, region in scene.regions.items() if region.outer_radius is not None}
+    said = {
+        name: region.outer_radius
+        for name, region in scene.regions.items()
+        if region.outer_radius is not None
+    }
     return dict(sorted(said.items(), key=lambda item: item[1]))
 
 
@@ -211,7 +228,9 @@ def _inverse_elastostatics(scene: Scene, given: Array, share: float) -> Array:
     end = scene.end_of_ramps
     loads = {name: load.value * load.factor(end) * share for name, load in scene.loads.items()}
     axial = 1.0 + loads.get("elongation", 0.0)
-    radii = close_ring(layers, 0.0, Loads(loads.get("pressure", 0.0), None, axial)).natural_radius(given[:-1])
+    radii = close_ring(layers, 0.0, Loads(loads.get("pressure", 0.0), None, axial)).natural_radius(
+        given[:-1]
+    )
     return np.append(radii, given[-1] / axial)
 
 
@@ -223,22 +242,34 @@ def _load_forward(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: floa
         changes |= PASSIVE | {"time.end": end, "time.step": end / LOAD_STEPS}
     else:
         changes |= {"time.end": EQUILIBRIUM}
-    changes |= {"solver.relative_tolerance": min(scene.solver.relative_tolerance, GEOMETRY_TOLERANCE / 10)}
+    changes |= {
+        "solver.relative_tolerance": min(scene.solver.relative_tolerance, GEOMETRY_TOLERANCE / 10)
+    }
     for name, load in scene.loads.items():
         changes |= {f"loads.{name}.value": load.value * load.factor(end) * share}
         changes |= {f"loads.{name}.ramp": [[0.0, 0.0], [end, 1.0]]}
     with (
         muted_warnings(),
-        contextlib.closing(Simulation(_with_dimensions(scene, numbers).with_values(changes), comm)) as simulation,
+        contextlib.closing(
+            Simulation(_with_dimensions(scene, numbers).with_values(changes), comm)
+        ) as simulation,
     ):
         simulation.watchers = [simulation.observer]
         row = [step.row for step in simulation.steps()][-1]
         domain = simulation.domain
-        places, moves = domain.gather_nodes(domain.mesh.geometry.x), simulation.state.gathered_displacement()
+        places, moves = (
+            domain.gather_nodes(domain.mesh.geometry.x),
+            simulation.state.gathered_displacement(),
+        )
     radii = None
     if places is not None and moves is not None:
         before, after = (np.hypot(x[:, 0], x[:, 1]) for x in (places, places + moves))
-        radii = np.array([after[np.abs(before - radius) < 1e-6 * numbers.max()].mean() for radius in numbers[:-1]])
+        radii = np.array(
+            [
+                after[np.abs(before - radius) < 1e-6 * numbers.max()].mean()
+                for radius in numbers[:-1]
+            ]
+        )
     found: Array = comm.bcast(radii)
     return np.append(found, numbers[-1] * (1 + row["axial_elongation"]))
 
@@ -246,7 +277,10 @@ def _load_forward(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: floa
 def _with_dimensions(scene: Scene, numbers: Array) -> Scene:
     """Return the scene of an unloaded tube with these radii (inner to outer) and length."""
     changes: dict[str, object] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
-    changes |= {"geometry.inner_radius": float(numbers[0]), "geometry.outer_radius": float(numbers[-2])}
+    changes |= {
+        "geometry.inner_radius": float(numbers[0]),
+        "geometry.outer_radius": float(numbers[-2]),
+    }
     changes |= {"geometry.length": float(numbers[-1])}
     for name, radius in zip(_outer_radii(scene), numbers[1:-1], strict=False):
         changes[f"regions.{name}.outer_radius"] = float(radius)
@@ -259,22 +293,32 @@ def _with_dimensions(scene: Scene, numbers: Array) -> Scene:
 # step of that body.
 
 UNLOADED_MESH = "unloaded.msh"
-UPDATE_TOLERANCE = 1e-10  # largest distance of a node from its measured position, over the body's extent
+UPDATE_TOLERANCE = (
+    1e-10  # largest distance of a node from its measured position, over the body's extent
+)
 
 
 def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -> Scene:
     """Return the scene of the unloaded body and write its mesh into the folder. Collective."""
     shape: Any = scene.geometry
-    file, regions = raise_on_all_ranks(comm, lambda: _read(scene) if comm.rank == 0 else None) or (None, None)
+    file, regions = raise_on_all_ranks(comm, lambda: _read(scene) if comm.rank == 0 else None) or (
+        None,
+        None,
+    )
     given: Array = comm.bcast(None if file is None else file.points)
-    extent, as_unloaded = float(np.ptp(given, axis=0).max()), scene.with_values({"geometry.is": "unloaded"})
+    extent, as_unloaded = float(np.ptp(given, axis=0).max()), scene.with_values(
+        {"geometry.is": "unloaded"}
+    )
 
     def missed(places: Array, share: float) -> Array:
         moved: Any = file and replace(file, points=places)
         if not comm.bcast(moved is None or _has_valid_elements(moved)):
             raise ArithmeticError("inverted elements")
         domain = shared(lambda: (moved, shape.boundary(moved), regions or {}), comm)
-        with muted_warnings(), contextlib.closing(Simulation(as_unloaded, comm, domain)) as simulation:
+        with (
+            muted_warnings(),
+            contextlib.closing(Simulation(as_unloaded, comm, domain)) as simulation,
+        ):
             return np.divide(_missed(simulation, given, share), extent, dtype=np.float64)
 
     places, runs = found_unloaded(lambda _: given, missed, UPDATE_TOLERANCE, said, extent)
@@ -283,8 +327,18 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
         path.write_text(gmsh_text(places, file.blocks, file.names), encoding="ascii")
     comm.barrier()
     moved = np.linalg.norm(places - given, axis=1).max()
-    log.log(NOTICE, "unloaded: %d nodes, largest movement %.6g, found in %d iterations", len(places), moved, runs)
-    changes: dict[str, object] = {"geometry.is": "unloaded", "geometry.file": str(path), "mesh.refinement": 1}
+    log.log(
+        NOTICE,
+        "unloaded: %d nodes, largest movement %.6g, found in %d iterations",
+        len(places),
+        moved,
+        runs,
+    )
+    changes: dict[str, object] = {
+        "geometry.is": "unloaded",
+        "geometry.file": str(path),
+        "mesh.refinement": 1,
+    }
     changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
     if shape.regions:
         numbers: dict[str, int] = comm.bcast(regions)

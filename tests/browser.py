@@ -57,10 +57,20 @@ class Browser:
     def __init__(self, *options: str):
         path = browser_path()
         assert path is not None
-        self._profile = tempfile.TemporaryDirectory(prefix="remodel-fenicsx-browser-", ignore_cleanup_errors=True)
+        self._profile = tempfile.TemporaryDirectory(
+            prefix="remodel-fenicsx-browser-", ignore_cleanup_errors=True
+        )
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        command = ["bash", "-c", f'exec "$@" 3<&{to_read} 4>&{to_write}', "bash", path, *OPTIONS, *options]
+        command = [
+            "bash",
+            "-c",
+            f'exec "$@" 3<&{to_read} 4>&{to_write}',
+            "bash",
+            path,
+            *OPTIONS,
+            *options,
+        ]
         command += [f"--user-data-dir={self._profile.name}", "about:blank"]
         self.process = subprocess.Popen(
             command, pass_fds=(to_read, to_write), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
@@ -73,7 +83,9 @@ class Browser:
         self.requests: list[str] = []
         targets = self.call("Target.getTargets")["targetInfos"]
         target = next(one["targetId"] for one in targets if one["type"] == "page")
-        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
@@ -108,7 +120,9 @@ class Browser:
 
     def _note(self, method: str, found: dict[str, Any]) -> None:
         if method == "Runtime.consoleAPICalled" and found["type"] in ("warning", "error", "assert"):
-            self.said.append(" ".join(str(one.get("value", one.get("description"))) for one in found["args"]))
+            self.said.append(
+                " ".join(str(one.get("value", one.get("description"))) for one in found["args"])
+            )
         elif method == "Runtime.exceptionThrown":
             details = found["exceptionDetails"]
             self.said.append(details.get("exception", {}).get("description", details["text"]))
@@ -118,11 +132,23 @@ class Browser:
             self.requests.append(found["request"]["url"])
 
     # ------------------------------------------------------------ what a person does
-    def open(self, page: Path, width: int = 1360, height: int = 1000, wait: bool = True, **media: str) -> None:
+    def open(
+        self, page: Path, width: int = 1360, height: int = 1000, wait: bool = True, **media: str
+    ) -> None:
         """Open a file and wait until it says that it is ready; media features as prefers_color_scheme="dark"."""
-        features = [{"name": name.replace("_", "-"), "value": value} for name, value in media.items() if name != "type"]
+        features = [
+            {"name": name.replace("_", "-"), "value": value}
+            for name, value in media.items()
+            if name != "type"
+        ]
         self.call("Emulation.setEmulatedMedia", features=features, media=media.get("type", ""))
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
         self.call("Page.navigate", url="about:blank")
         self.said, self.requests = [], []
         self.call("Page.navigate", url=page.as_uri())
@@ -148,7 +174,9 @@ class Browser:
 
     def value(self, expression: str) -> Any:
         """Of an expression of the page; promises are waited for."""
-        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        found = self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         if "exceptionDetails" in found:
             raise PageError(found["exceptionDetails"]["exception"]["description"])
         return found["result"].get("value")
@@ -169,16 +197,32 @@ class Browser:
     def drag(self, *places: tuple[float, float]) -> None:
         """The left button down at the first place, up at the last."""
         for kind, (x, y) in zip(
-            ["mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"], [*places, places[-1]], strict=True
+            ["mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"],
+            [*places, places[-1]],
+            strict=True,
         ):
             buttons = 0 if kind == "mouseReleased" else 1
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=buttons, clickCount=1)
+            self.call(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="left",
+                buttons=buttons,
+                clickCount=1,
+            )
 
     def press(self, key: str) -> None:
         """A key, where the focus is."""
         codes = {"ArrowLeft": 37, "ArrowRight": 39, "Home": 36, "End": 35, " ": 32, "Tab": 9}
         for kind in ("rawKeyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=codes[key])
+            self.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=key,
+                code=key,
+                windowsVirtualKeyCode=codes[key],
+            )
 
     def choose(self, selector: str, value: str) -> None:
         """A choice of a list."""
@@ -193,11 +237,25 @@ class Browser:
         if selector is not None:
             x, y, width, height = self.place(selector)
             scrolled = self.value("window.scrollY")
-            options["clip"] = {"x": x, "y": y + scrolled, "width": width, "height": height, "scale": 1}
+            options["clip"] = {
+                "x": x,
+                "y": y + scrolled,
+                "width": width,
+                "height": height,
+                "scale": 1,
+            }
         else:
             size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-            options["clip"] = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
-        data = base64.b64decode(self.call("Page.captureScreenshot", format="png", **options)["data"])
+            options["clip"] = {
+                "x": 0,
+                "y": 0,
+                "width": size["width"],
+                "height": size["height"],
+                "scale": 1,
+            }
+        data = base64.b64decode(
+            self.call("Page.captureScreenshot", format="png", **options)["data"]
+        )
         with Image.open(io.BytesIO(data)) as picture:
             return np.asarray(picture.convert("RGB"))
 
@@ -216,6 +274,9 @@ class Browser:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()

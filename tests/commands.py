@@ -25,7 +25,10 @@ def main(folder: Path) -> None:
     codes, own = {}, [os.dup(1), os.dup(2)]
     for name, words in json.loads((folder / "commands.json").read_text()).items():
         for number, ending in ((1, "out"), (2, "err")):
-            os.dup2(os.open(folder / f"{name}.{ending}", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), number)
+            os.dup2(
+                os.open(folder / f"{name}.{ending}", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600),
+                number,
+            )
         code = cli.main(words)
         sys.stdout.flush()
         for number, stream in enumerate(own, 1):

@@ -35,14 +35,21 @@ def mpirun(ranks: int, *command: str) -> list[str]:
 
 def slowly(*cases: Any) -> list[Any]:
     """Cases of a parametrised test that only `-m slow` runs, where the others already show what it tells."""
-    return [pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=pytest.mark.slow) for one in cases]
+    return [
+        pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=pytest.mark.slow)
+        for one in cases
+    ]
 
 
 @contextmanager
 def forked_children() -> Iterator[None]:
     """Within, the runs that figures, ensembles and trades start are forked, one after the other."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(children, "subprocess", SimpleNamespace(**vars(children.subprocess) | {"Popen": ForkedChild}))
+        patch.setattr(
+            children,
+            "subprocess",
+            SimpleNamespace(**vars(children.subprocess) | {"Popen": ForkedChild}),
+        )
         yield
 
 
@@ -52,7 +59,9 @@ def display() -> Iterator[dict[str, str]]:
     told = "import json, os, sys; print(json.dumps({**os.environ}), flush=True); sys.stdin.read()"
     command = ["xvfb-run", "-a", "-s", "-screen 0 1280x1024x24", sys.executable, "-c", told]
     if shutil.which("xvfb-run"):
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as shown:
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as shown:
             inside = json.loads(shown.stdout.readline())  # type: ignore[union-attr]
             yield {name: inside[name] for name in ("DISPLAY", "XAUTHORITY")}
             shown.stdin.close()  # type: ignore[union-attr]
@@ -66,7 +75,9 @@ def drawn_by_forks(display: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> 
     program = "import sys; from remodel_fenicsx import pictures; pictures.main(sys.argv[1])"
     imports = ("remodel_fenicsx.pictures", "pyvista.plotting", "matplotlib.backends.backend_agg")
 
-    def draw(command: Sequence[str], env: dict[str, str], **_: Any) -> subprocess.CompletedProcess[str]:
+    def draw(
+        command: Sequence[str], env: dict[str, str], **_: Any
+    ) -> subprocess.CompletedProcess[str]:
         return forked("python", program, command[-1], variables=env | display, imports=imports)
 
     drawing = SimpleNamespace(**vars(subprocess) | {"run": draw})
@@ -81,7 +92,11 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
         capsys.readouterr()
         assert cli.main([*map(str, words)]) == 2
         said = capsys.readouterr()
-        assert said.out == "" and said.err.count("\n") == 1 and said.err.startswith("remodel-fenicsx: "), said
+        assert (
+            said.out == ""
+            and said.err.count("\n") == 1
+            and said.err.startswith("remodel-fenicsx: ")
+        ), said
         return said.err.removeprefix("remodel-fenicsx: ")
 
     return run
@@ -102,7 +117,9 @@ def cases(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
     With one that a test file lists as ON_ONE_AND_TWO_RANKS start those of all files of this session: ranks start once.
     """
     modules = dict.fromkeys(getattr(item, "module", None) for item in request.session.items)
-    on_both = [arguments for module in modules for arguments in getattr(module, "ON_ONE_AND_TWO_RANKS", ())]
+    on_both = [
+        arguments for module in modules for arguments in getattr(module, "ON_ONE_AND_TWO_RANKS", ())
+    ]
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cases"
     folder.mkdir(exist_ok=True)
@@ -112,7 +129,9 @@ def cases(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
         together = on_both if any(arguments in on_both for arguments in wanted) else []
         for arguments in (*wanted, *together):
             text = json.dumps({"divisions": None} | arguments, sort_keys=True)
-            requests[folder / (hashlib.sha256(f"{ranks} {text}".encode()).hexdigest()[:16] + ".npz")] = text
+            requests[
+                folder / (hashlib.sha256(f"{ranks} {text}".encode()).hexdigest()[:16] + ".npz")
+            ] = text
         with ExitStack() as locked:
             for out in sorted(requests):
                 fcntl.flock(locked.enter_context(out.with_suffix(".lock").open("w")), fcntl.LOCK_EX)

@@ -78,7 +78,15 @@ class Forks:
         with tempfile.TemporaryDirectory() as folder:
             streams = [os.path.join(folder, name) for name in ("output", "errors")]
             environment = dict(os.environ if variables is None else variables)
-            request = [program, [*map(str, words)], str(cwd or Path.cwd()), environment, streams, imports, seconds]
+            request = [
+                program,
+                [*map(str, words)],
+                str(cwd or Path.cwd()),
+                environment,
+                streams,
+                imports,
+                seconds,
+            ]
             print(json.dumps(request), file=self.process.stdin, flush=True)
             answer = self.process.stdout.readline()
             assert answer, f"it has ended: {self.process.wait()}"
@@ -200,10 +208,17 @@ def python(words: list[str]) -> int:
     return 0
 
 
-PROGRAMS = {"remodel-fenicsx": remodel_fenicsx, "four layers": four_layers, "case": run_case, "python": python}
+PROGRAMS = {
+    "remodel-fenicsx": remodel_fenicsx,
+    "four layers": four_layers,
+    "case": run_case,
+    "python": python,
+}
 
 
-def begin(program: str, words: list[str], folder: str, variables: dict[str, str], streams: list[str]) -> int:
+def begin(
+    program: str, words: list[str], folder: str, variables: dict[str, str], streams: list[str]
+) -> int:
     """In a child: the program with a folder, an environment and streams of its own."""
     for number, name in enumerate([os.devnull, *streams]):
         os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), number)

@@ -31,7 +31,11 @@ def place(m: Any, point: tuple[float, float, float], component: int) -> float:
     """Deformed coordinate of the node at a reference point, over all ranks."""
     nodes = m.state.unknown.function_space.tabulate_dof_coordinates()
     here = np.linalg.norm(nodes - point, axis=1) < 1e-6
-    return float(m.domain.comm.allreduce(float(np.max(m.position[here, component], initial=-np.inf)), MPI.MAX))
+    return float(
+        m.domain.comm.allreduce(
+            float(np.max(m.position[here, component], initial=-np.inf)), MPI.MAX
+        )
+    )
 
 
 class Bar(Shape):
@@ -40,11 +44,15 @@ class Bar(Shape):
     face_names: ClassVar[tuple[str, ...]] = ("x0", "x1", "y0", "y1", "z0", "z1")
     loads: ClassVar[dict[str, LoadKind]] = {
         "pressure": LoadKind(
-            lambda s, loading, name: loading.add_follower_pressure(name, "z0"), "on the bottom", STRESS
+            lambda s, loading, name: loading.add_follower_pressure(name, "z0"),
+            "on the bottom",
+            STRESS,
         )
     }
     columns: ClassVar[tuple[Column, ...]] = (
-        Column("tip", "length", "z of the point (10, 0.5, 1)", lambda m: place(m, (10.0, 0.5, 1.0), 2)),
+        Column(
+            "tip", "length", "z of the point (10, 0.5, 1)", lambda m: place(m, (10.0, 0.5, 1.0), 2)
+        ),
     )
     number_of_elements: ClassVar[int] = 80
 
@@ -57,7 +65,10 @@ class Bar(Shape):
         def draw() -> None:
             corners = model.points(np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 1.0), (0.0, 1.0)]))
             counts = (along, across) * 2
-            lines = [model.line(corners[i], corners[(i + 1) % 4], count) for i, count in enumerate(counts)]
+            lines = [
+                model.line(corners[i], corners[(i + 1) % 4], count)
+                for i, count in enumerate(counts)
+            ]
             section = model.block(lines, corners, mesh.element)
             sides = dict(zip(("y0", "x1", "y1", "x0"), lines, strict=True))
             model.extrude([section], 1.0, across, mesh.element, sides, ends=("z0", "z1"))
@@ -74,7 +85,9 @@ class Bar(Shape):
 def transversely_isotropic(F: Any, lame_lambda: Any, lame_mu: Any) -> Any:
     """W = C/2 (exp Q - 1), Q = b_f E11^2 + b_t (E22^2 + E33^2 + 2 E23^2) + 2 b_fs (E12^2 + E13^2), C = mu, fibre x."""
     E = (F.T * F - ufl.Identity(3)) / 2
-    along, across = 8 * E[0, 0] ** 2, 2 * (E[1, 1] ** 2 + E[2, 2] ** 2 + E[1, 2] ** 2 + E[2, 1] ** 2)
+    along, across = 8 * E[0, 0] ** 2, 2 * (
+        E[1, 1] ** 2 + E[2, 2] ** 2 + E[1, 2] ** 2 + E[2, 1] ** 2
+    )
     sheared = 4 * (E[0, 1] ** 2 + E[1, 0] ** 2 + E[0, 2] ** 2 + E[2, 0] ** 2)
     return lame_mu / 2 * (ufl.exp(along + across + sheared) - 1)
 
@@ -89,7 +102,13 @@ def registered() -> Iterator[None]:
 
 def bar_scene(**mesh: Any) -> Scene:
     """The benchmark's bar: C = 2 kPa, pressure 0.004 kPa in ten steps, lambda = 1000 C."""
-    material = {"matrix": "cardiac", "lame_mu": 2.0, "lame_lambda": 2000.0, "stress_unit": "kPa", "chain_density": 0.0}
+    material = {
+        "matrix": "cardiac",
+        "lame_mu": 2.0,
+        "lame_lambda": 2000.0,
+        "stress_unit": "kPa",
+        "chain_density": 0.0,
+    }
     return Scene(
         geometry={"shape": "bar"}, mesh=mesh, material=material, loads=ramped(10.0, pressure=0.004),
         remodeling={"law": "none"}, time={"end": 10.0},

@@ -15,7 +15,9 @@ from remodel_fenicsx.body.tube import draw_tube
 NAMES = {"bottom": "inlet", "top": "outlet", "inner": "inner", "outer": "outer"}
 COUNTS = (8, 2, 3)
 RADII, LENGTH = (1.0, 2.0), 3.0
-TUBE = Path(__file__).parent / "body" / "files" / "tube.msh"  # of `write_tube` in format 2.2, a line for each
+TUBE = (
+    Path(__file__).parent / "body" / "files" / "tube.msh"
+)  # of `write_tube` in format 2.2, a line for each
 
 
 def write_tube(

@@ -52,7 +52,9 @@ def bent(radii: tuple[float, float], bend: float, angle: float, leg: float = 0.0
 
     def frame(turn: Array) -> tuple[Array, Array]:
         zero = np.zeros_like(turn)
-        return np.stack([np.cos(turn), zero, np.sin(turn)], -1), np.stack([-np.sin(turn), zero, np.cos(turn)], -1)
+        return np.stack([np.cos(turn), zero, np.sin(turn)], -1), np.stack(
+            [-np.sin(turn), zero, np.cos(turn)], -1
+        )
 
     def place(around: Array, through: Array, along: Array) -> Array:
         radius, length = inner + through * (outer - inner), along * (arc + 2 * leg) - leg
@@ -60,7 +62,12 @@ def bent(radii: tuple[float, float], bend: float, angle: float, leg: float = 0.0
         outwards, ahead = frame(turn)
         x, y = radius * np.cos(2 * np.pi * around), radius * np.sin(2 * np.pi * around)
         rest = length - np.clip(length, 0.0, arc)
-        return axis + (bend + x)[:, None] * outwards + y[:, None] * np.eye(3)[1] + rest[:, None] * ahead
+        return (
+            axis
+            + (bend + x)[:, None] * outwards
+            + y[:, None] * np.eye(3)[1]
+            + rest[:, None] * ahead
+        )
 
     def local(places: Array) -> tuple[Array, Array, Array, Array]:
         turn = np.clip(np.arctan2(places[..., 2], places[..., 0] + bend), 0.0, angle)
@@ -88,9 +95,13 @@ def straight(inner: float, outer: float, length: float) -> KnownBody:
 
     def directions(places: Array) -> tuple[Array, Array]:
         x, y, zero = places[..., 0], places[..., 1], np.zeros(places.shape[:-1])
-        return np.stack([-y, x, zero], -1) / np.hypot(x, y)[..., None], np.stack([zero, zero, zero + 1.0], -1)
+        return np.stack([-y, x, zero], -1) / np.hypot(x, y)[..., None], np.stack(
+            [zero, zero, zero + 1.0], -1
+        )
 
-    return KnownBody(place, directions, lambda x: (np.hypot(x[..., 0], x[..., 1]) - inner) / (outer - inner))
+    return KnownBody(
+        place, directions, lambda x: (np.hypot(x[..., 0], x[..., 1]) - inner) / (outer - inner)
+    )
 
 
 def elliptic(inner: float, outer: float, focus: float, length: float) -> KnownBody:
@@ -98,19 +109,31 @@ def elliptic(inner: float, outer: float, focus: float, length: float) -> KnownBo
 
     def place(around: Array, through: Array, along: Array) -> Array:
         u, v = inner + through * (outer - inner), 2 * np.pi * around
-        return np.stack([focus * np.cosh(u) * np.cos(v), focus * np.sinh(u) * np.sin(v), length * along], axis=-1)
+        return np.stack(
+            [focus * np.cosh(u) * np.cos(v), focus * np.sinh(u) * np.sin(v), length * along],
+            axis=-1,
+        )
 
     def directions(places: Array) -> tuple[Array, Array]:
         w = np.arccosh((places[..., 0] + 1j * places[..., 1]) / focus)
-        u, v, zero = np.abs(w.real), np.where(w.real < 0, -w.imag, w.imag), np.zeros(places.shape[:-1])
+        u, v, zero = (
+            np.abs(w.real),
+            np.where(w.real < 0, -w.imag, w.imag),
+            np.zeros(places.shape[:-1]),
+        )
         around = np.stack([-np.cosh(u) * np.sin(v), np.sinh(u) * np.cos(v), zero], -1)
-        return around / np.linalg.norm(around, axis=-1)[..., None], np.stack([zero, zero, zero + 1.0], -1)
+        return around / np.linalg.norm(around, axis=-1)[..., None], np.stack(
+            [zero, zero, zero + 1.0], -1
+        )
 
     return KnownBody(place, directions)
 
 
 def ring(
-    place: Callable[[Array, Array, Array], Array], counts: tuple[int, int, int], kind: str, comm: Any = MPI.COMM_SELF
+    place: Callable[[Array, Array, Array], Array],
+    counts: tuple[int, int, int],
+    kind: str,
+    comm: Any = MPI.COMM_SELF,
 ) -> Domain:
     """The mesh of a body in blocks around, through and along; each is a hexahedron or six tetrahedra."""
     around, through, along = counts
@@ -121,20 +144,32 @@ def ring(
         i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
         corners.append(np.roll(number, -i, axis=0)[:, j : through + j, k : along + k].ravel())
     hexahedra = np.stack(corners, axis=1)
-    cells = hexahedra if kind == "hexahedron" else np.concatenate([hexahedra[:, list(those)] for those in TETRAHEDRA])
+    cells = (
+        hexahedra
+        if kind == "hexahedron"
+        else np.concatenate([hexahedra[:, list(those)] for those in TETRAHEDRA])
+    )
     here = slice(None) if comm.rank == 0 else slice(0)
     shares = places / np.array(counts)[:, None]
     tube = straight(1.0, 2.0, 1.0).place(*shares)  # on which the faces are easily told apart
-    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=cells[here], x=tube[here], e=symbolic_mesh(kind, 1))
+    mesh: Any = dolfinx.mesh.create_mesh(
+        comm, cells=cells[here], x=tube[here], e=symbolic_mesh(kind, 1)
+    )
     found = [dolfinx.mesh.locate_entities_boundary(mesh, 2, marker) for marker in FACES.values()]
-    facets, values = np.concatenate(found), np.repeat(np.arange(1, 5, dtype=np.int32), list(map(len, found)))
+    facets, values = np.concatenate(found), np.repeat(
+        np.arange(1, 5, dtype=np.int32), list(map(len, found))
+    )
     order = np.argsort(facets)
     tags = dolfinx.mesh.meshtags(mesh, 2, facets[order], values[order])
     mesh.geometry.x[:] = place(*shares)[mesh.geometry.input_global_indices]
-    return Domain(mesh, tags, {name: tag for tag, name in enumerate(FACES, start=1)}, "ring", {"size": 1.0})
+    return Domain(
+        mesh, tags, {name: tag for tag, name in enumerate(FACES, start=1)}, "ring", {"size": 1.0}
+    )
 
 
-def fork(half_angle: float, size: float, radius: float = 1.0, wall: float = 0.4, length: float = 5.0) -> Domain:
+def fork(
+    half_angle: float, size: float, radius: float = 1.0, wall: float = 0.4, length: float = 5.0
+) -> Domain:
     """A trunk along z below the origin and two branches above, as Gmsh cuts and meshes it; both are its outlet."""
     branches = [half_angle * sign for sign in (-1.0, 1.0)]
     ways = [np.array([0.0, 0.0, -1.0])]  # the inlet, then the outlets

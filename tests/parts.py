@@ -35,7 +35,9 @@ def cube(side: float = 1.0, comm: MPI.Intracomm | None = None, **mesh: Any) -> D
     return Cube(side=side).build(Mesh(**mesh), comm)
 
 
-def tendon(length: float = 10.0, area: float = 10.0, comm: MPI.Intracomm | None = None, **mesh: Any) -> Domain:
+def tendon(
+    length: float = 10.0, area: float = 10.0, comm: MPI.Intracomm | None = None, **mesh: Any
+) -> Domain:
     """The mesh of a tendon."""
     return Tendon(length=length, area=area).build(Mesh(**mesh), comm)
 
@@ -58,7 +60,9 @@ def tube(
 
 def rotation(axis: Sequence[float], degrees: float) -> np.ndarray:
     """The rotation about an axis, (3, 3)."""
-    return Rotation.from_rotvec(degrees / np.linalg.norm(axis) * np.asarray(axis), degrees=True).as_matrix()
+    return Rotation.from_rotvec(
+        degrees / np.linalg.norm(axis) * np.asarray(axis), degrees=True
+    ).as_matrix()
 
 
 def symmetric(values: Any, axes: np.ndarray) -> np.ndarray:
@@ -134,7 +138,9 @@ class Body:
         tissue = material.tissue(self.cells.settings.end_to_end_length)
         return RemodelingPass(self.state(), tissue, Remodeling(**settings))
 
-    def stepper(self, load_values: Callable[[float], LoadValues], solver: Solver = TIGHT, **remodeling: Any) -> Stepper:
+    def stepper(
+        self, load_values: Callable[[float], LoadValues], solver: Solver = TIGHT, **remodeling: Any
+    ) -> Stepper:
         """Its way through time."""
         tissue = MATERIAL.tissue(self.cells.settings.end_to_end_length)
         return Stepper(self.state(), tissue, Remodeling(**remodeling), solver, load_values)
@@ -174,5 +180,7 @@ def body(domain: Domain, cells: Cells, degree: int = 1) -> Body:
 def random_axes(made: Body, rng: np.random.Generator) -> None:
     """Turn the cell of every quadrature point by a rotation of its own."""
     cells = made.cells
-    axes = random_rotations(rng, int(np.prod(made.quadrature.shape))).reshape(cells.axis_values.shape)
+    axes = random_rotations(rng, int(np.prod(made.quadrature.shape))).reshape(
+        cells.axis_values.shape
+    )
     cells.set(cells.dimension_values.copy(), axes)

@@ -9,7 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-COMPILER, TICKS = "cc1", 2  # its name, and hundredths of a second of work after which it has read its source
+COMPILER, TICKS = (
+    "cc1",
+    2,
+)  # its name, and hundredths of a second of work after which it has read its source
 
 
 CHILDREN, GROUP, SESSION = 1, 2, 3  # which of the numbers of a process, behind its state
@@ -50,15 +53,21 @@ def all_end(session: int, timeout: float = 60) -> bool:
     return not members(session)
 
 
-def wait_for_rows(process: subprocess.Popen[Any], folder: Path, rows: int, timeout: float = 200) -> None:
+def wait_for_rows(
+    process: subprocess.Popen[Any], folder: Path, rows: int, timeout: float = 200
+) -> None:
     """Wait until a run has recorded so many rows, its head among them."""
     history, deadline = folder / "history.csv", time.monotonic() + timeout
-    while time.monotonic() < deadline and not (history.exists() and history.read_text().count("\n") >= rows):
+    while time.monotonic() < deadline and not (
+        history.exists() and history.read_text().count("\n") >= rows
+    ):
         time.sleep(0.02)
         assert process.poll() is None, process.communicate()
 
 
-def wait_for_compiler(process: subprocess.Popen[str], program: str = COMPILER, timeout: float = 120) -> int:
+def wait_for_compiler(
+    process: subprocess.Popen[str], program: str = COMPILER, timeout: float = 120
+) -> int:
     """Wait until the C compiler itself is at work in this process's session; the number of the gcc that called it.
 
     At work is a compiler that has used processor time: it has opened its source.

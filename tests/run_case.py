@@ -36,13 +36,21 @@ def main(out: str, request: dict) -> None:
             tendon.ALONG = (request["divisions"] or [10])[-1]
         elif request["divisions"]:
             domain = tube(
-                body.inner_radius, body.outer_radius, body.length, scene.mesh.degree, divisions=request["divisions"]
+                body.inner_radius,
+                body.outer_radius,
+                body.length,
+                scene.mesh.degree,
+                divisions=request["divisions"],
             )
         simulation = Simulation(scene, MPI.COMM_WORLD, domain)
         domain, cells, quadrature = simulation.domain, simulation.cells, simulation.quadrature
         rows = [step.row for step in simulation.steps()]
         saved: dict[str, object] = {"u": simulation.state.gathered_displacement()}
-        of_points = {"l": cells.dimension_values, "l0": cells.initial_dimensions, "n": cells.axis_values}
+        of_points = {
+            "l": cells.dimension_values,
+            "l0": cells.initial_dimensions,
+            "n": cells.axis_values,
+        }
         for name, values in (of_points | {"x": quadrature.coordinates}).items():
             saved[name] = domain.gather_elements(values)
         if MPI.COMM_WORLD.rank == 0:

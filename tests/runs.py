@@ -35,7 +35,9 @@ class AtSolved(Watcher):
 @contextmanager
 def made(scene: Scene | Mapping[str, Any], domain: Any = None) -> Iterator[Simulation]:
     """A simulation before its first step, which is closed in the end."""
-    simulation = Simulation(scene if isinstance(scene, Scene) else scene_from_dict(dict(scene)), SELF, domain)
+    simulation = Simulation(
+        scene if isinstance(scene, Scene) else scene_from_dict(dict(scene)), SELF, domain
+    )
     try:
         yield simulation
     finally:
@@ -51,7 +53,9 @@ def simulated(
         yield simulation, [dict(step.row) for step in simulation.steps(watchers)]
 
 
-def rows_of(scene: Scene | Mapping[str, Any], domain: Any = None, watchers: Sequence[Any] = ()) -> Rows:
+def rows_of(
+    scene: Scene | Mapping[str, Any], domain: Any = None, watchers: Sequence[Any] = ()
+) -> Rows:
     """All rows of its steps."""
     with simulated(scene, domain, watchers) as (_, rows):
         return rows

@@ -22,7 +22,9 @@ from xdist.scheduler import LoadFileScheduling
 from tests.forks import what_is_imported_stays
 
 SLOW_LIMIT = 3600  # seconds for a test marked slow; pyproject.toml has the limit of all others
-COMPILED = "REMODEL_FENICSX_COMPILED"  # names the file that gets one line for each kernel that is compiled
+COMPILED = (
+    "REMODEL_FENICSX_COMPILED"  # names the file that gets one line for each kernel that is compiled
+)
 
 
 # ---------------------------------------------------------------- limits
@@ -53,7 +55,9 @@ def kill_descendants() -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Of pyproject.toml, and of -o NAME=VALUE."""
     parser.addini(
-        "timeout_grace", "seconds after a test's limit: if it goes on then, its process is ended", default="60"
+        "timeout_grace",
+        "seconds after a test's limit: if it goes on then, its process is ended",
+        default="60",
     )
     parser.addini("start_first", "test files that take longest, for pytest-xdist", type="args")
 
@@ -96,7 +100,9 @@ class LongFilesFirst(LoadFileScheduling):  # type: ignore[misc]
 
     def _assign_work_unit(self, node: Any) -> None:
         long_files = self.config.getini("start_first")
-        waiting = [scope for name in long_files for scope in self.workqueue if Path(scope).name == name]
+        waiting = [
+            scope for name in long_files for scope in self.workqueue if Path(scope).name == name
+        ]
         if waiting:
             self.workqueue.move_to_end(waiting[0], last=False)
         super()._assign_work_unit(node)
@@ -122,8 +128,12 @@ def pytest_collection(session: pytest.Session) -> None:
     files = sorted(tests.rglob("test_*.py"))
     first = int(worker["workerid"].removeprefix("gw")) * len(files) // worker["workercount"]
     for path in files[first:] + files[:first]:
-        with contextlib.suppress(Exception, pytest.skip.Exception):  # collecting it says what is wrong, or skipped
-            importlib.import_module(".".join(("tests", *path.relative_to(tests).with_suffix("").parts)))
+        with contextlib.suppress(
+            Exception, pytest.skip.Exception
+        ):  # collecting it says what is wrong, or skipped
+            importlib.import_module(
+                ".".join(("tests", *path.relative_to(tests).with_suffix("").parts))
+            )
 
 
 # ---------------------------------------------------------------- the session
@@ -138,14 +148,22 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Before anything is collected or started."""
-    config.stash[STANDARD_ERROR] = os.dup(2)  # during a test, 2 is a file that would be lost with the process
-    if COMPILED not in os.environ:  # pytest-xdist's workers have it from the process that starts them
+    config.stash[STANDARD_ERROR] = os.dup(
+        2
+    )  # during a test, 2 is a file that would be lost with the process
+    if (
+        COMPILED not in os.environ
+    ):  # pytest-xdist's workers have it from the process that starts them
         folder = tempfile.TemporaryDirectory(prefix="remodel-fenicsx-tests-")
         os.environ[COMPILED] = str(Path(folder.name) / "compiled")
         config.add_cleanup(lambda: (os.environ.pop(COMPILED), folder.cleanup()))
-        os.environ.pop("PYTHONUNBUFFERED", None)  # it writes a line in pieces, and those of two ranks come mixed
+        os.environ.pop(
+            "PYTHONUNBUFFERED", None
+        )  # it writes a line in pieces, and those of two ranks come mixed
         # an mpirun that was killed leaves a folder, in the way of a later one with the same process number
-        os.environ["PRTE_MCA_prte_tmpdir_base"] = os.environ["OMPI_MCA_orte_tmpdir_base"] = folder.name
+        os.environ["PRTE_MCA_prte_tmpdir_base"] = os.environ["OMPI_MCA_orte_tmpdir_base"] = (
+            folder.name
+        )
 
 
 def pytest_collection_finish() -> None:

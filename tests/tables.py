@@ -12,7 +12,11 @@ HUGE = "1" + 400 * "0"  # no float can hold it
 def rows(test: str, name: str) -> list[list[str]]:
     """Lines of a file in the folder of a test, given as its `__file__`; those that begin with # say what is meant."""
     lines = Path(test).with_name(name).read_text(encoding="utf-8").splitlines()
-    return [[column.strip() for column in line.split(" | ")] for line in lines if not line.startswith("#")]
+    return [
+        [column.strip() for column in line.split(" | ")]
+        for line in lines
+        if not line.startswith("#")
+    ]
 
 
 def values(text: str) -> dict[str, Any]:

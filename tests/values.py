@@ -13,12 +13,20 @@ PAPER = "kuhl-holzapfel-2007"
 
 def ramped(end: float, **values: float) -> dict[str, Any]:
     """Loads that rise to their values until a time."""
-    return {name: {"value": value, "ramp": [[0.0, 0.0], [end, 1.0]]} for name, value in values.items()}
+    return {
+        name: {"value": value, "ramp": [[0.0, 0.0], [end, 1.0]]} for name, value in values.items()
+    }
 
 
-def isotropic(preset: str | None = PAPER, kinematics: str = "radial", **tables: Any) -> dict[str, Any]:
+def isotropic(
+    preset: str | None = PAPER, kinematics: str = "radial", **tables: Any
+) -> dict[str, Any]:
     """By itself a tube on one radius, without fields of its run; a table that is None is left out."""
-    values: dict[str, Any] = {"preset": preset, "geometry": {"shape": "tube"}, "model": {"kinematics": kinematics}}
+    values: dict[str, Any] = {
+        "preset": preset,
+        "geometry": {"shape": "tube"},
+        "model": {"kinematics": kinematics},
+    }
     values |= {"cells": {"initial": "isotropic"}, "output": {"fields": False}, **tables}
     return {name: table for name, table in values.items() if table is not None}
 

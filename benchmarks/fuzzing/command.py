@@ -25,19 +25,31 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser = running.parser_of(description, 15, "fuzz")
     parser.add_argument("--seed", type=int, default=1, metavar="FIRST", help="the first seed (1)")
     parser.add_argument("--count", type=int, default=300, metavar="N", help="how many seeds (300)")
-    parser.add_argument("--only", type=int, metavar="SEED", help="this one, with its scene, whatever is there of it")
+    parser.add_argument(
+        "--only", type=int, metavar="SEED", help="this one, with its scene, whatever is there of it"
+    )
     options = parser.parse_args(arguments)
     if options.only is not None:
         return _one(options.only, options.limit)
-    by, seeds = running.judges("fuzzing", "stability_map")[:10], range(options.seed, options.seed + options.count)
+    by, seeds = running.judges("fuzzing", "stability_map")[:10], range(
+        options.seed, options.seed + options.count
+    )
     source = f"{running.source_of()} by {by}"
     file = running.file_of(options, source)
-    there = {} if options.again else {r["seed"]: r for r in running.read_records(file) if r["source"] == source}
+    there = (
+        {}
+        if options.again
+        else {r["seed"]: r for r in running.read_records(file) if r["source"] == source}
+    )
     done = {seed: there[seed] for seed in seeds if seed in there}
     # the cheap ones first: what is stopped has seen as many as it could
-    missing = sorted((seed for seed in seeds if seed not in done), key=lambda seed: cost(made(seed)[0]))
+    missing = sorted(
+        (seed for seed in seeds if seed not in done), key=lambda seed: cost(made(seed)[0])
+    )
     print(f"{source}: {len(seeds)} scenes, {len(missing)} to run; {file}", file=sys.stderr)
-    done |= running.measure({seed: partial(evaluated, seed, source=source) for seed in missing}, said, source, options)
+    done |= running.measure(
+        {seed: partial(evaluated, seed, source=source) for seed in missing}, said, source, options
+    )
     print(summary([done[seed] for seed in seeds if seed in done]))
     return int(any(record["outcome"] == "wrong" for record in done.values()))
 
@@ -61,10 +73,15 @@ def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
     """What all references say together; what no row may do is wrong whatever was said beside it."""
     faults = [] if run.code == NO_END else references.broken(scene, run)
     if again.code != NO_END:
-        faults += [f"{other.name}: {fault}" for fault in references.broken(other.in_numbers or other.scene, again)]
+        faults += [
+            f"{other.name}: {fault}"
+            for fault in references.broken(other.in_numbers or other.scene, again)
+        ]
     ends = {run.code, again.code}
     if other.tolerance == relations.EXACT and len(ends) == 2 and NO_END not in ends:
-        faults.append(f"{other.name}: exit {again.code} for {run.code}: {(again.said or run.said)[-300:].strip()}")
+        faults.append(
+            f"{other.name}: exit {again.code} for {run.code}: {(again.said or run.said)[-300:].strip()}"
+        )
     if faults:
         return Verdict("wrong", "; ".join(faults))
     findings = []
@@ -72,11 +89,18 @@ def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
         findings.append(references.compared(scene, run))
     if ends == {0}:
         finding = relations.compared(other, run, again)
-        if finding.ratio > 1 and again.warnings and not run.warnings:  # nobody knows which of them is off
-            finding = replace(finding, ratio=np.nan, words=f"{finding.words}, which says: {again.warnings[0]}")
+        if (
+            finding.ratio > 1 and again.warnings and not run.warnings
+        ):  # nobody knows which of them is off
+            finding = replace(
+                finding, ratio=np.nan, words=f"{finding.words}, which says: {again.warnings[0]}"
+            )
         findings.append(finding)
     known = [finding for finding in findings if not np.isnan(finding.ratio)]
-    words = "; ".join(finding.words for finding in findings) or f"{other.name}: {again.said.strip()[-200:]}"
+    words = (
+        "; ".join(finding.words for finding in findings)
+        or f"{other.name}: {again.said.strip()[-200:]}"
+    )
     ratio = max((finding.ratio for finding in known), default=np.nan if run.code == 0 else 0.0)
     worst = Finding(ratio, words, None, all(finding.solvable for finding in findings))
     return judged(Case("fuzz", "", scene, lambda case, run: worst, ""), run)
@@ -85,26 +109,37 @@ def verdict_on(scene: Values, other: Other, run: Run, again: Run) -> Verdict:
 def said(record: running.Record) -> str:
     """A line on a seed."""
     alarm = " (false alarm)" if record["false_alarm"] else ""
-    return (
-        f"{record['outcome']:9}{alarm} {record['seed']}: {record['body']}, {record['seconds']:g} s: {record['words']}"
-    )
+    return f"{record['outcome']:9}{alarm} {record['seed']}: {record['body']}, {record['seconds']:g} s: {record['words']}"
 
 
 def summary(records: list[running.Record]) -> str:
     """How many ended how, and those that are not right."""
     counts = Counter(record["outcome"] for record in records)
     lines = [said(record) for record in records if record["outcome"] in ("wrong", "unchecked")]
-    lines += [f"{len(records)} scenes: " + ", ".join(f"{number} {outcome}" for outcome, number in counts.most_common())]
+    lines += [
+        f"{len(records)} scenes: "
+        + ", ".join(f"{number} {outcome}" for outcome, number in counts.most_common())
+    ]
     named = sum(bool(record["cause_named"]) for record in records)
-    alarms, own = (sum(bool(record[key]) for record in records) for key in ("false_alarm", "reference"))
-    return "\n".join([*lines, f"refused with a cause {named}; false alarms {alarms}; own reference for {own}"])
+    alarms, own = (
+        sum(bool(record[key]) for record in records) for key in ("false_alarm", "reference")
+    )
+    return "\n".join(
+        [*lines, f"refused with a cause {named}; false alarms {alarms}; own reference for {own}"]
+    )
 
 
 def _one(seed: int, limit: float) -> int:
     scene, counts = made(seed)
     other = relations.chosen(scene, Random(seed))
-    print(tomlkit.dumps(scene), f"# elements: {counts}\n# held against: {other.name} {other.asked}", sep="")
-    changed = [line for line in tomlkit.dumps(other.scene).splitlines() if line not in tomlkit.dumps(scene)]
+    print(
+        tomlkit.dumps(scene),
+        f"# elements: {counts}\n# held against: {other.name} {other.asked}",
+        sep="",
+    )
+    changed = [
+        line for line in tomlkit.dumps(other.scene).splitlines() if line not in tomlkit.dumps(scene)
+    ]
     print("\n".join(f"#     {line}" for line in changed))
     with closing(running.Runner(limit)) as runner:
         record = evaluated(seed, runner)

@@ -21,7 +21,9 @@ PAPERS_RATIO = 3.0
 
 def known(scene: Values) -> bool:
     """Whether the reference can do it: axes that stay, no residual stress, equal steps, sorted values."""
-    if scene.get("name") == STIFF_NAME:  # its elements have noise of its own in a bulk as stiff as that
+    if (
+        scene.get("name") == STIFF_NAME
+    ):  # its elements have noise of its own in a bulk as stiff as that
         return False
     r, g, time = scene["remodeling"], scene["geometry"]["shape"], scene["time"]
     lags = slowed(scene)
@@ -50,13 +52,19 @@ def compared(scene: Values, run: Run) -> Finding:
         radii = np.stack(path.faces(), axis=1)[:number]
         start = np.array([scene["geometry"]["inner_radius"], scene["geometry"]["outer_radius"]])
         moved = np.abs(radii - start).max() + ROUNDING * start[1]
-        allowed = POLYGON_TOLERANCE if scene["model"]["kinematics"] in ("sector", "full") else WALL_TOLERANCE
+        allowed = (
+            POLYGON_TOLERANCE
+            if scene["model"]["kinematics"] in ("sector", "full")
+            else WALL_TOLERANCE
+        )
         allowed *= max(1.0, (start[1] / start[0] - 1) / (PAPERS_RATIO - 1)) ** 2
         for i, name in enumerate(("inner_radius", "outer_radius")):
             off[name] = np.abs(run.column(name)[:number] - radii[:, i]).max() / moved / allowed
     else:
         stretch = np.array(path.unknowns)[:number, 2]
-        off["mean_stretch"] = np.abs(run.column("mean_stretch")[:number] / stretch - 1).max() / POINT_TOLERANCE
+        off["mean_stretch"] = (
+            np.abs(run.column("mean_stretch")[:number] / stretch - 1).max() / POINT_TOLERANCE
+        )
         turned = np.abs(run.column("mean_fibre_angle")[:number] - path.angle()[:number]).max()
         off["mean_fibre_angle"] = turned / POINT_TOLERANCE / 100
     found = farthest(off, "reference: ", solvable=not ended)
@@ -74,7 +82,12 @@ def broken(scene: Values, run: Run) -> list[str]:
     if not len(history.get("time", ())):
         return []
     times, end = history["time"], scene["time"]["end"]
-    if np.any(np.diff(times) <= 0) or run.code == 0 and end != "equilibrium" and not np.isclose(times[-1], end):
+    if (
+        np.any(np.diff(times) <= 0)
+        or run.code == 0
+        and end != "equilibrium"
+        and not np.isclose(times[-1], end)
+    ):
         found.append(f"times {times[0]:g} to {times[-1]:g} for {end}")
     found += [f"{name} is not finite" for name, values in history.items() if np.isinf(values).any()]
     if np.nanmax(history["max_chain_extension"]) >= 1 or np.nanmin(history["min_jacobian"]) <= 0:
@@ -84,20 +97,26 @@ def broken(scene: Values, run: Run) -> list[str]:
     for name, load in scene["loads"].items() if end != "equilibrium" else ():
         if name == "elongation" and found_length:
             continue
-        column = history.get("axial_elongation" if name == "elongation" else name, np.full(len(times), np.nan))
+        column = history.get(
+            "axial_elongation" if name == "elongation" else name, np.full(len(times), np.nan)
+        )
         asked = load["value"] * first.get(name, 1.0) * factor(load["ramp"], times)
         near = 1e-4 if name == "axial_force" else 1e-9  # the one is that of the wall, as solved
         if np.nanmax(np.abs(column - asked)[1:], initial=0.0) > near * max(map(abs, asked)):
             found.append(f"{name} is not its ramp")
     r0 = scene["cells"]["end_to_end_length"]
-    if "cell_dimensions" in run.fields and scene["material"]["chain_density"]:  # without chains they are zero
+    if (
+        "cell_dimensions" in run.fields and scene["material"]["chain_density"]
+    ):  # without chains they are zero
         trace = np.sum(np.array(run.fields["cell_dimensions"]) ** 2, axis=1) / r0**2
         exact = scene["remodeling"]["law"] in ("tensor", "none", "rotation")
         bounded = scene["remodeling"]["law"] != "rate"  # eq. (10) adds up whatever its targets were
         if bounded and trace.max() > 1 + 1e-5 or exact and trace.min() < 1 - 1e-5:
             found.append(f"tr A between {trace.min():.7g} and {trace.max():.7g} r0^2")
     if scene["remodeling"]["law"] == "none" and end != "equilibrium":
-        loads = [history[name] for name in ("force", "pressure", "axial_elongation") if name in history]
+        loads = [
+            history[name] for name in ("force", "pressure", "axial_elongation") if name in history
+        ]
         held = np.all(np.diff(loads, axis=1) == 0, axis=0)
         change = np.abs(np.diff(history["stored_energy"]))[held]
         if (

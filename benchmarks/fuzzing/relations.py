@@ -13,14 +13,24 @@ import numpy as np
 from benchmarks.fuzzing.scenes import STIFF_NAME, Values, has_free_length
 from benchmarks.stability_map.cases import Finding, Run, farthest, with_values
 
-EXACT, SOLVED = 1e-6, 1e-4  # relative tolerance of lengths: of the same arithmetic; of another way to the same solution
+EXACT, SOLVED = (
+    1e-6,
+    1e-4,
+)  # relative tolerance of lengths: of the same arithmetic; of another way to the same solution
 DEGREES = 100.0  # degrees for a relative error of one
 SIZES = {  # powers of the units of stress, length and time of columns
     "force": (1, 2, 0), "axial_force": (1, 2, 0), "reduced_axial_force": (1, 2, 0), "pressure": (1, 0, 0),
     "stored_energy": (1, 3, 0), "remodeling_power": (1, 3, -1), "inner_radius": (0, 1, 0), "outer_radius": (0, 1, 0),
     "time": (0, 0, 1),
 }  # fmt: skip
-LENGTHS = ("inner_radius", "outer_radius", "mean_stretch", "min_stretch", "max_stretch", "axial_elongation")
+LENGTHS = (
+    "inner_radius",
+    "outer_radius",
+    "mean_stretch",
+    "min_stretch",
+    "max_stretch",
+    "axial_elongation",
+)
 GEOMETRY = {"side": 1, "length": 1, "inner_radius": 1, "outer_radius": 1, "area": 2}
 LOADS = {"force": (1, 2), "axial_force": (1, 2), "pressure": (1, 0)}
 
@@ -42,7 +52,9 @@ class Other:
 Relation = Callable[[Values, Random], Other | None]
 
 
-def in_units(scene: Values, stress: float = 1.0, length: float = 1.0, time: float = 1.0, chain: float = 1.0) -> Values:
+def in_units(
+    scene: Values, stress: float = 1.0, length: float = 1.0, time: float = 1.0, chain: float = 1.0
+) -> Values:
     """The same tissue and loads in other units."""
     s = deepcopy(scene)
     m, cells, r, t = s["material"], s["cells"], s["remodeling"], s["time"]
@@ -55,7 +67,9 @@ def in_units(scene: Values, stress: float = 1.0, length: float = 1.0, time: floa
     if t["end"] != "equilibrium":
         t["end"] *= time
     if "turnover" in r:
-        r["turnover"] |= {key: r["turnover"][key] * time for key in ("time", "from") if key in r["turnover"]}
+        r["turnover"] |= {
+            key: r["turnover"][key] * time for key in ("time", "from") if key in r["turnover"]
+        }
     if "times" in s["output"]:
         s["output"]["times"] = [at * time for at in s["output"]["times"]]
     if "absolute_tolerance" in s["solver"]:
@@ -84,16 +98,25 @@ def _unit(of: str, decades: float) -> Relation:
 
 
 def _chain(scene: Values, random: Random) -> Other:
-    return Other("chain lengths in another unit", in_units(scene, chain=random.choice((1e-9, 1e-3, 92.4, 1e6))))
+    return Other(
+        "chain lengths in another unit",
+        in_units(scene, chain=random.choice((1e-9, 1e-3, 92.4, 1e6))),
+    )
 
 
 def _said(scene: Values, random: Random) -> Other | None:
-    s, unit, own = deepcopy(scene), scene["geometry"].get("length_unit"), scene["material"]["stress_unit"]
+    s, unit, own = (
+        deepcopy(scene),
+        scene["geometry"].get("length_unit"),
+        scene["material"]["stress_unit"],
+    )
     if unit is None:
         return None
     for key, power in GEOMETRY.items():
         if key in s["geometry"]:
-            s["geometry"][key] = f"{s['geometry'][key]!r} {unit}" + (f"^{power}" if power > 1 else "")
+            s["geometry"][key] = f"{s['geometry'][key]!r} {unit}" + (
+                f"^{power}" if power > 1 else ""
+            )
     other, by = ("MPa", 1e-3) if own == "kPa" else ("kPa", {"Pa": 1e-3, "MPa": 1e3}[own])
     s["material"]["lame_mu"] = f"{s['material']['lame_mu'] * by!r} {other}"
     s["material"]["temperature"] = f"{s['material']['temperature'] - 273.15!r} degC"
@@ -124,29 +147,59 @@ def _resumed(scene: Values, random: Random) -> Other | None:
     stop = random.randint(1, round(t["end"] / t["step"]) - 1) * t["step"]
     s, exact = deepcopy(scene), scene["solver"]["method"] == "direct"
     s["output"].pop("times", None)  # they may be after the stop
-    return Other(f"stopped at t = {stop:g} and resumed", s, {"stop": stop}, tolerance=EXACT if exact else SOLVED)
+    return Other(
+        f"stopped at t = {stop:g} and resumed",
+        s,
+        {"stop": stop},
+        tolerance=EXACT if exact else SOLVED,
+    )
 
 
 def _ranks(scene: Values, random: Random) -> Other | None:
-    small = scene["model"]["kinematics"] in ("point", "radial")  # fewer elements than ranks, or nearly
-    return None if small and random.random() < 0.7 else Other("on two ranks", scene, {"ranks": 2}, tolerance=SOLVED)
+    small = scene["model"]["kinematics"] in (
+        "point",
+        "radial",
+    )  # fewer elements than ranks, or nearly
+    return (
+        None
+        if small and random.random() < 0.7
+        else Other("on two ranks", scene, {"ranks": 2}, tolerance=SOLVED)
+    )
 
 
-KINDS = {"cube": ("point", "full"), "tendon": ("point", "full"), "tube": ("radial", "axisymmetric", "sector", "full")}
+KINDS = {
+    "cube": ("point", "full"),
+    "tendon": ("point", "full"),
+    "tube": ("radial", "axisymmetric", "sector", "full"),
+}
 
 
 def _kinematics(scene: Values, random: Random) -> Other | None:
-    kinds, chosen, cells = KINDS[scene["geometry"]["shape"]], scene["model"]["kinematics"], scene["cells"]
-    if chosen not in kinds or cells["initial"] == "random" or scene["remodeling"]["law"] == "rotation":
+    kinds, chosen, cells = (
+        KINDS[scene["geometry"]["shape"]],
+        scene["model"]["kinematics"],
+        scene["cells"],
+    )
+    if (
+        chosen not in kinds
+        or cells["initial"] == "random"
+        or scene["remodeling"]["law"] == "rotation"
+    ):
         return None
-    if scene["solver"].get("unstable") or scene["time"]["end"] == "equilibrium" and chosen == "full":
+    if (
+        scene["solver"].get("unstable")
+        or scene["time"]["end"] == "equilibrium"
+        and chosen == "full"
+    ):
         return None
     # a polygon is no circle: radius and half-plane agree, and the quarter and the whole
     other = kinds[kinds.index(chosen) ^ 1]
     pulled = scene["supports"]["ends"] == "clamped" or "axial_force" in scene["loads"]
     if other in ("radial", "sector") and pulled or other == "sector" and cells["axes"] == "global":
         return None
-    return Other(f"kinematics {other}", with_values(scene, {"model.kinematics": other}), tolerance=SOLVED)
+    return Other(
+        f"kinematics {other}", with_values(scene, {"model.kinematics": other}), tolerance=SOLVED
+    )
 
 
 def _solver(scene: Values, random: Random) -> Other:
@@ -164,14 +217,24 @@ def _tolerance(scene: Values, random: Random) -> Other | None:
     if asked is None or scene["time"]["end"] == "equilibrium":
         return None
     finer, allowed = with_values(scene, {"time.tolerance": asked / 4}), 1.3 * asked
-    return Other(f"a quarter of time.tolerance {asked:g}", finer, tolerance=float(np.radians(allowed)), degrees=allowed)
+    return Other(
+        f"a quarter of time.tolerance {asked:g}",
+        finer,
+        tolerance=float(np.radians(allowed)),
+        degrees=allowed,
+    )
 
 
 def _half(scene: Values, random: Random) -> Other | None:
     """The coupling `extrapolated` is of second order."""
     r, t = scene["remodeling"], scene["time"]
     rate = r["kappa"] * t["step"]
-    if t["end"] == "equilibrium" or "tolerance" in t or r["coupling"] != "extrapolated" or rate >= 0.1:
+    if (
+        t["end"] == "equilibrium"
+        or "tolerance" in t
+        or r["coupling"] != "extrapolated"
+        or rate >= 0.1
+    ):
         return None
     # a step in which tension comes or goes is off by up to kappa dt
     error = max(20 * rate**2, rate)
@@ -183,7 +246,9 @@ def _equilibrium(scene: Values, random: Random) -> Other | None:
     if scene["time"]["end"] != "equilibrium":
         return None
     last = max(load["ramp"][-1][0] for load in scene["loads"].values())
-    long = with_values(scene, {"time.end": last + 40 / scene["remodeling"]["kappa"], "time.tolerance": 1.0})
+    long = with_values(
+        scene, {"time.end": last + 40 / scene["remodeling"]["kappa"], "time.tolerance": 1.0}
+    )
     return Other("in time", long, tolerance=5e-3, degrees=0.5, last_only=True)
 
 
@@ -192,7 +257,9 @@ def _elements(scene: Values) -> Other | None:
         return None
     changes = {"mesh.formulation": "selective-integration", "mesh.element": "hexahedron"}
     finer = with_values(scene, changes)
-    return Other("by selective integration", finer, tolerance=5e-3, degrees=1.0, last_only="profile" in scene)
+    return Other(
+        "by selective integration", finer, tolerance=5e-3, degrees=1.0, last_only="profile" in scene
+    )
 
 
 RELATIONS: tuple[tuple[int, Relation], ...] = (
@@ -206,7 +273,11 @@ def chosen(scene: Values, random: Random) -> Other:
     """One that the scene allows."""
     if (elements := _elements(scene)) is not None:
         return elements
-    found = [(weight, other) for weight, relation in RELATIONS if (other := relation(scene, random)) is not None]
+    found = [
+        (weight, other)
+        for weight, relation in RELATIONS
+        if (other := relation(scene, random)) is not None
+    ]
     return random.choices([other for _, other in found], [weight for weight, _ in found])[0]
 
 
@@ -214,7 +285,11 @@ def compared(other: Other, run: Run, again: Run) -> Finding:
     """The columns of two runs at the times that both have."""
     sizes = {name: float(np.prod(np.power(other.units, powers))) for name, powers in SIZES.items()}
     mine, theirs = np.array(run.history["time"]), np.array(again.history["time"]) / sizes["time"]
-    pairs = [(i, j) for i, at in enumerate(mine) for j in np.flatnonzero(np.isclose(theirs, at, rtol=1e-9))[:1]]
+    pairs = [
+        (i, j)
+        for i, at in enumerate(mine)
+        for j in np.flatnonzero(np.isclose(theirs, at, rtol=1e-9))[:1]
+    ]
     if other.last_only:
         pairs = [(len(mine) - 1, len(theirs) - 1)]
     if len(pairs) < len(mine) and not other.last_only and "tolerance" not in other.scene["time"]:
@@ -224,7 +299,9 @@ def compared(other: Other, run: Run, again: Run) -> Finding:
     for name in run.history:
         if name not in again.history or (allowed := _allowed(name, other)) is None:
             continue
-        a, b = np.array(run.history[name])[rows], np.array(again.history[name])[others] / sizes.get(name, 1.0)
+        a, b = np.array(run.history[name])[rows], np.array(again.history[name])[others] / sizes.get(
+            name, 1.0
+        )
         if np.any(np.isnan(a) != np.isnan(b)):
             off[f"emptiness of {name}"] = np.inf
         scale = (

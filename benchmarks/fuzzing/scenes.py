@@ -11,7 +11,11 @@ from tests.reference.radial import secant_stiffness
 from tests.values import ramped
 
 Values = dict[str, Any]
-COARSE = (8, 4, 2)  # elements of a tube around, through the wall and along, where it is meshed in full
+COARSE = (
+    8,
+    4,
+    2,
+)  # elements of a tube around, through the wall and along, where it is meshed in full
 RAY = (16, 8, 1)  # one layer: a half-plane that the radius is held against
 COUNTS = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 2}}
 
@@ -44,18 +48,32 @@ def made(seed: int) -> tuple[Values, Values]:
     scene["remodeling"] = _remodeling(random)
     scene["cells"] = _cells(random, shape, r0)
     scene["supports"] = {
-        "ends": random.choices(("free", "clamped", "closed"), (12, 1, 2))[0] if shape == "tube" else "free"
+        "ends": (
+            random.choices(("free", "clamped", "closed"), (12, 1, 2))[0]
+            if shape == "tube"
+            else "free"
+        )
     }
     scene["mesh"], scene["model"] = _mesh(random, scene)
     scene["time"] = _time(random, scene)
     scene["loads"] = _loads(random, scene, stiffness)
     scene["solver"] = _solver(random, scene)
-    output = {"fields": True, "every": 1_000_000, "checkpoint": random.choice((0, 3)), "report": seed % 4 == 0}
+    output = {
+        "fields": True,
+        "every": 1_000_000,
+        "checkpoint": random.choice((0, 3)),
+        "report": seed % 4 == 0,
+    }
     scene["output"] = output
     if random.random() < 0.2:
         scene["output"]["columns"] = ["pass_residual"]
     _rarely(Random(f"more of {seed}"), scene, stiffness)
-    small = shape == "tube" and scene["model"]["kinematics"] in ("full", "sector", "auto", "axisymmetric")
+    small = shape == "tube" and scene["model"]["kinematics"] in (
+        "full",
+        "sector",
+        "auto",
+        "axisymmetric",
+    )
     elements = list(COARSE if small else RAY)
     return scene, {**COUNTS, "tube": {"PAPER": elements}}
 
@@ -88,13 +106,20 @@ def _stiff(random: Random) -> tuple[Values, Values]:
         scene["profile"] = random.choice(("fast", "balanced", "reference"))
         del scene["mesh"], scene["remodeling"]["coupling"]
         scene["mesh"] = {"element": "hexahedron"}
-    return scene, {**COUNTS, "tube": {"PAPER": list(COARSE if kinematics in ("sector", "full") else RAY)}}
+    return scene, {
+        **COUNTS,
+        "tube": {"PAPER": list(COARSE if kinematics in ("sector", "full") else RAY)},
+    }
 
 
 def cheap(scene: Values) -> bool:
     """Whether a step costs next to nothing."""
     kinematics = scene["model"]["kinematics"]
-    return kinematics in ("point", "radial") or scene["geometry"]["shape"] == "cube" and kinematics == "auto"
+    return (
+        kinematics in ("point", "radial")
+        or scene["geometry"]["shape"] == "cube"
+        and kinematics == "auto"
+    )
 
 
 def cost(scene: Values) -> tuple[bool, bool]:
@@ -108,10 +133,18 @@ def _geometry(random: Random, shape: str) -> Values:
     if shape == "cube":
         geometry = {"shape": shape, "side": size}
     elif shape == "tendon":
-        geometry = {"shape": shape, "length": size, "area": rounded((size * random.uniform(0.2, 1)) ** 2)}
+        geometry = {
+            "shape": shape,
+            "length": size,
+            "area": rounded((size * random.uniform(0.2, 1)) ** 2),
+        }
     else:
         wall = decades(random, -1.3, 0.6)
-        geometry = {"shape": shape, "inner_radius": size, "outer_radius": rounded(size * (1 + wall))}
+        geometry = {
+            "shape": shape,
+            "inner_radius": size,
+            "outer_radius": rounded(size * (1 + wall)),
+        }
         geometry["length"] = rounded(size * random.uniform(0.5, 4))
     if random.random() < 0.3:
         geometry["length_unit"] = random.choice(("m", "cm", "mm", "um"))
@@ -123,11 +156,17 @@ def _material(random: Random) -> tuple[Values, float, float]:
     unit, mu = random.choice(list(STRESS_UNITS)), decades(random, -2, 3)
     scale = random.choice((1.0, 1.0, 1.0, 1e-9, 1e-3, 92.4, 1e6))
     length = rounded(scale * random.uniform(1.2, 4))
-    r0, persistence = rounded(length * random.uniform(0.2, 0.9)), rounded(length * 10 ** random.uniform(-1.3, 0.3))
+    r0, persistence = rounded(length * random.uniform(0.2, 0.9)), rounded(
+        length * 10 ** random.uniform(-1.3, 0.3)
+    )
     network = 0.0 if random.random() < 0.05 else mu * decades(random, -1.5, 1.5)
-    temperature, factor = random.choice((310.0, rounded(random.uniform(280, 320)))), random.choice((1, 1, 4))
+    temperature, factor = random.choice((310.0, rounded(random.uniform(280, 320)))), random.choice(
+        (1, 1, 4)
+    )
     pulled = float(secant_stiffness(r0, length)) * r0**2 * factor  # type: ignore[arg-type]
-    density = rounded(network / pulled * STRESS_UNITS[unit] * 4 * persistence / BOLTZMANN / temperature)
+    density = rounded(
+        network / pulled * STRESS_UNITS[unit] * 4 * persistence / BOLTZMANN / temperature
+    )
     table = {
         "lame_lambda": 0.0 if random.random() < 0.05 else rounded(mu * decades(random, -1, 2.5)), "lame_mu": mu,
         "chain_density": density, "contour_length": length, "persistence_length": persistence,
@@ -137,7 +176,9 @@ def _material(random: Random) -> tuple[Values, float, float]:
 
 
 def _remodeling(random: Random) -> Values:
-    law = random.choices(("explicit", "rate", "relaxation", "tensor", "rotation", "none"), (4, 2, 3, 6, 1, 1))[0]
+    law = random.choices(
+        ("explicit", "rate", "relaxation", "tensor", "rotation", "none"), (4, 2, 3, 6, 1, 1)
+    )[0]
     couplings = ["staggered", "staggered", "relaxed"] + ["extrapolated"] * 4 * (law == "tensor")
     return {
         "law": law, "driver": random.choices(("cauchy", "pk2", "finger"), (3, 1, 1))[0],
@@ -183,9 +224,16 @@ def _mesh(random: Random, scene: Values) -> tuple[Values, Values]:
         "degree": random.choice((1, 2)) if reduced else 1, "formulation": formulation, "element": "hexahedron",
         "refinement": random.choice((1, 1, 2)) if reduced else 1,
     }  # fmt: skip
-    if shape == "cube" and kinematics == "full" and formulation == "displacement" and random.random() < 0.2:
+    if (
+        shape == "cube"
+        and kinematics == "full"
+        and formulation == "displacement"
+        and random.random() < 0.2
+    ):
         mesh["element"] = "tetrahedron"
-    repulsions = ("log", "length") if remodeling["law"] == "tensor" else ("axes", "axes", "log", "length")
+    repulsions = (
+        ("log", "length") if remodeling["law"] == "tensor" else ("axes", "axes", "log", "length")
+    )
     scene["material"]["repulsion"] = random.choice(repulsions)
     return mesh, {"kinematics": kinematics}
 
@@ -198,7 +246,11 @@ def _time(random: Random, scene: Values) -> Values:
     scene["remodeling"] |= {"kappa": kappa, "rotation_time": rounded(step * random.uniform(2, 40))}
     time: Values = {"end": steps * step, "step": step}
     chosen = random.random()
-    if chosen < 0.12 and scene["remodeling"]["law"] in ("explicit", "relaxation", "tensor") and not few:
+    if (
+        chosen < 0.12
+        and scene["remodeling"]["law"] in ("explicit", "relaxation", "tensor")
+        and not few
+    ):
         return {"end": "equilibrium", "step": step} if scene["material"]["chain_density"] else time
     if chosen < 0.3 and not few:
         time["tolerance"] = random.choice((0.5, 1.0, 2.0))
@@ -209,7 +261,9 @@ def _ramp(random: Random, step: float, steps: int) -> list[list[float]]:
     """At once, at the start, late, falling, reversed or in cycles; corners at steps."""
     at = sorted(random.sample(range(1, steps + 1), min(3, steps)))
     a, b, c = (at + [steps + 1, steps + 2])[:3]
-    kind = random.choice(("start", "start", "start", "late", "falling", "reversed", "cycles", "at once", "beyond"))
+    kind = random.choice(
+        ("start", "start", "start", "late", "falling", "reversed", "cycles", "at once", "beyond")
+    )
     corners = {
         "start": [(0, 0.0), (a, 1.0)], "late": [(a, 0.0), (b, 1.0)],
         "falling": [(0, 0.0), (a, 1.0), (b, 1.0), (c, 0.0)],
@@ -238,8 +292,13 @@ def _loads(random: Random, scene: Values, stiffness: float) -> Values:
         if random.random() < 0.8:
             loads["elongation"] = load(random.uniform(-0.05, 0.4))
         else:
-            loads["elongation"] = {"value": 0.0, "ramp": [[0.0, 0.0]]}  # a preset's stays where the scene has none
-            loads["axial_force"] = load(stiffness * math.pi * (outer**2 - inner**2) * random.uniform(-0.02, 0.3))
+            loads["elongation"] = {
+                "value": 0.0,
+                "ramp": [[0.0, 0.0]],
+            }  # a preset's stays where the scene has none
+            loads["axial_force"] = load(
+                stiffness * math.pi * (outer**2 - inner**2) * random.uniform(-0.02, 0.3)
+            )
     return loads
 
 
@@ -257,7 +316,10 @@ def _solver(random: Random, scene: Values) -> Values:
     if solver["method"] == "iterative" and has_free_length(scene):
         solver["method"] = "auto"  # refused
     if random.random() < 0.1:
-        solver |= {"maximum_iterations": random.randint(10, 50), "maximum_halvings": random.randint(4, 14)}
+        solver |= {
+            "maximum_iterations": random.randint(10, 50),
+            "maximum_halvings": random.randint(4, 14),
+        }
     if scene["model"]["kinematics"] == "full" and random.random() < 0.2:
         solver["unstable"] = "stop"
     if random.random() < 0.05:
@@ -284,18 +346,45 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
         scene["natural"] = {"opening_angle": rounded(random.uniform(0, 120))}
         if random.random() < 0.4:
             along = {"axial": rounded(random.uniform(0.95, 1.1))}
-            scene["natural"]["layers"] = [{"from": rounded(random.uniform(0.2, 0.8)), "prestretch": along}]
+            scene["natural"]["layers"] = [
+                {"from": rounded(random.uniform(0.2, 0.8)), "prestretch": along}
+            ]
     _set_points(random, scene, stiffness)
-    plain = "tolerance" not in scene["time"] and "profile" not in scene and scene["time"]["end"] != "equilibrium"
-    turns = scene["remodeling"]["law"] == "tensor" and scene["remodeling"]["coupling"] in ("staggered", "extrapolated")
+    plain = (
+        "tolerance" not in scene["time"]
+        and "profile" not in scene
+        and scene["time"]["end"] != "equilibrium"
+    )
+    turns = scene["remodeling"]["law"] == "tensor" and scene["remodeling"]["coupling"] in (
+        "staggered",
+        "extrapolated",
+    )
     locked = scene["material"]["contour_length"] <= 1.3 * scene["cells"]["end_to_end_length"]
-    if turns and plain and not locked and scene["material"]["chain_density"] and random.random() < 0.2:
-        numbers = {"time": rounded(random.uniform(20, 80)), "deposition_stretch": rounded(random.uniform(1.02, 1.2))}
-        numbers |= {"gain": rounded(random.uniform(0.5, 2)), "rates": random.choice(("cauchy", "tension"))}
+    if (
+        turns
+        and plain
+        and not locked
+        and scene["material"]["chain_density"]
+        and random.random() < 0.2
+    ):
+        numbers = {
+            "time": rounded(random.uniform(20, 80)),
+            "deposition_stretch": rounded(random.uniform(1.02, 1.2)),
+        }
+        numbers |= {
+            "gain": rounded(random.uniform(0.5, 2)),
+            "rates": random.choice(("cauchy", "tension")),
+        }
         grows = scene["geometry"]["shape"] == "tube"
         grows = grows and scene.get("mesh", {}).get("formulation", "displacement") == "displacement"
-        scene["remodeling"]["turnover"] = numbers | {"volume": random.choice((0.0, 0.3, 0.6)) if grows else 0.0}
-    if _closes_from_a_sector(scene) and scene["supports"]["ends"] != "clamped" and random.random() < 0.05:
+        scene["remodeling"]["turnover"] = numbers | {
+            "volume": random.choice((0.0, 0.3, 0.6)) if grows else 0.0
+        }
+    if (
+        _closes_from_a_sector(scene)
+        and scene["supports"]["ends"] != "clamped"
+        and random.random() < 0.05
+    ):
         scene["geometry"]["is"] = "loaded"
         if scene["time"]["end"] == "equilibrium":
             scene.setdefault("natural", {})["cells"] = "equilibrium"
@@ -311,7 +400,9 @@ def _cases(random: Random, scene: Values) -> None:
     name = random.choice(sorted(scene["loads"]))
     factors = [{"loads": {name: rounded(random.uniform(0.5, 1.0))}}, {}]
     weights = [weight, 1 - weight] if random.random() < 0.7 else [1.0]
-    scene["cases"] = [{"weight": share} | more for share, more in zip(weights, factors, strict=False)]
+    scene["cases"] = [
+        {"weight": share} | more for share, more in zip(weights, factors, strict=False)
+    ]
     means = ("tensor", "largest") + ("target",) * (scene["remodeling"]["law"] == "tensor")
     scene["remodeling"]["mean"] = random.choice(means)
 
@@ -330,5 +421,9 @@ def _set_points(random: Random, scene: Values, stiffness: float) -> None:
 def _closes_from_a_sector(scene: Values) -> bool:
     """Whether an opening angle goes with all else."""
     uniform = scene["cells"]["initial"] == "isotropic" and scene["cells"]["axes"] == "cylindrical"
-    plain = scene["mesh"]["formulation"] == "displacement" and "regions" not in scene and "profile" not in scene
+    plain = (
+        scene["mesh"]["formulation"] == "displacement"
+        and "regions" not in scene
+        and "profile" not in scene
+    )
     return scene["geometry"]["shape"] == "tube" and uniform and plain

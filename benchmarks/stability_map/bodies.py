@@ -7,14 +7,29 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.cases import MU, Case, Check, Finding, Place, Run, Values, named, table, with_values
+from benchmarks.stability_map.cases import (
+    MU,
+    Case,
+    Check,
+    Finding,
+    Place,
+    Run,
+    Values,
+    named,
+    table,
+    with_values,
+)
 from benchmarks.stability_map.homogeneous import CUBE, DRIVERS, FRAMES, RAMP, element, has_frame
 from benchmarks.stability_map.judging import SAME_MESH
 from tests.reference.march import Wall, load_at, march
 from tests.reference.radial import RadialMaterial, Tube
 from tests.values import ramped
 
-SOFT = {"material.chain_density": 2.0e21, "material.contour_length": 1.594, "material.persistence_length": 1.365}
+SOFT = {
+    "material.chain_density": 2.0e21,
+    "material.contour_length": 1.594,
+    "material.persistence_length": 1.365,
+}
 TUBE = with_values(CUBE, {
     **SOFT, "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 0.5}, "mesh.degree": 2,
     "cells.axes": "cylindrical", "loads": ramped(20.0, pressure=4.8, elongation=0.1), "time.end": 40.0,
@@ -27,7 +42,9 @@ TENDON = with_values(CUBE, {
 COARSE_TENDON = {"tendon": {"AROUND": 8, "CORE": 2, "RINGS": 1, "ALONG": 3}}
 RADIUS_TOLERANCE, STEP_TOLERANCE = 0.01, 0.01
 ANGLE_TOLERANCE = 1.5  # degrees, of the mean over a body
-CELL_TOLERANCE = 0.1  # of A over r0^2, root mean square over the elements: a mean may hide that they swing
+CELL_TOLERANCE = (
+    0.1  # of A over r0^2, root mean square over the elements: a mean may hide that they swing
+)
 OUTER_ANGLE_TOLERANCE = 5.0  # degrees: a coarse layer of elements
 REFERENCE = "tube in one dimension"
 FACES, ELEMENTS = ("inner_radius", "outer_radius"), 8  # through the wall, refinement 1
@@ -45,35 +62,57 @@ def check_wall(case: Case, run: Run) -> Finding:
     Options of a case: `radii`, their tolerance; `displacement`: in their place the inner one, within this share;
     `angles`: tolerances in degrees by place; `elements` of the reference; `unstable`, what is known of the state.
     """
-    wall, options, rows = Wall(case.scene, case.options.get("elements", 60)), case.options, run.column("time")
+    wall, options, rows = (
+        Wall(case.scene, case.options.get("elements", 60)),
+        case.options,
+        run.column("time"),
+    )
     expected = march(case.scene, wall, coupling="staggered")
     known, whole = options.get("unstable"), not expected.ended
     rows = rows[: np.searchsorted(rows, (expected.times or [0.0])[-1] + 1e-9)]
     if not len(rows):
-        return Finding(np.inf if run.code == 0 else 0.0, f"no row to compare {expected.ended}", known, whole)
+        return Finding(
+            np.inf if run.code == 0 else 0.0, f"no row to compare {expected.ended}", known, whole
+        )
     at, radii = expected.at(rows), dict(zip(FACES, expected.faces(), strict=True))
-    off = {name: np.abs(run.column(name)[: len(rows)] / radii[name][at] - 1).max() for name in FACES}
+    off = {
+        name: np.abs(run.column(name)[: len(rows)] / radii[name][at] - 1).max() for name in FACES
+    }
     words = [f"{name} off by {100 * value:.3g} %" for name, value in off.items()]
     ratio = max(off.values()) / options.get("radii", RADIUS_TOLERANCE)
     if "displacement" in options:
         inner, found = wall.tube.inner_radius, run.column("inner_radius")[: len(rows)]
         error = np.abs((found - inner) / (radii["inner_radius"][at] - inner) - 1).max()
-        words, ratio = [*words, f"inner displacement off by {100 * error:.3g} %"], error / options["displacement"]
+        words, ratio = [*words, f"inner displacement off by {100 * error:.3g} %"], error / options[
+            "displacement"
+        ]
     for place, degrees in options.get("angles", {}).items():
         inside, outside = layer(case, place)
         angles = [expected.mean_angle(wall.tube, inside, outside, row) for row in at]
         angle = np.abs(run.column(f"fibre_angle_{place}")[: len(rows)] - angles).max()
-        words, ratio = [*words, f"{place} angle by {angle:.3g} degrees"], max(ratio, angle / degrees)
+        words, ratio = [*words, f"{place} angle by {angle:.3g} degrees"], max(
+            ratio, angle / degrees
+        )
     words += [] if whole else [f"the reference ends at t = {expected.times[-1]:g}"]
-    return Finding(float(np.inf if run.code == 0 and not whole else ratio), ", ".join(words), known, whole)
+    return Finding(
+        float(np.inf if run.code == 0 and not whole else ratio), ", ".join(words), known, whole
+    )
 
 
 def layer(case: Case, place: str) -> tuple[float, float]:
     """Radii between which the elements of an angle's column are."""
     inner, outer = (case.scene["geometry"][name] for name in FACES)
-    through = case.counts["tube"]["PAPER"][1] if case.counts else ELEMENTS * case.scene["mesh"]["refinement"]
+    through = (
+        case.counts["tube"]["PAPER"][1]
+        if case.counts
+        else ELEMENTS * case.scene["mesh"]["refinement"]
+    )
     size, middle = (outer - inner) / through, (inner + outer) / 2
-    places = {"inner": (inner, inner + size), "outer": (outer - size, outer), "middle": (middle - size, middle + size)}
+    places = {
+        "inner": (inner, inner + size),
+        "outer": (outer - size, outer),
+        "middle": (middle - size, middle + size),
+    }
     return places[place]
 
 
@@ -86,25 +125,36 @@ def check_inner_displacement(case: Case, run: Run) -> Finding:
     tube = Tube(geometry["inner_radius"], geometry["outer_radius"], 400, elastic)
     radii, cells, errors = tube.nodes.copy(), np.full((len(tube.points), 3), 1 / 3), []
     pressures = [load_at(case.scene, "pressure", time) for time in run.column("time")]
-    for before, pressure, found in zip(pressures, pressures[1:], run.column("inner_radius")[1:], strict=False):
+    for before, pressure, found in zip(
+        pressures, pressures[1:], run.column("inner_radius")[1:], strict=False
+    ):
         for start, end in pairwise(np.linspace(before, pressure, 4)):
             radii = tube.advance(radii, (cells, start, 1.0), (cells, end, 1.0))
         errors.append((found - tube.nodes[0]) / (radii[0] - tube.nodes[0]) - 1)
     error = max(errors, key=abs)
-    return Finding(abs(error) / case.options["tolerance"], f"inner displacement off by {100 * error:.3g} %")
+    return Finding(
+        abs(error) / case.options["tolerance"], f"inner displacement off by {100 * error:.3g} %"
+    )
 
 
 # ---------------------------------------------------------------- families of tubes
-def tube_case(family: str, changes: Values, place: Place, check: Check = check_wall, **more: Any) -> Case:
+def tube_case(
+    family: str, changes: Values, place: Place, check: Check = check_wall, **more: Any
+) -> Case:
     """A short piece of the demo's artery with isotropic cells."""
     given = {"counts": ring(8, 4), "options": {"angles": {"outer": OUTER_ANGLE_TOLERANCE}}, **more}
-    return Case(family, named(family, place), with_values(TUBE, changes), check, REFERENCE, place, **given)
+    return Case(
+        family, named(family, place), with_values(TUBE, changes), check, REFERENCE, place, **given
+    )
 
 
 def long(around: int = 16, through: int = 8, **options: Any) -> dict[str, Any]:
     """With the error of trilinear elements, 1 % of their own."""
     angles = {"outer": 2 * OUTER_ANGLE_TOLERANCE}
-    return {"counts": ring(around, through), "options": {"radii": 0.02, "angles": angles, **options}}
+    return {
+        "counts": ring(around, through),
+        "options": {"radii": 0.02, "angles": angles, **options},
+    }
 
 
 LONG = long()
@@ -148,7 +198,12 @@ table(
 )  # fmt: skip
 
 ELASTIC = {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0}
-PRESSED = {**ELASTIC, "loads.pressure": ramped(4.0, pressure=2.0)["pressure"], "time.end": 4.0, "time.step": 1.0}
+PRESSED = {
+    **ELASTIC,
+    "loads.pressure": ramped(4.0, pressure=2.0)["pressure"],
+    "time.end": 4.0,
+    "time.step": 1.0,
+}
 RATIOS = (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5)
 # the tolerance is the error that the mesh has where nothing locks, at most the 5 % from which a run warns, or 3.5 %
 MESHES = {
@@ -161,7 +216,13 @@ MESHES = {
 def thick_wall(family: str, changes: Values, place: Place, **more: Any) -> Case:
     """Without chains, p = 2, on one of the meshes."""
     kind, degree, counts, tolerance = MESHES[place["mesh"]]
-    changes = {**PRESSED, "mesh.formulation": "displacement", "mesh.element": kind, "mesh.degree": degree, **changes}
+    changes = {
+        **PRESSED,
+        "mesh.formulation": "displacement",
+        "mesh.element": kind,
+        "mesh.degree": degree,
+        **changes,
+    }
     more |= {"counts": counts, "options": {"tolerance": tolerance}}
     return tube_case(family, changes, place, check_inner_displacement, **more)
 
@@ -178,7 +239,9 @@ def check_half_step(case: Case, run: Run) -> Finding:
     """The same with half of the step: a column, the mean angle and A of the elements at the end."""
     other = run.companion
     if other is None or other.code != 0 or run.code != 0:
-        return Finding(np.nan if run.code == 0 else 0.0, "half of the step does not come to the end")
+        return Finding(
+            np.nan if run.code == 0 else 0.0, "half of the step does not come to the end"
+        )
     name = case.options.get("column", "mean_stretch")
     share = abs(run.column(name)[-1] / other.column(name)[-1] - 1)
     angle = abs(run.column("mean_fibre_angle")[-1] - other.column("mean_fibre_angle")[-1])
@@ -201,7 +264,12 @@ def check_column(case: Case, run: Run) -> Finding:
 
 # ---------------------------------------------------------------- families of tendons
 def tendon_case(
-    family: str, changes: Values, place: Place, check: Check = check_half_step, reference: str = SAME_MESH, **more: Any
+    family: str,
+    changes: Values,
+    place: Place,
+    check: Check = check_half_step,
+    reference: str = SAME_MESH,
+    **more: Any,
 ) -> Case:
     """A coarse tendon."""
     scene = with_values(TENDON, changes)
@@ -212,9 +280,14 @@ def tendon_case(
 
 def twisted_case(family: str, changes: Values, place: Place, **more: Any) -> Case:
     """A bar that is twisted and stretched: no axes are coaxial but those on its axis."""
-    loads = {"twist": {"value": place["twist"], "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}}
+    loads = {
+        "twist": {"value": place["twist"], "ramp": RAMP},
+        "elongation": {"value": 0.1, "ramp": RAMP},
+    }
     changes = {**changes, "geometry.shape": "twisted", "loads": loads, "cells.initial": "isotropic"}
-    return tendon_case(family, changes, place, options={"column": "stored_energy"}, extended=True, **more)
+    return tendon_case(
+        family, changes, place, options={"column": "stored_energy"}, extended=True, **more
+    )
 
 
 # every driver, frame and coupling, from weak loads to locking

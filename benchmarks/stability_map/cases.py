@@ -142,7 +142,8 @@ def toml_set(key: str, value: Any) -> str:
 def with_values(scene: Mapping[str, Any], changes: Mapping[str, Any]) -> Values:
     """A copy of nested tables with other values by dotted key."""
     copy: Values = {
-        name: with_values(value, {}) if isinstance(value, Mapping) else value for name, value in scene.items()
+        name: with_values(value, {}) if isinstance(value, Mapping) else value
+        for name, value in scene.items()
     }
     for key, value in changes.items():
         table, *names = copy, *key.split(".")
@@ -200,7 +201,9 @@ def table(
                     asked[KEYS["lambda/mu"]] *= MU
                 asked |= changes(place) if callable(changes) else changes
                 given = dict(more(place) if callable(more) else more)
-                yield make(family, asked, place, reduced=reduced is not None and reduced(place), **given)
+                yield make(
+                    family, asked, place, reduced=reduced is not None and reduced(place), **given
+                )
 
     FAMILIES.setdefault(family, []).append(cases)
 

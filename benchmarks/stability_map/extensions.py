@@ -29,10 +29,16 @@ def dead_force(component: int) -> LoadKind:
 class Block(Cube):
     """The sliding cube under forces along all three axes, perhaps flat, perhaps of bad elements."""
 
-    loads: ClassVar[dict[str, LoadKind]] = {f"force_{axis}": dead_force(i) for i, axis in enumerate("xyz")}
+    loads: ClassVar[dict[str, LoadKind]] = {
+        f"force_{axis}": dead_force(i) for i, axis in enumerate("xyz")
+    }
     shape: Literal["block"] = Field(default="block", description="Which body it is.")
-    aspect: Annotated[float, LENGTH] = Field(default=1.0, gt=0, description="Side over the thickness along x.")
-    distortion: float = Field(default=0.0, ge=0, description="Of the node inside: 1 flattens the Jacobian to zero.")
+    aspect: Annotated[float, LENGTH] = Field(
+        default=1.0, gt=0, description="Side over the thickness along x."
+    )
+    distortion: float = Field(
+        default=0.0, ge=0, description="Of the node inside: 1 flattens the Jacobian to zero."
+    )
 
     def build(self, mesh: Any, comm: Any = None) -> Domain:
         """The cube's mesh, moved."""
@@ -51,7 +57,9 @@ def prescribed(loading: Any, face: str | None = None, component: int | None = No
     dimension, space = loading.domain.mesh.topology.dim - 1, loading.space
     if component is None:
         values = dolfinx.fem.Function(space)
-        condition = dolfinx.fem.dirichletbc(values, dolfinx.fem.locate_dofs_topological(space, dimension, facets))
+        condition = dolfinx.fem.dirichletbc(
+            values, dolfinx.fem.locate_dofs_topological(space, dimension, facets)
+        )
     else:
         part = space.sub(component)
         values = dolfinx.fem.Function(part.collapse()[0])
@@ -82,7 +90,9 @@ class Driven(Block):
     """A block whose whole boundary has a given deformation gradient F = I + H: a patch test that remodels."""
 
     loads: ClassVar[dict[str, LoadKind]] = {
-        f"h_{a}{b}": entry_of_gradient(i, j) for i, a in enumerate("xyz") for j, b in enumerate("xyz")
+        f"h_{a}{b}": entry_of_gradient(i, j)
+        for i, a in enumerate("xyz")
+        for j, b in enumerate("xyz")
     }
     columns: ClassVar[tuple[Column, ...]] = uniaxial_columns("z1", "side")[-1:]
     shape: Literal["driven"] = Field(default="driven", description="Which body it is.")
@@ -109,7 +119,9 @@ class Twisted(Tendon):
     loads: ClassVar[dict[str, LoadKind]] = {
         "twist": LoadKind(turn_top, "angle of the top in radians"),
         "elongation": LoadKind(
-            lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
+            lambda shape, loading, name: loading.add_prescribed_elongation(
+                name, "top", 2, shape.length
+            ),
             "engineering strain of the length",
         ),
     }

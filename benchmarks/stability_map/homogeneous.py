@@ -11,8 +11,29 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.stability_map.cases import Case, Check, Finding, Place, Run, Values, farthest, named, table, with_values
-from tests.reference.march import Bar, Path, factor, initial, march, material, nominal_stress, slowed, step_times
+from benchmarks.stability_map.cases import (
+    Case,
+    Check,
+    Finding,
+    Place,
+    Run,
+    Values,
+    farthest,
+    named,
+    table,
+    with_values,
+)
+from tests.reference.march import (
+    Bar,
+    Path,
+    factor,
+    initial,
+    march,
+    material,
+    nominal_stress,
+    slowed,
+    step_times,
+)
 from tests.reference.point import prescribed_path
 from tests.reference.radial import Array
 from tests.reference.solid import smallest_eigenvalue
@@ -32,11 +53,19 @@ CUBE: dict[str, Any] = {
     "time": {"end": 100.0, "step": 1.0},
     "output": {"fields": True, "every": 1_000_000},
 }  # fmt: skip
-STRETCH_TOLERANCE, ANGLE_TOLERANCE, CELL_TOLERANCE = 1e-5, 1e-3, 1e-4  # relative, degrees, of A over r0^2
+STRETCH_TOLERANCE, ANGLE_TOLERANCE, CELL_TOLERANCE = (
+    1e-5,
+    1e-3,
+    1e-4,
+)  # relative, degrees, of A over r0^2
 LAGGING = 1e3  # times that for a lag of a step: 1 % of a stretch, a degree, 0.1 of A
 FRAMES, DRIVERS = ("spatial", "material"), ("cauchy", "pk2", "finger")
 LAWS, COUPLINGS = ("explicit", "rate", "relaxation", "none"), ("staggered", "relaxed")
-ELEMENTS = {f"{kind[:3]}{degree}": (kind, degree) for kind in ("hexahedron", "tetrahedron") for degree in (1, 2)}
+ELEMENTS = {
+    f"{kind[:3]}{degree}": (kind, degree)
+    for kind in ("hexahedron", "tetrahedron")
+    for degree in (1, 2)
+}
 REFERENCE = "material point"
 VARIANT = {"remodeling.law": "tensor", "remodeling.frame": "material", "material.repulsion": "log"}
 
@@ -56,7 +85,10 @@ def check_point(case: Case, run: Run) -> Finding:
     return found
 
 
-LOOKS, DECIDED = 10, 0.01  # rows of a path that are looked at; over the unloaded eigenvalue: nearer to 0 nobody decides
+LOOKS, DECIDED = (
+    10,
+    0.01,
+)  # rows of a path that are looked at; over the unloaded eigenvalue: nearer to 0 nobody decides
 
 
 def saddle(scene: dict[str, Any], path: Path) -> bool | None:
@@ -65,15 +97,22 @@ def saddle(scene: dict[str, Any], path: Path) -> bool | None:
         return None
     rows = np.unique(np.linspace(0, len(path.times) - 1, LOOKS).astype(int))
     squares = [by_point[0] for by_point in path.squares]
-    lowest = min(smallest_eigenvalue(path.unknowns[i], squares[i], material(scene), squares[0]) for i in rows)
+    lowest = min(
+        smallest_eigenvalue(path.unknowns[i], squares[i], material(scene), squares[0]) for i in rows
+    )
     return None if abs(lowest) < DECIDED else lowest < 0
 
 
 def deviations(scene: dict[str, Any], run: Run, path: Path, rows: int) -> dict[str, float]:
     """Deviation over tolerance by quantity."""
     stretch, r0 = np.array(path.unknowns[:rows])[:, 2], scene["cells"]["end_to_end_length"]
-    found = {"stretch": np.max(np.abs(run.column("mean_stretch")[:rows] / stretch - 1)) / STRETCH_TOLERANCE}
-    chains = 1.0 if scene["material"]["chain_density"] else 0.0  # without them there are no cells, and no angle
+    found = {
+        "stretch": np.max(np.abs(run.column("mean_stretch")[:rows] / stretch - 1))
+        / STRETCH_TOLERANCE
+    }
+    chains = (
+        1.0 if scene["material"]["chain_density"] else 0.0
+    )  # without them there are no cells, and no angle
     if chains:
         turned = np.abs(run.column("mean_fibre_angle")[:rows] - path.angle()[:rows])
         found["angle"] = np.max(turned) / ANGLE_TOLERANCE
@@ -96,11 +135,25 @@ def deviations(scene: dict[str, Any], run: Run, path: Path, rows: int) -> dict[s
 
 # ---------------------------------------------------------------- families
 def cube_case(
-    family: str, changes: Values, place: Place, check: Check = check_point, reference: str = REFERENCE, **more: Any
+    family: str,
+    changes: Values,
+    place: Place,
+    check: Check = check_point,
+    reference: str = REFERENCE,
+    **more: Any,
 ) -> Case:
     """The demo's cube with other values."""
     scene = with_values(CUBE, changes)
-    return Case(family, named(family, place), scene, check, reference, place, base=("demos/cube.toml", changes), **more)
+    return Case(
+        family,
+        named(family, place),
+        scene,
+        check,
+        reference,
+        place,
+        base=("demos/cube.toml", changes),
+        **more,
+    )
 
 
 def element(p: Place) -> Values:
@@ -108,7 +161,25 @@ def element(p: Place) -> Values:
     return dict(zip(("mesh.element", "mesh.degree"), ELEMENTS[p["element"]], strict=True))
 
 
-LOADS = (0.0, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.5, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e6, 1e9)
+LOADS = (
+    0.0,
+    1e-4,
+    1e-3,
+    0.01,
+    0.03,
+    0.1,
+    0.3,
+    0.5,
+    1.0,
+    3.0,
+    10.0,
+    30.0,
+    100.0,
+    1e3,
+    1e4,
+    1e6,
+    1e9,
+)
 RAMP = [[0.0, 0.0], [10.0, 1.0]]
 
 
@@ -226,8 +297,14 @@ TRIAXIAL: dict[str, tuple[dict[str, tuple[float, list[list[float]]]], float]] = 
     "equibiaxial 20": ({"x": (20.0, RAMP), "z": (20.0, RAMP)}, 80.0),
     "three unequal": ({"x": (3.0, RAMP), "y": (6.0, RAMP), "z": (10.0, RAMP)}, 60.0),
     "tension and compression": ({"x": (-2.0, RAMP), "z": (8.0, RAMP)}, 60.0),
-    "crossing": ({"x": (10.0, [[0, 0], [10, 0.2], [50, 1]]), "z": (10.0, [[0, 0], [10, 1], [50, 0.2]])}, 80.0),
-    "turned": ({"x": (10.0, [[0, 0], [30, 0], [40, 1]]), "z": (10.0, [[0, 0], [10, 1], [30, 1], [40, 0]])}, 80.0),
+    "crossing": (
+        {"x": (10.0, [[0, 0], [10, 0.2], [50, 1]]), "z": (10.0, [[0, 0], [10, 1], [50, 0.2]])},
+        80.0,
+    ),
+    "turned": (
+        {"x": (10.0, [[0, 0], [30, 0], [40, 1]]), "z": (10.0, [[0, 0], [10, 1], [30, 1], [40, 0]])},
+        80.0,
+    ),
     "hydrostatic 3": ({axis: (3.0, RAMP) for axis in "xyz"}, 30.0),
     "hydrostatic 30": ({axis: (30.0, RAMP) for axis in "xyz"}, 30.0),
     "hydrostatic -30": ({axis: (-30.0, RAMP) for axis in "xyz"}, 30.0),
@@ -237,7 +314,9 @@ TRIAXIAL: dict[str, tuple[dict[str, tuple[float, list[list[float]]]], float]] = 
 def triaxial(p: Place) -> Values:
     """Dead forces along the axes, for the coordinate `load`."""
     forces, end = TRIAXIAL[p["load"]]
-    return {f"loads.force_{a}": {"value": v, "ramp": ramp} for a, (v, ramp) in forces.items()} | {"time.end": end}
+    return {f"loads.force_{a}": {"value": v, "ramp": ramp} for a, (v, ramp) in forces.items()} | {
+        "time.end": end
+    }
 
 
 def has_frame(p: Place) -> bool:
@@ -246,7 +325,13 @@ def has_frame(p: Place) -> bool:
 
 
 def case_of_shape(
-    shape: str, check: Check, family: str, changes: Values, place: Place, reference: str = REFERENCE, **more: Any
+    shape: str,
+    check: Check,
+    family: str,
+    changes: Values,
+    place: Place,
+    reference: str = REFERENCE,
+    **more: Any,
 ) -> Case:
     """A shape of `extensions` of the cube's size and material."""
     base = {**CUBE, "geometry": {"shape": shape, "side": 1.0}, "loads": {}}
@@ -282,7 +367,9 @@ table(
 
 # ---------------------------------------------------------------- a prescribed deformation of the whole boundary
 FINER_PATHS = 16  # steps of the reference in one of the scene's
-LIMIT_TOLERANCE = 0.03  # of A over r0^2: the staggered pass has an error of the order of kappa dt = 0.025
+LIMIT_TOLERANCE = (
+    0.03  # of A over r0^2: the staggered pass has an error of the order of kappa dt = 0.025
+)
 SETTLED = 0.01  # of A between two references, or there is no limit
 OF_LIMIT = "material point, dt -> 0"
 
@@ -324,7 +411,11 @@ def check_limit(case: Case, run: Run) -> Finding:
     F = gradients(scene, step_times(scene))[-1]
     patch = np.abs(run.tensor("deformation_gradient") - F).max() / np.abs(F).max() / 1e-5
     cells = np.abs(run.structure_tensor() - expected).max() / r0**2 / LIMIT_TOLERANCE
-    words = f"A differs from dt -> 0 by {cells * LIMIT_TOLERANCE:.3g} r0^2" if cells > patch else "F is not uniform"
+    words = (
+        f"A differs from dt -> 0 by {cells * LIMIT_TOLERANCE:.3g} r0^2"
+        if cells > patch
+        else "F is not uniform"
+    )
     return Finding(float(max(cells, patch)), words)
 
 
@@ -391,7 +482,9 @@ def check_small_steps(case: Case, run: Run) -> Finding:
     found = {"stretch": float(np.max(np.abs(run.column("mean_stretch") / stretch - 1))) / error}
     if run.code == 0:
         r0, A = scene["cells"]["end_to_end_length"], run.structure_tensor()
-        found["trace of A"] = float(np.abs(np.trace(A, axis1=1, axis2=2) / r0**2 - 1).max()) / TRACE_TOLERANCE
+        found["trace of A"] = (
+            float(np.abs(np.trace(A, axis1=1, axis2=2) / r0**2 - 1).max()) / TRACE_TOLERANCE
+        )
         found["A"] = float(np.abs(A - np.diag(path.squares[-1][0])).max()) / r0**2 / error
     return farthest(found)
 
@@ -436,7 +529,10 @@ table(
 # ---------------------------------------------------------------- weak jumps
 def closed_squares(scene: dict[str, Any], times: Array) -> Array:
     """l_d^2 at the ends of steps under uniaxial tension along z, from isotropic cells: dA/dt solved."""
-    r0, done = scene["cells"]["end_to_end_length"], -np.expm1(-scene["remodeling"]["kappa"] * times)[:, None]
+    r0, done = (
+        scene["cells"]["end_to_end_length"],
+        -np.expm1(-scene["remodeling"]["kappa"] * times)[:, None],
+    )
     along = np.array([0.0, 0.0, 1.0])
     return np.asarray(r0**2 * (1 / 3 + (along - 1 / 3) * done))
 
@@ -454,12 +550,22 @@ def check_closed_form(case: Case, run: Run) -> Finding:
     angle = np.degrees(np.arctan2(np.sqrt(squares[:, 0] + squares[:, 1]), np.sqrt(squares[:, 2])))
     off = np.abs(run.column("mean_stretch") / np.array(stretches)[1:, 2] - 1)
     turned = np.abs(run.column("mean_fibre_angle") - angle)
-    return farthest({"angle": turned.max() / CLOSED_ANGLE_TOLERANCE, "stretch": off.max() / CLOSED_STRETCH_TOLERANCE})
+    return farthest(
+        {
+            "angle": turned.max() / CLOSED_ANGLE_TOLERANCE,
+            "stretch": off.max() / CLOSED_STRETCH_TOLERANCE,
+        }
+    )
 
 
 def jump(p: Place) -> Values:
     """All of the load at once: no point may keep its cells, and the target stays, so that steps have no error."""
-    return {**TENSOR, "remodeling.coupling": "extrapolated", "loads.force.ramp": [[0.0, 1.0]], "time.end": 6.0}
+    return {
+        **TENSOR,
+        "remodeling.coupling": "extrapolated",
+        "loads.force.ramp": [[0.0, 1.0]],
+        "time.end": 6.0,
+    }
 
 
 # from weak to strong, soft to nearly incompressible
@@ -479,7 +585,11 @@ table(
 UNITS = (1e-9, 1e-3, 92.4, 1e6)
 
 
-LENGTHS = (("material", "contour_length"), ("material", "persistence_length"), ("cells", "end_to_end_length"))
+LENGTHS = (
+    ("material", "contour_length"),
+    ("material", "persistence_length"),
+    ("cells", "end_to_end_length"),
+)
 
 
 def in_units(p: Place, changes: Values) -> Values:

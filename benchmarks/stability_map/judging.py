@@ -12,7 +12,8 @@ from benchmarks.stability_map.cases import Case, Finding, Run
 OUTCOMES = ("right", "refused", "unstable", "warned", "wrong", "unchecked")
 # what a refusal must say to be one with a cause
 CAUSES = re.compile(
-    r"limit point|bifurcation|kinematic locking|chain locking|chains? lock|solver tolerance|eigenvalue", re.I
+    r"limit point|bifurcation|kinematic locking|chain locking|chains? lock|solver tolerance|eigenvalue",
+    re.I,
 )
 UNSTABLE = re.compile(
     r"negative eigenvalue|unstable equilibrium|equilibrium is unstable|no longer a minimum|lost (its )?stability|"
@@ -59,7 +60,9 @@ def judged(case: Case, run: Run) -> Verdict:
     if run.code not in (0, BAD_INPUT, SOLVE_FAILED):
         return Verdict("wrong", f"exit {run.code}: {run.said[-300:].strip()}")
     if run.code == BAD_INPUT:
-        return Verdict("refused", run.said.strip(), cause_named=True)  # one line names key and value: the contract
+        return Verdict(
+            "refused", run.said.strip(), cause_named=True
+        )  # one line names key and value: the contract
     finding = case.check(case, run)
     ratio = float(finding.ratio) if np.isfinite(finding.ratio) else None
     if run.code == SOLVE_FAILED:
@@ -77,16 +80,24 @@ def judged(case: Case, run: Run) -> Verdict:
     if finding.ratio <= 1:
         if named and finding.unstable is None:
             return Verdict("unstable", named[0], ratio)
-        said = [line for line in (*named, *others) if not any(text in line for text in finding.confirmed)]
+        said = [
+            line
+            for line in (*named, *others)
+            if not any(text in line for text in finding.confirmed)
+        ]
         return Verdict("right", said[0] if said else finding.words, ratio, false_alarm=bool(said))
     if warnings:
-        return Verdict("unstable" if named else "warned", f"{finding.words}; said: {warnings[0]}", ratio)
+        return Verdict(
+            "unstable" if named else "warned", f"{finding.words}; said: {warnings[0]}", ratio
+        )
     return Verdict("wrong", finding.words, ratio)
 
 
 def _refused(run: Run, finding: Finding, ratio: float | None) -> Verdict:
     said = run.said.strip().splitlines()
-    message = next((line for line in reversed(said) if "no equilibrium" in line), said[-1] if said else "")
+    message = next(
+        (line for line in reversed(said) if "no equilibrium" in line), said[-1] if said else ""
+    )
     notes = [message]
     if finding.solvable:
         notes.append("the reference goes on")

@@ -11,13 +11,30 @@ from scipy.optimize import root
 
 from benchmarks.stability_map import bodies
 from benchmarks.stability_map.bodies import MU
-from benchmarks.stability_map.cases import Case, Check, Finding, Place, Run, Values, farthest, named, table, with_values
+from benchmarks.stability_map.cases import (
+    Case,
+    Check,
+    Finding,
+    Place,
+    Run,
+    Values,
+    farthest,
+    named,
+    table,
+    with_values,
+)
 from benchmarks.stability_map.homogeneous import VARIANT
 from tests.reference.march import Wall, initial, load_at, march
 from tests.reference.radial import AXIAL, Array, Tube, first_piola_kirchhoff
 
 RAY: dict[str, Any] = with_values(
-    bodies.TUBE, {"geometry.length": 8.0, "model.kinematics": "radial", "loads": {}, "time": {"end": 8.0, "step": 1.0}}
+    bodies.TUBE,
+    {
+        "geometry.length": 8.0,
+        "model.kinematics": "radial",
+        "loads": {},
+        "time": {"end": 8.0, "step": 1.0},
+    },
 )
 CURVE = f"{bodies.REFERENCE}, its inner radius prescribed"
 UNLOADED = {"material.chain_density": 0.0, "remodeling.law": "none"}
@@ -25,7 +42,12 @@ AT_ALL_POINTS = {"mesh.formulation": "displacement"}
 
 
 def ray_case(
-    family: str, changes: Values, place: Place, check: Check, reference: str = bodies.REFERENCE, **more: Any
+    family: str,
+    changes: Values,
+    place: Place,
+    check: Check,
+    reference: str = bodies.REFERENCE,
+    **more: Any,
 ) -> Case:
     """A tube on a ray; a load is [value, end of its ramp] or a table."""
     changes = dict(changes)
@@ -139,7 +161,9 @@ def growing_steps(ramped: float) -> tuple[float, ...]:
     return tuple(found)
 
 
-PROMISED_ANGLE = 0.5  # degrees: by what a run to the equilibrium and one in time may differ without a word
+PROMISED_ANGLE = (
+    0.5  # degrees: by what a run to the equilibrium and one in time may differ without a word
+)
 
 
 def check_equilibrium(case: Case, run: Run) -> Finding:
@@ -158,17 +182,29 @@ def check_equilibrium(case: Case, run: Run) -> Finding:
     }
     turned = {
         f"fibre_angle_{place}": abs(
-            run.column(f"fibre_angle_{place}")[-1] - expected.mean_angle(wall.tube, *bodies.layer(case, place), -1)
+            run.column(f"fibre_angle_{place}")[-1]
+            - expected.mean_angle(wall.tube, *bodies.layer(case, place), -1)
         )
         for place in ("inner", "outer")
     }
     off |= {name: degrees / bodies.OUTER_ANGLE_TOLERANCE for name, degrees in turned.items()}
     mean = np.average(expected.squares[-1][:, 1], weights=wall.tube.areas)
-    along = run.structure_tensor()[:, 2, 2]  # of the elements of a ray, from the inner face outwards
-    volumes = np.diff(np.linspace(wall.tube.inner_radius, wall.tube.outer_radius, len(along) + 1) ** 2)
-    off["mean of A along the axis"] = abs(np.average(along, weights=volumes) - mean) / MEAN_TOLERANCE
+    along = run.structure_tensor()[
+        :, 2, 2
+    ]  # of the elements of a ray, from the inner face outwards
+    volumes = np.diff(
+        np.linspace(wall.tube.inner_radius, wall.tube.outer_radius, len(along) + 1) ** 2
+    )
+    off["mean of A along the axis"] = (
+        abs(np.average(along, weights=volumes) - mean) / MEAN_TOLERANCE
+    )
     jumps = [name for name, degrees in turned.items() if degrees > PROMISED_ANGLE]
-    return farthest(off, confirmed=tuple(f"{name} is a mean over elements in which the angle jumps" for name in jumps))
+    return farthest(
+        off,
+        confirmed=tuple(
+            f"{name} is a mean over elements in which the angle jumps" for name in jumps
+        ),
+    )
 
 
 FALLS = {
@@ -221,12 +257,18 @@ def pressure_curve(scene: Values, elements: int = 6) -> tuple[Array, Array]:
     there. With closed ends the axial stretch is found with the radii, from the thrust p pi r_i^2 on the ends.
     """
     tube = Wall(scene, elements).tube
-    residual = _of_given_inner_radius(tube, initial(scene) ** 2, scene.get("supports", {}).get("ends") == "closed")
+    residual = _of_given_inner_radius(
+        tube, initial(scene) ** 2, scene.get("supports", {}).get("ends") == "closed"
+    )
     unknown, found = np.concatenate([[0.0, 1.0], tube.nodes[1:]]), [(tube.inner_radius, 0.0)]
     for inner in tube.inner_radius * np.arange(1 + WIDER, WIDEST, WIDER):
-        unknown[2:] = np.sqrt(unknown[2:] ** 2 + inner**2 - found[-1][0] ** 2)  # a start that keeps areas
+        unknown[2:] = np.sqrt(
+            unknown[2:] ** 2 + inner**2 - found[-1][0] ** 2
+        )  # a start that keeps areas
         solved = root(residual, unknown, (inner,), tol=1e-12)
-        if not np.abs(residual(solved.x, inner)).max() < 1e-9:  # NaN too: chains as long as they can be
+        if (
+            not np.abs(residual(solved.x, inner)).max() < 1e-9
+        ):  # NaN too: chains as long as they can be
             break
         unknown = solved.x
         found.append((inner, float(unknown[0])))
@@ -236,7 +278,9 @@ def pressure_curve(scene: Values, elements: int = 6) -> tuple[Array, Array]:
     return radii, pressures
 
 
-def _of_given_inner_radius(tube: Tube, squares: Array, closed: bool) -> Callable[[Array, float], Array]:
+def _of_given_inner_radius(
+    tube: Tube, squares: Array, closed: bool
+) -> Callable[[Array, float], Array]:
     """Residual of pressure, axial stretch and the other radii."""
     cells = np.tile(squares, (len(tube.points), 1))
 
@@ -261,9 +305,13 @@ def check_limit(case: Case, run: Run) -> Finding:
     off = float(np.max(np.abs(found[below] / expected - 1), initial=0.0))
     asked = load_at(case.scene, "pressure", 1e9)
     if asked < most:
-        return Finding(off / bodies.RADIUS_TOLERANCE, f"inner radius off by {100 * off:.3g} %", False)
+        return Finding(
+            off / bodies.RADIUS_TOLERANCE, f"inner radius off by {100 * off:.3g} %", False
+        )
     words = f"largest pressure {most:.4g}, asked {asked:.4g}; inner radius off by {100 * off:.3g} % below it"
-    return Finding(np.inf if run.code == 0 else off / bodies.RADIUS_TOLERANCE, words, solvable=False)
+    return Finding(
+        np.inf if run.code == 0 else off / bodies.RADIUS_TOLERANCE, words, solvable=False
+    )
 
 
 WEAK_HOOPS: dict[str, tuple[Any, dict[float, float]]] = {
@@ -297,11 +345,15 @@ def check_thrust(case: Case, run: Run) -> Finding:
     tube, pressure = Wall(case.scene).tube, float(run.column("pressure")[-1])
     m, inner, outer = case.scene["material"], tube.inner_radius, tube.outer_radius
     poisson = m["lame_lambda"] / 2 / (m["lame_lambda"] + m["lame_mu"])
-    displacement = pressure * inner**2 / (outer**2 - inner**2) / (2 * m["lame_mu"])  # Lame, plane strain
+    displacement = (
+        pressure * inner**2 / (outer**2 - inner**2) / (2 * m["lame_mu"])
+    )  # Lame, plane strain
     expected = inner + displacement * ((1 - 2 * poisson) * inner + outer**2 / inner)
     error = abs((run.column("inner_radius")[-1] - inner) / (expected - inner) - 1)
     return Finding(
-        error / 0.2, f"inner displacement off by {100 * error:.3g} % of the linear one", case.options["unstable"]
+        error / 0.2,
+        f"inner displacement off by {100 * error:.3g} % of the linear one",
+        case.options["unstable"],
     )
 
 

@@ -40,17 +40,25 @@ def table(records: Iterable[Record]) -> str:
     rows["**all**"] = total
     columns = [name for name in (*OUTCOMES, *EXTRA) if rows["**all**"][name] or name == "wrong"]
     cells = (
-        [name, str(sum(row[outcome] for outcome in OUTCOMES)), *(str(row[column] or "") for column in columns)]
+        [
+            name,
+            str(sum(row[outcome] for outcome in OUTCOMES)),
+            *(str(row[column] or "") for column in columns),
+        ]
         for name, row in rows.items()
     )
     return markdown(["family", "cases", *columns], cells)
 
 
-def listed(records: Iterable[Record], cases: Mapping[str, Case], chosen: Callable[[Record], bool]) -> str:
+def listed(
+    records: Iterable[Record], cases: Mapping[str, Case], chosen: Callable[[Record], bool]
+) -> str:
     """The chosen cases with what is said of them; for the first of a family the command that shows it."""
     rows, commands = list[list[str]](), dict[str, str]()
     for record in filter(chosen, records):
-        rows.append([record["key"], shorten(record["words"].replace("|", "/"), 200, placeholder=" ...")])
+        rows.append(
+            [record["key"], shorten(record["words"].replace("|", "/"), 200, placeholder=" ...")]
+        )
         commands.setdefault(record["family"], cases[record["key"]].command)
     shown = "\n".join(("One of each family again:\n\n```sh", *commands.values(), "```"))
     return markdown(["case", "what is said"], rows) + f"\n\n{shown}" if commands else "None."
@@ -69,7 +77,9 @@ def draw(file: Path, cases: Mapping[str, Case], records: Iterable[Record]) -> No
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch, Rectangle
 
-    figure, found = Figure(figsize=(8.5, 8.5), layout="constrained"), {record["key"]: record for record in records}
+    figure, found = Figure(figsize=(8.5, 8.5), layout="constrained"), {
+        record["key"]: record for record in records
+    }
     axes, families = figure.subplots(), dict[str, list[str]]()
     for key, case in cases.items():
         families.setdefault(case.family, []).append(key)
@@ -80,7 +90,9 @@ def draw(file: Path, cases: Mapping[str, Case], records: Iterable[Record]) -> No
             record = found.get(key)
             x, down = number % WIDTH, y + number // WIDTH
             colour = COLOURS[record["outcome"] if record else "not run"]
-            axes.add_patch(Rectangle((x, down), 0.9, 0.9, facecolor=colour, edgecolor="#bbbbbb", linewidth=0.2))
+            axes.add_patch(
+                Rectangle((x, down), 0.9, 0.9, facecolor=colour, edgecolor="#bbbbbb", linewidth=0.2)
+            )
             if record and record["false_alarm"]:
                 axes.plot(x + 0.45, down + 0.45, ".", color="black", markersize=2)
         y += (len(keys) - 1) // WIDTH + 1.4
@@ -88,23 +100,37 @@ def draw(file: Path, cases: Mapping[str, Case], records: Iterable[Record]) -> No
     axes.set_yticks([at for at, _ in ticks], [name for _, name in ticks], fontsize=7)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-    handles = [Patch(facecolor=colour, edgecolor="#bbbbbb", label=name) for name, colour in COLOURS.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
+    handles = [
+        Patch(facecolor=colour, edgecolor="#bbbbbb", label=name) for name, colour in COLOURS.items()
+    ]
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False
+    )
     figure.savefig(file, dpi=130)
 
 
 # ---------------------------------------------------------------- the page
 def write(results: Path, cases: Mapping[str, Case], source: str) -> int:
     """Table, picture, and cases.md beside the results; 1 if nothing has been measured."""
-    of_package = [r for r in read_records(results / f"{source.partition('+')[0]}.jsonl") if r["source"] == source]
-    last = {r["key"]: r for r in of_package if r["key"] in cases and r["digest"] == digest(cases[r["key"]])}
+    of_package = [
+        r
+        for r in read_records(results / f"{source.partition('+')[0]}.jsonl")
+        if r["source"] == source
+    ]
+    last = {
+        r["key"]: r
+        for r in of_package
+        if r["key"] in cases and r["digest"] == digest(cases[r["key"]])
+    }
     records = [last[key] for key in cases if key in last]
     if not records:
         print(f"nothing has been measured with {source}: run benchmarks/stability.py first")
         return 1
     draw(FIGURES / "stability.png", cases, records)
     families = f"{table(records)}\n\n{made(source, records, cases)}"
-    PAGE.write_text(between_marks(PAGE.read_text(encoding="utf-8"), "families", families), encoding="utf-8")
+    PAGE.write_text(
+        between_marks(PAGE.read_text(encoding="utf-8"), "families", families), encoding="utf-8"
+    )
     parts = []
     for outcome in ("wrong", "warned", "unchecked"):
         said = listed(records, cases, lambda r, outcome=outcome: r["outcome"] == outcome)  # type: ignore[misc]

@@ -36,7 +36,14 @@ from remodel_fenicsx import Recording
 from remodel_fenicsx._version import __version__
 
 PROJECT = Path(__file__).resolve().parents[2]
-WANTED_FIELDS = ("deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3")
+WANTED_FIELDS = (
+    "deformation_gradient",
+    "cauchy_stress",
+    "cell_dimensions",
+    "axis_1",
+    "axis_2",
+    "axis_3",
+)
 Record = dict[str, Any]
 
 
@@ -58,7 +65,10 @@ def run_request(request: dict[str, Any]) -> Run:
     with tempfile.TemporaryDirectory(prefix="remodel-fenicsx-stability-") as name:
         folder = Path(name)
         scene, results = folder / "scene.toml", folder / "run"
-        tables = {"model": {"kinematics": "full"}, **request["scene"]}  # without it they take the cheapest kinematics
+        tables = {
+            "model": {"kinematics": "full"},
+            **request["scene"],
+        }  # without it they take the cheapest kinematics
         scene.write_text(tomlkit.dumps(tables), encoding="utf-8")
         command = ["run", str(scene), "-o", str(results), "-q"]
         with (
@@ -77,7 +87,9 @@ def run_request(request: dict[str, Any]) -> Run:
             if code == 0 and request.get("recorded"):
                 recorded, results = results / "scene.toml", folder / "again"
                 code = commanded(["run", str(recorded), "-o", str(results), "-q"], said)
-        return Run(code, said.getvalue()[-2000:], clock.perf_counter() - start, **read_results(results))
+        return Run(
+            code, said.getvalue()[-2000:], clock.perf_counter() - start, **read_results(results)
+        )
 
 
 def commanded(command: list[str], said: io.StringIO) -> Any:
@@ -102,11 +114,24 @@ sys.exit(code)
 
 def on_ranks(request: dict[str, Any], command: list[str], said: io.StringIO) -> int:
     """The exit code of a command line in processes of its own, each with the request's numbers of elements."""
-    words = ["mpirun", "--allow-run-as-root", "--oversubscribe", "-n", str(request["ranks"]), sys.executable, "-c"]
+    words = [
+        "mpirun",
+        "--allow-run-as-root",
+        "--oversubscribe",
+        "-n",
+        str(request["ranks"]),
+        sys.executable,
+        "-c",
+    ]
     words += [ON_RANKS, json.dumps(request.get("counts", {})), *command]
     environment = os.environ | {"PYTHONPATH": str(PROJECT)}
     done = subprocess.run(
-        words, capture_output=True, text=True, timeout=300, cwd=tempfile.gettempdir(), env=environment
+        words,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=tempfile.gettempdir(),
+        env=environment,
     )
     said.write(done.stderr)
     return done.returncode
@@ -117,7 +142,10 @@ def element_counts(counts: dict[str, dict[str, Any]]) -> Iterator[None]:
     """Numbers of elements other than the paper's, where meshes are made."""
     with contextlib.ExitStack() as stack:
         for name, constants in counts.items():
-            values = {key: tuple(value) if isinstance(value, list) else value for key, value in constants.items()}
+            values = {
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in constants.items()
+            }
             stack.enter_context(patch.multiple(f"remodel_fenicsx.body.{name}", **values))
         yield
 
@@ -127,7 +155,9 @@ def read_results(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {"warnings": [], "history": {}, "fields": {}}
     if (folder / "run.log").exists():
         lines = (folder / "run.log").read_text(encoding="utf-8").splitlines()
-        found["warnings"] = [re.sub(r"^.*? WARNING ", "", line) for line in lines if " WARNING " in line]
+        found["warnings"] = [
+            re.sub(r"^.*? WARNING ", "", line) for line in lines if " WARNING " in line
+        ]
     if (folder / "history.csv").exists():
         with (folder / "history.csv").open(encoding="utf-8") as file:
             rows = csv.DictReader(file)
@@ -235,7 +265,13 @@ def plain(value: Any) -> Any:
 
 def digest(case: Case) -> str:
     """Of everything that makes its result, references included: what changes is judged again."""
-    scenes = [case.scene, case.companion, dict(case.counts), dict(case.options), case.check.__name__]
+    scenes = [
+        case.scene,
+        case.companion,
+        dict(case.counts),
+        dict(case.options),
+        case.check.__name__,
+    ]
     text = json.dumps(scenes, sort_keys=True, default=plain) + judges("stability_map")
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -246,7 +282,9 @@ def judges(*rooms: str) -> str:
     files = sorted(PROJECT.glob("tests/reference/*.py"))
     files += [path for room in rooms for path in sorted(PROJECT.glob(f"benchmarks/{room}/*.py"))]
     apart = ("command", "report", "running")
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files if path.stem not in apart)).hexdigest()
+    return hashlib.sha256(
+        b"".join(path.read_bytes() for path in files if path.stem not in apart)
+    ).hexdigest()
 
 
 def source_of() -> str:
@@ -260,12 +298,18 @@ def source_of() -> str:
 # ---------------------------------------------------------------- many of them
 def parser_of(description: str | None, limit: float, results: str) -> argparse.ArgumentParser:
     """The options that both commands have; seconds and the name of the results' folder are their defaults."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--again", action="store_true", help="run also what has been measured")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="at a time (all cores)")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="at a time (all cores)"
+    )
     words = f"of processor time for one scene ({limit:g})"
     parser.add_argument("--limit", type=float, default=limit, metavar="SECONDS", help=words)
-    parser.add_argument("--results", type=Path, default=PROJECT / "results" / results, help="folder of the results")
+    parser.add_argument(
+        "--results", type=Path, default=PROJECT / "results" / results, help="folder of the results"
+    )
     return parser
 
 
@@ -288,7 +332,10 @@ def measure(
         finally:
             free.put(runner)
 
-    with file_of(options, source).open("a", encoding="utf-8") as out, ThreadPoolExecutor(options.jobs) as pool:
+    with (
+        file_of(options, source).open("a", encoding="utf-8") as out,
+        ThreadPoolExecutor(options.jobs) as pool,
+    ):
         waiting = {pool.submit(done, job): key for key, job in jobs.items()}
         try:
             for number, future in enumerate(as_completed(waiting), start=1):
@@ -296,10 +343,16 @@ def measure(
                 out.write(json.dumps(record) + "\n")
                 out.flush()
                 left = (clock.monotonic() - start) / number * (len(jobs) - number)
-                print(f"[{number}/{len(jobs)}, {left / 60:.0f} min left] {said(record)}", file=sys.stderr, flush=True)
+                print(
+                    f"[{number}/{len(jobs)}, {left / 60:.0f} min left] {said(record)}",
+                    file=sys.stderr,
+                    flush=True,
+                )
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
-            print("stopped; what has been measured is kept, the same command goes on", file=sys.stderr)
+            print(
+                "stopped; what has been measured is kept, the same command goes on", file=sys.stderr
+            )
     for runner in runners:
         runner.close()
     return found

@@ -70,7 +70,12 @@ table(
 # the thick tube towards incompressibility, and the cube, where nothing may change
 SELECTIVE = {"mesh.formulation": "selective-integration"}
 HEXAHEDRA = [name for name in bodies.MESHES if name.startswith("hex")]
-table("selective integration", bodies.thick_wall, {"mesh": HEXAHEDRA, "lambda/mu": bodies.RATIOS}, SELECTIVE)
+table(
+    "selective integration",
+    bodies.thick_wall,
+    {"mesh": HEXAHEDRA, "lambda/mu": bodies.RATIOS},
+    SELECTIVE,
+)
 table(
     "selective integration", bodies.tube_case, {"chains": ("yes",), "lambda/mu": (0.1, 8.8, 100.0, 1e3, 1e4)},
     {**SELECTIVE, "loads.pressure.value": 2.4, "mesh.degree": 1}, more=bodies.LONG,
@@ -81,14 +86,21 @@ table(
 )  # fmt: skip
 
 # Remark 5's rotation and the continuous pairing under loads along three axes; random cells
-METHODS = {"rotation": {"remodeling.law": "rotation"}, "continuous": {"remodeling.pairing": "continuous"}}
+METHODS = {
+    "rotation": {"remodeling.law": "rotation"},
+    "continuous": {"remodeling.pairing": "continuous"},
+}
 
 
 def block_and_half_step(family: str, changes: Values, place: Place, **more: Any) -> Case:
     """A block and the same with half of its step."""
-    case = partial(cube.case_of_shape, "block", bodies.check_half_step, family, reference=SAME_MESH, **more)
+    case = partial(
+        cube.case_of_shape, "block", bodies.check_half_step, family, reference=SAME_MESH, **more
+    )
     scene = case(changes, place).scene
-    return case(changes, place, companion=with_values(scene, {"time.step": scene["time"]["step"] / 2}))
+    return case(
+        changes, place, companion=with_values(scene, {"time.step": scene["time"]["step"] / 2})
+    )
 
 
 table(

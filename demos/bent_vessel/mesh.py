@@ -15,7 +15,11 @@ import numpy as np
 
 RADII = (1.5, 1.8, 2.1)  # mm, at the inlet: lumen, between the layers, outside
 LAYERS = ("media", "adventitia")
-LENGTH, BEND, TAPER = 12.0, 60.0, 0.85  # mm along the middle, degrees, size of the outlet over that of the inlet
+LENGTH, BEND, TAPER = (
+    12.0,
+    60.0,
+    0.85,
+)  # mm along the middle, degrees, size of the outlet over that of the inlet
 AROUND, THROUGH, ALONG = 24, 2, 16  # elements around, in each layer, along
 
 
@@ -24,7 +28,9 @@ def straight() -> None:
     occ = gmsh.model.occ
     quarters = []
     for inner, outer in zip(RADII, RADII[1:], strict=False):
-        ring = occ.cut([(2, occ.addDisk(0, 0, 0, outer, outer))], [(2, occ.addDisk(0, 0, 0, inner, inner))])[0]
+        ring = occ.cut(
+            [(2, occ.addDisk(0, 0, 0, outer, outer))], [(2, occ.addDisk(0, 0, 0, inner, inner))]
+        )[0]
         boxes = [
             (2, occ.addRectangle(min(0, x * outer), min(0, y * outer), 0, outer, outer))
             for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))

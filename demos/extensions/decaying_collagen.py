@@ -35,7 +35,9 @@ class DecayingContent(Remodels):
 
     def __init__(self, state, tissue, remodeling):
         if tissue.content is not None:
-            raise SceneError(f"remodeling.decay.rate = {remodeling.decay.rate}: must be 0 with remodeling.turnover")
+            raise SceneError(
+                f"remodeling.decay.rate = {remodeling.decay.rate}: must be 0 with remodeling.turnover"
+            )
         self.state, self.slowest, self.fastest = state, remodeling.decay.rate, remodeling.decay.rate
         self.content = state.cells.quadrature.function("decaying_content", ())
         self.content.x.array[:] = self.last = self.next = 1.0
@@ -44,7 +46,9 @@ class DecayingContent(Remodels):
 
     def before(self, time, order):
         """Take the content at the end of the step."""
-        self.last, self.next = (math.exp(-self.fastest * moment) for moment in (self.state.time, time))
+        self.last, self.next = (
+            math.exp(-self.fastest * moment) for moment in (self.state.time, time)
+        )
         self.set_part(1.0)
 
     def set_part(self, fraction):

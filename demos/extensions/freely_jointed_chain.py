@@ -31,6 +31,8 @@ CHAINS["freely-jointed"] = Chain(
     energy,
     stiffness,
     parameters={
-        "links_per_persistence_length": Parameter(0.5, "A_p/b, with the length b of a free link.", exclusive_minimum=0),
+        "links_per_persistence_length": Parameter(
+            0.5, "A_p/b, with the length b of a free link.", exclusive_minimum=0
+        ),
     },
 )

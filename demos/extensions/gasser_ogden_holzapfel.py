@@ -20,18 +20,28 @@ import ufl
 from remodel_fenicsx.extend import MATRICES, Matrix, Parameter, neo_hookean
 
 
-def families(F: Any, lame_lambda: Any, mu: Any, fibre_stiffness: Any, fibre_exponent: Any, **more: Any) -> Any:
+def families(
+    F: Any, lame_lambda: Any, mu: Any, fibre_stiffness: Any, fibre_exponent: Any, **more: Any
+) -> Any:
     """The energy of both, of F in UFL or of arrays (..., 3, 3)."""
     on_arrays = isinstance(F, np.ndarray)
     C = np.moveaxis(np.swapaxes(F, -1, -2) @ F, (-2, -1), (0, 1)) if on_arrays else F.T * F
-    math, angle, dispersion = np if on_arrays else ufl, more["family_angle"] * np.pi / 180, more["dispersion"]
+    math, angle, dispersion = (
+        np if on_arrays else ufl,
+        more["family_angle"] * np.pi / 180,
+        more["dispersion"],
+    )
     energy = 0.0
     for side in (-1.0, 1.0):
         c, s = math.cos(angle), side * math.sin(angle)
         along = c**2 * C[1, 1] + 2 * c * s * C[1, 2] + s**2 * C[2, 2]
         strain = dispersion * (C[0, 0] + C[1, 1] + C[2, 2]) + (1 - 3 * dispersion) * along - 1
-        pulled = np.maximum(strain, 0) if on_arrays else (strain + abs(strain)) / 2  # arrays may be complex
-        energy += fibre_stiffness / (2 * fibre_exponent) * (math.exp(fibre_exponent * pulled**2) - 1)
+        pulled = (
+            np.maximum(strain, 0) if on_arrays else (strain + abs(strain)) / 2
+        )  # arrays may be complex
+        energy += (
+            fibre_stiffness / (2 * fibre_exponent) * (math.exp(fibre_exponent * pulled**2) - 1)
+        )
     return energy
 
 

@@ -17,7 +17,9 @@ from remodel_fenicsx.extend import LAWS, Parameter
 GAS_CONSTANT = 8.314  # J/(mol K)
 
 
-def arrhenius(kappa: float, temperature: float, activation_energy: float, reference_temperature: float) -> float:
+def arrhenius(
+    kappa: float, temperature: float, activation_energy: float, reference_temperature: float
+) -> float:
     """The kappa that acts at a temperature."""
     colder = 1 / temperature - 1 / reference_temperature
     return kappa * math.exp(-activation_energy / GAS_CONSTANT * colder)

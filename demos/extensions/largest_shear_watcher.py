@@ -34,7 +34,9 @@ class ShearWarning(WarnsOnce):
         found = largest_shear(self.state.deformation_gradient()).reshape(self.quadrature.shape)
         if (most := self.quadrature.maximum(found)) <= LIMIT:
             return ""
-        place = ", ".join(f"{coordinate:.3g}" for coordinate in self.quadrature.argmax_position(found))
+        place = ", ".join(
+            f"{coordinate:.3g}" for coordinate in self.quadrature.argmax_position(found)
+        )
         return f"right angles change by up to {most:.3g} degrees, most at ({place}); the limit is {LIMIT:g}"
 
 

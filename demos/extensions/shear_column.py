@@ -20,5 +20,9 @@ def max_shear_strain(measurement: Measurement) -> float:
 
 
 COLUMNS["max_shear_strain"] = Column(
-    "max_shear_strain", "", "largest difference of principal strains in the body", max_shear_strain, extreme=True
+    "max_shear_strain",
+    "",
+    "largest difference of principal strains in the body",
+    max_shear_strain,
+    extreme=True,
 )

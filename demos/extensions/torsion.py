@@ -12,7 +12,11 @@ def add_torsion(shape, loading, name):
     def turned(angle, places):
         x, y, _ = places.T
         cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-        return np.stack([cosine * x - sine * y, sine * x + cosine * y, 0 * x], axis=1) - places * [1.0, 1.0, 0.0]
+        return np.stack([cosine * x - sine * y, sine * x + cosine * y, 0 * x], axis=1) - places * [
+            1.0,
+            1.0,
+            0.0,
+        ]
 
     for component in (0, 1):
         loading.hold_face("bottom", component)
@@ -25,5 +29,14 @@ def shear_stress(m):
     return m.quadrature.mean(np.einsum("...i,...ij,...j->...", circumferential, m.stress, axial))
 
 
-Tube.loads["torsion"] = LoadKind(add_torsion, "angle in degrees by which the end z = `length` is turned about z")
-Tube.columns += (Column("shear_stress", "stress", "mean shear stress between circumferential and axial", shear_stress),)
+Tube.loads["torsion"] = LoadKind(
+    add_torsion, "angle in degrees by which the end z = `length` is turned about z"
+)
+Tube.columns += (
+    Column(
+        "shear_stress",
+        "stress",
+        "mean shear stress between circumferential and axial",
+        shear_stress,
+    ),
+)

@@ -15,7 +15,10 @@ import numpy as np
 
 TRUNK, BRANCH = (1.6, 2.0, 2.4), (1.2, 1.5, 1.8)  # mm: lumen, between the layers, outside
 LAYERS = ("media", "adventitia")
-LENGTH, HALF_ANGLE = 7.0, 25.0  # mm of each leg from the fork, degrees between a branch and the trunk's axis
+LENGTH, HALF_ANGLE = (
+    7.0,
+    25.0,
+)  # mm of each leg from the fork, degrees between a branch and the trunk's axis
 SIZE = 0.85  # mm, of an element
 
 Vector = np.ndarray

@@ -29,7 +29,13 @@ def draw() -> int:
 
 def name_faces() -> None:
     """Round faces lie against the posts; lower and upper face are plane across z, the others are the sides."""
-    faces: dict[str, list[int]] = {"left_post": [], "right_post": [], "bottom": [], "top": [], "sides": []}
+    faces: dict[str, list[int]] = {
+        "left_post": [],
+        "right_post": [],
+        "bottom": [],
+        "top": [],
+        "sides": [],
+    }
     for _, surface in gmsh.model.getEntities(2):
         x, _, z = gmsh.model.occ.getCenterOfMass(2, surface)
         if gmsh.model.getType(2, surface) == "Cylinder":

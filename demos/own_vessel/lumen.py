@@ -19,15 +19,21 @@ AROUND, ALONG = 32, 40
 
 def main(path: str) -> None:
     """A grid of triangles around an arc, which begins at the origin along z."""
-    turn, around = np.meshgrid(np.linspace(0, np.radians(BEND), ALONG), 2 * np.pi * np.arange(AROUND) / AROUND)
+    turn, around = np.meshgrid(
+        np.linspace(0, np.radians(BEND), ALONG), 2 * np.pi * np.arange(AROUND) / AROUND
+    )
     middle = LENGTH / np.radians(BEND)
     radius = RADIUS * (1 - NARROWING * turn / turn.max()) * (1 + OVAL * np.sin(2 * around))
     across = middle + radius * np.cos(around)
-    places = np.stack([across * np.cos(turn) - middle, radius * np.sin(around), across * np.sin(turn)], axis=-1)
+    places = np.stack(
+        [across * np.cos(turn) - middle, radius * np.sin(around), across * np.sin(turn)], axis=-1
+    )
     number = np.arange(AROUND * ALONG).reshape(AROUND, ALONG)
     a, b = number[:, :-1], np.roll(number, -1, axis=0)[:, :-1]
     c, d = a + 1, b + 1
-    triangles = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, d), (a, d, c))])
+    triangles = np.concatenate(
+        [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, d), (a, d, c))]
+    )
     meshio.Mesh(places.reshape(-1, 3), [("triangle", triangles)]).write(path)
 
 

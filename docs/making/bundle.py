@@ -21,13 +21,25 @@ from pathlib import Path
 ASSETS = Path(__file__).parents[2] / "remodel_fenicsx" / "report" / "assets"
 VENDOR = ASSETS / "VENDOR.toml"
 BUNDLES = ("report.bundle.js", "report.bundle.css")
-OPTIONS = ("--bundle", "--minify", "--format=iife", "--global-name=LIBRARIES", "--target=es2022", "--log-level=warning")
+OPTIONS = (
+    "--bundle",
+    "--minify",
+    "--format=iife",
+    "--global-name=LIBRARIES",
+    "--target=es2022",
+    "--log-level=warning",
+)
 
 
 def fetched(name: str, version: str, integrity: str, folder: Path) -> Path:
     """A package of npm's, unpacked in the folder, if it is the one that is meant."""
     command = ["npm", "pack", "--silent", f"{name}@{version}"]
-    file = folder / subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout.split()[-1]
+    file = (
+        folder
+        / subprocess.run(
+            command, cwd=folder, check=True, capture_output=True, text=True
+        ).stdout.split()[-1]
+    )
     found = "sha512-" + base64.b64encode(hashlib.sha512(file.read_bytes()).digest()).decode()
     if found != integrity:
         sys.exit(f"{name} {version}: is {found}, VENDOR.toml has {integrity}")
@@ -56,7 +68,9 @@ def built(folder: Path) -> dict[str, bytes]:
 def check() -> bool:
     """Whether the bundles are what the packages give."""
     with tempfile.TemporaryDirectory() as folder:
-        return all(data == (ASSETS / name).read_bytes() for name, data in built(Path(folder)).items())
+        return all(
+            data == (ASSETS / name).read_bytes() for name, data in built(Path(folder)).items()
+        )
 
 
 def make(keep: bool) -> None:

@@ -26,7 +26,13 @@ VARIANTS: dict[str, tuple[str, float, str, str]] = {
     "twice": ("consistent", 2.0, r"consistent, $2\kappa$", COLOURS[2]),
 }
 KAPPAS = (0.01, 0.025, 0.05, 0.1)  # of Fig. 5
-LOADS = {"10_0": (0.1, 0.0), "10_2.4": (0.1, 2.4), "10_4.8": (0.1, 4.8), "5_4.8": (0.05, 4.8), "0_4.8": (0.0, 4.8)}
+LOADS = {
+    "10_0": (0.1, 0.0),
+    "10_2.4": (0.1, 2.4),
+    "10_4.8": (0.1, 4.8),
+    "5_4.8": (0.05, 4.8),
+    "0_4.8": (0.0, 4.8),
+}
 DRIVERS = ("pk2", "finger")
 CAPTION = (
     "The consistent law beside the paper's",
@@ -41,16 +47,26 @@ def run(variant: str, shape: str, kinematics: str, **values: Any) -> tuple[Colum
     """Columns, and means over the layers of the wall of the fibre angle at the end (of a tube)."""
     preset, factor, *_ = VARIANTS[variant]
     kappa = factor * values.pop("remodeling.kappa", KAPPA)
-    changes = {"model.kinematics": kinematics, "output.fields": False, "time.end": END, "remodeling.kappa": kappa}
+    changes = {
+        "model.kinematics": kinematics,
+        "output.fields": False,
+        "time.end": END,
+        "remodeling.kappa": kappa,
+    }
     print(variant, shape, values, flush=True)
     with made(preset_scene(preset, shape).with_values(changes | values)) as simulation:
         steps = list(simulation.steps())
         columns = {name: np.array([step.row[name] for step in steps]) for name in steps[0].row}
         if shape != "tube":
             return columns, np.zeros(0)
-        angle, volume = Measurement(simulation.observer, steps[-1]).fibre_angle, simulation.quadrature.volumes
+        angle, volume = (
+            Measurement(simulation.observer, steps[-1]).fibre_angle,
+            simulation.quadrature.volumes,
+        )
         layer = np.digitize(simulation.quadrature.coordinates[..., 0], EDGES) - 1
-    return columns, np.array([np.average(angle[layer == k], weights=volume[layer == k]) for k in range(8)])
+    return columns, np.array(
+        [np.average(angle[layer == k], weights=volume[layer == k]) for k in range(8)]
+    )
 
 
 def histories() -> Columns:
@@ -75,9 +91,13 @@ def artery() -> tuple[Columns, Columns]:
             loads = {"loads.elongation.value": elongation, "loads.pressure.value": pressure}
             columns, layers[f"{case}_{variant}"] = run(variant, "tube", "radial", **ray, **loads)
             if case == "10_4.8":
-                history |= {f"{face}_{variant}": columns[f"{face}_radius"] for face in ("inner", "outer")}
+                history |= {
+                    f"{face}_{variant}": columns[f"{face}_radius"] for face in ("inner", "outer")
+                }
         for driver in DRIVERS:
-            layers[f"{driver}_{variant}"] = run(variant, "tube", "radial", **ray, **{"remodeling.driver": driver})[1]
+            layers[f"{driver}_{variant}"] = run(
+                variant, "tube", "radial", **ray, **{"remodeling.driver": driver}
+            )[1]
     return history, layers
 
 
@@ -105,7 +125,9 @@ def draw(table: Columns, layers: Columns, tendon: Columns) -> Figure:
 # ---------------------------------------------------------------- the numbers on the page
 def page_values(folder: Path) -> dict[str, str]:
     """What the page shows of the tables."""
-    table, layers = (read_table(folder / f"{name}.csv") for name in ("consistent", "consistent-layers"))
+    table, layers = (
+        read_table(folder / f"{name}.csv") for name in ("consistent", "consistent-layers")
+    )
     found: dict[str, str] = {}
     for variant in ("once", "twice"):
         # at the same time of the cells: a row of the printed method has those of the step before
@@ -128,6 +150,8 @@ def make(keep: bool) -> None:
         history, layers = artery()
         page.save_table(table | history, [source])
         page.save_table(layers, [source], "layers")
-    tables = (read_table(FIGURES / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6"))
+    tables = (
+        read_table(FIGURES / f"{name}.csv") for name in ("consistent", "consistent-layers", "fig6")
+    )
     drawn(page, draw, *tables, made=source)
     write_page()

@@ -22,7 +22,14 @@ from mpi4py import MPI
 import remodel_fenicsx
 from remodel_fenicsx import cli, extend, parts
 from docs.making.pages import DOCS, markdown
-from remodel_fenicsx.body.shape import COLUMNS_ON_REQUEST, Column, Shape, WithRegions, columns_of, columns_on_request
+from remodel_fenicsx.body.shape import (
+    COLUMNS_ON_REQUEST,
+    Column,
+    Shape,
+    WithRegions,
+    columns_of,
+    columns_on_request,
+)
 from remodel_fenicsx.schema.tables import Table
 from remodel_fenicsx.solver.attempts import ATTEMPTS
 
@@ -53,11 +60,15 @@ def page() -> str:
 def schema() -> str:
     """docs/scene.schema.json, as the command prints it."""
     command = [sys.executable, "-m", "remodel_fenicsx.cli", "schema"]
-    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=DOCS.parent).stdout
+    return subprocess.run(
+        command, capture_output=True, text=True, check=True, cwd=DOCS.parent
+    ).stdout
 
 
 def _wrapped(lines: Iterable[str], indent: str = "  ") -> str:
-    return "\n".join(textwrap.fill(line, 100, subsequent_indent=indent, break_on_hyphens=False) for line in lines)
+    return "\n".join(
+        textwrap.fill(line, 100, subsequent_indent=indent, break_on_hyphens=False) for line in lines
+    )
 
 
 # ---------------------------------------------------------------- names
@@ -81,12 +92,28 @@ def _module(module: ModuleType, seen: dict[int, str]) -> Iterator[str]:
 
 def described(kind: type) -> Iterator[str]:
     """How it is made, its attributes and methods without those of a public base."""
-    public = {value for module in MODULES for name in module.__all__ if inspect.isclass(value := getattr(module, name))}
-    lineage = [base for base in kind.__mro__ if base.__module__.startswith("remodel_fenicsx.") and base is not Table]
+    public = {
+        value
+        for module in MODULES
+        for name in module.__all__
+        if inspect.isclass(value := getattr(module, name))
+    }
+    lineage = [
+        base
+        for base in kind.__mro__
+        if base.__module__.startswith("remodel_fenicsx.") and base is not Table
+    ]
     bases = [base for base in lineage[1:] if base in public]
     own = [owner for owner in lineage if not any(issubclass(base, owner) for base in bases)]
-    fields = {field.name for field in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set[str]()
-    fields |= {*getattr(kind, "_fields", ()), *getattr(kind, "model_fields", ())}  # of a tuple, of a table
+    fields = (
+        {field.name for field in dataclasses.fields(kind)}
+        if dataclasses.is_dataclass(kind)
+        else set[str]()
+    )
+    fields |= {
+        *getattr(kind, "_fields", ()),
+        *getattr(kind, "model_fields", ()),
+    }  # of a tuple, of a table
     members: dict[str, str] = {}
     for owner in reversed(own):
         members |= {name: name for name in _documented(owner)}
@@ -98,13 +125,19 @@ def described(kind: type) -> Iterator[str]:
         made = _parameters(kind)
     yield f"class {kind.__name__}{made}" + (f"  # a {bases[0].__name__}" if bases else "")
     hidden = {"model_config", *fields}
-    yield from (f"    {members[name]}" for name in sorted(members) if name not in hidden and not name.startswith("_"))
+    yield from (
+        f"    {members[name]}"
+        for name in sorted(members)
+        if name not in hidden and not name.startswith("_")
+    )
 
 
 def _documented(kind: type) -> list[str]:
     """Names in the section "Attributes" of a docstring."""
     text = inspect.cleandoc(vars(kind).get("__doc__") or "")
-    section = re.search(r"^Attributes\n-+\n(.*?)(?=\n\w[\w ]*\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE)
+    section = re.search(
+        r"^Attributes\n-+\n(.*?)(?=\n\w[\w ]*\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE
+    )
     heads = re.findall(r"^(\w[^:\n]*)", section[1], re.MULTILINE) if section else []
     return [name.strip() for head in heads for name in head.split(",")]
 
@@ -118,7 +151,11 @@ def _parameters(function: Any) -> str:
     parameters = [
         parameter.replace(
             annotation=parameter.empty,
-            default=parameter.empty if parameter.default is parameter.empty else _Default(parameter.default),
+            default=(
+                parameter.empty
+                if parameter.default is parameter.empty
+                else _Default(parameter.default)
+            ),
         )
         for name, parameter in signature.parameters.items()
         if name not in ("self", "cls")
@@ -130,8 +167,14 @@ class _Default:
     """A default as a reader knows it."""
 
     def __init__(self, value: Any):
-        plain = repr(value) if value is None or isinstance(value, (bool, int, float, str, tuple)) else "..."
-        self.text = "MPI.COMM_WORLD" if isinstance(value, MPI.Comm) else getattr(value, "__name__", plain)
+        plain = (
+            repr(value)
+            if value is None or isinstance(value, (bool, int, float, str, tuple))
+            else "..."
+        )
+        self.text = (
+            "MPI.COMM_WORLD" if isinstance(value, MPI.Comm) else getattr(value, "__name__", plain)
+        )
 
     def __repr__(self) -> str:
         return self.text
@@ -139,7 +182,9 @@ class _Default:
 
 # ---------------------------------------------------------------- the rest
 def _commands(parser: argparse.ArgumentParser) -> Iterator[str]:
-    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    (commands,) = (
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    )
     yield " ".join([parser.prog, *_arguments(parser)])
     for listed in commands._choices_actions:  # those with a help text
         yield " ".join([parser.prog, listed.dest, *_arguments(commands.choices[listed.dest])])
@@ -169,7 +214,9 @@ def of_shape(kind: type[Shape]) -> tuple[list[Column], list[Column]]:
 
 def attempts_table() -> str:
     """What is tried where a solve fails, in its order."""
-    rows = ((str(number), one.what, f"`{one.where}`") for number, one in enumerate(ATTEMPTS, start=1))
+    rows = (
+        (str(number), one.what, f"`{one.where}`") for number, one in enumerate(ATTEMPTS, start=1)
+    )
     return markdown(("", "what", "where"), rows)
 
 
@@ -184,14 +231,20 @@ def columns_table() -> str:
     always = sorted(found[0].items(), key=lambda item: item[1] != everywhere)
     rows = [(key, "all" if shapes == everywhere else ", ".join(shapes)) for key, shapes in always]
     rows += [(key, f"{', '.join(shapes)}, on request") for key, shapes in found[1].items()]
-    rows += [((column.name, column.unit, column.meaning), "on request") for column in COLUMNS_ON_REQUEST.values()]
+    rows += [
+        ((column.name, column.unit, column.meaning), "on request")
+        for column in COLUMNS_ON_REQUEST.values()
+    ]
     cells = (
-        [", ".join(f"`{name}`" for name in names), of, unit, meaning] for names, of, unit, meaning in together(rows)
+        [", ".join(f"`{name}`" for name in names), of, unit, meaning]
+        for names, of, unit, meaning in together(rows)
     )
     return markdown(["column", "of", "unit", "meaning"], cells)
 
 
-def together(rows: Iterable[tuple[tuple[str, str, str], str]]) -> Iterator[tuple[list[str], str, str, str]]:
+def together(
+    rows: Iterable[tuple[tuple[str, str, str], str]],
+) -> Iterator[tuple[list[str], str, str, str]]:
     """Columns of one quantity at several places in one row: those with one stem whose meanings are nearly the same."""
 
     def stem(row: tuple[tuple[str, str, str], str]) -> tuple[str, str, str]:
@@ -205,7 +258,9 @@ def together(rows: Iterable[tuple[tuple[str, str, str], str]]) -> Iterator[tuple
         if one is not None:
             yield names, of, unit, one
         else:
-            yield from (([name], of, unit, meaning) for name, meaning in zip(names, meanings, strict=True))
+            yield from (
+                ([name], of, unit, meaning) for name, meaning in zip(names, meanings, strict=True)
+            )
 
 
 def one_meaning(meanings: list[str]) -> str | None:

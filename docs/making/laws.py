@@ -55,14 +55,20 @@ class CompareLaw:
 
 LAWS = {
     "explicit": CompareLaw("eq. (11), as printed", {}, COLOURS[0]),
-    "explicit-continuous": CompareLaw("eq. (11), continuous", {"pairing": "continuous"}, COLOURS[0], "--"),
+    "explicit-continuous": CompareLaw(
+        "eq. (11), continuous", {"pairing": "continuous"}, COLOURS[0], "--"
+    ),
     "rate": CompareLaw("eq. (10)", {"law": "rate"}, COLOURS[2]),
-    "rate-continuous": CompareLaw("eq. (10), continuous", {"law": "rate", "pairing": "continuous"}, COLOURS[2], "--"),
+    "rate-continuous": CompareLaw(
+        "eq. (10), continuous", {"law": "rate", "pairing": "continuous"}, COLOURS[2], "--"
+    ),
     "relaxation": CompareLaw("relaxation", {"law": "relaxation"}, COLOURS[3]),
     "relaxation-continuous": CompareLaw(
         "relaxation, continuous", {"law": "relaxation", "pairing": "continuous"}, COLOURS[3], "--"
     ),
-    "rotation": CompareLaw("rotation (Remark 5)", {"law": "rotation", "rotation_time": 40.0}, COLOURS[1]),
+    "rotation": CompareLaw(
+        "rotation (Remark 5)", {"law": "rotation", "rotation_time": 40.0}, COLOURS[1]
+    ),
 }
 
 
@@ -111,12 +117,17 @@ def history(case: Case, law: CompareLaw, **changes: Any) -> Iterator[dict[str, f
     """`COLUMNS` of every step of a run; a run that cannot go on ends early."""
     Cube.loads["sideways"] = SIDEWAYS
     values = {"preset": "kuhl-holzapfel-2007", "remodeling": {"frame": "material", **law.values}}
-    scene = Scene(**values, **case.scene, output={"columns": ["pass_residual"]}).with_values(changes)
+    scene = Scene(**values, **case.scene, output={"columns": ["pass_residual"]}).with_values(
+        changes
+    )
     names = ("time", case.angle, case.size, "pass_residual", "newton_iterations", "substeps")
     with made(scene, case.domain() if case.domain else None) as simulation:
         try:
             for step in simulation.steps():
-                yield {column: float(step.row[name]) for column, name in zip(COLUMNS, names, strict=True)}
+                yield {
+                    column: float(step.row[name])
+                    for column, name in zip(COLUMNS, names, strict=True)
+                }
         except StepFailure as failure:
             print(f"laws: {failure}", file=sys.stderr)
 
@@ -144,9 +155,13 @@ def comparison() -> str:
 
     def shown(case: str, law: str) -> str:
         found = runs[case, law]
-        return f"{found['angle'][-1]:.1f}°, {found['size'][-1]:.3f}, {found['change'][1:].max():.3f}"
+        return (
+            f"{found['angle'][-1]:.1f}°, {found['size'][-1]:.3f}, {found['change'][1:].max():.3f}"
+        )
 
-    rows = ([settings.label, *(shown(case, law) for case in CASES)] for law, settings in LAWS.items())
+    rows = (
+        [settings.label, *(shown(case, law) for case in CASES)] for law, settings in LAWS.items()
+    )
     return markdown(["law", *(case.label for case in CASES.values())], rows)
 
 
@@ -172,10 +187,14 @@ def draw(runs: dict[tuple[str, str], Columns]) -> Figure:
     return figure
 
 
-def _curves(axes: Axes, runs: dict[tuple[str, str], Columns], case: str, what: str, label: str) -> None:
+def _curves(
+    axes: Axes, runs: dict[tuple[str, str], Columns], case: str, what: str, label: str
+) -> None:
     for name, law in LAWS.items():
         found = runs[case, name]
-        axes.plot(found["time"], found[what], color=law.colour, ls=law.line, lw=1.3, label=law.label)
+        axes.plot(
+            found["time"], found[what], color=law.colour, ls=law.line, lw=1.3, label=law.label
+        )
     axes.set(xlabel="time $t$", ylabel=label, xlim=(0, None), title=CASES[case].label)
 
 

@@ -77,7 +77,9 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     """Columns of a table that `Page.save_table` wrote: numbers, or text where one of them is none."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(line for line in file if not line.startswith("#")))
-    return {name: _as_numbers([row[index] for row in rows[1:]]) for index, name in enumerate(rows[0])}
+    return {
+        name: _as_numbers([row[index] for row in rows[1:]]) for index, name in enumerate(rows[0])
+    }
 
 
 def _as_numbers(values: list[str]) -> np.ndarray:
@@ -90,11 +92,15 @@ def _as_numbers(values: list[str]) -> np.ndarray:
 def rows_of(path: Path) -> list[dict[str, Any]]:
     """Rows of a table, numbers where they are."""
     columns = read_table(path)
-    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+    return [
+        dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
+    ]
 
 
 # ---------------------------------------------------------------- pictures
-def drawn(page: Page, draw: Callable[..., Figure], *tables: Any, made: str = "", **style: Any) -> None:
+def drawn(
+    page: Page, draw: Callable[..., Figure], *tables: Any, made: str = "", **style: Any
+) -> None:
     """Save what a function draws of tables; 256 colours are enough, and a third of the bytes."""
     with rc_context(STYLE | style):
         page.save_figure(draw(*tables), made or made_with())
@@ -104,7 +110,9 @@ def drawn(page: Page, draw: Callable[..., Figure], *tables: Any, made: str = "",
         for key, value in picture.info.items():
             if isinstance(value, str):
                 about.add_text(key, value)
-        small = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE)
+        small = picture.convert("RGB").quantize(
+            256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE
+        )
     small.save(path, pnginfo=about, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
 
 

@@ -54,7 +54,9 @@ class Setting:
     front: tuple[float, float] = (1.7, 2.0)
 
 
-LOAD_CASES = tuple(Setting(*loads) for loads in ((0.1, 0.0), (0.1, 2.4), (0.1, 4.8), (0.05, 4.8), (0.0, 4.8)))  # Fig. 9
+LOAD_CASES = tuple(
+    Setting(*loads) for loads in ((0.1, 0.0), (0.1, 2.4), (0.1, 4.8), (0.05, 4.8), (0.0, 4.8))
+)  # Fig. 9
 PK2 = Setting(driver="pk2", planes=True, divisions=(8, 8, 1))
 FINGER = Setting(driver="finger", planes=True, divisions=(48, 16, 1), degree=1, end=120.0)
 PK2_FREE = Setting(driver="pk2", divisions=(8, 8, 1), end=60.0)
@@ -104,21 +106,34 @@ def hold_symmetry_planes(simulation: Simulation) -> None:
             (subspace, subspace.collapse()[0]), lambda x, i=component: np.abs(x[i]) < 1e-9
         )
         value = dolfinx.fem.Constant(simulation.domain.mesh, zero)
-        simulation.loading.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs[0], subspace))
+        simulation.loading.boundary_conditions.append(
+            dolfinx.fem.dirichletbc(value, dofs[0], subspace)
+        )
 
 
 @lru_cache(maxsize=None)
 def finite_elements(setting: Setting) -> Run:
     """The run of a setting."""
-    domain = tube(1.0, 3.0, LENGTH, degree=setting.degree, divisions=setting.divisions, comm=MPI.COMM_SELF)
+    domain = tube(
+        1.0, 3.0, LENGTH, degree=setting.degree, divisions=setting.divisions, comm=MPI.COMM_SELF
+    )
     simulation = Simulation(scene(setting), MPI.COMM_SELF, domain)
     if setting.planes:
         hold_symmetry_planes(simulation)
     steps = list(simulation.steps())
-    inner, outer = (np.array([step.row[f"{face}_radius"] for step in steps]) for face in ("inner", "outer"))
-    angle, x = Measurement(simulation.observer, steps[-1]).fibre_angle, simulation.quadrature.coordinates
+    inner, outer = (
+        np.array([step.row[f"{face}_radius"] for step in steps]) for face in ("inner", "outer")
+    )
+    angle, x = (
+        Measurement(simulation.observer, steps[-1]).fibre_angle,
+        simulation.quadrature.coordinates,
+    )
     return Run(
-        inner, outer, np.hypot(x[..., 0], x[..., 1]).ravel(), angle.ravel(), simulation.quadrature.volumes.ravel()
+        inner,
+        outer,
+        np.hypot(x[..., 0], x[..., 1]).ravel(),
+        angle.ravel(),
+        simulation.quadrature.volumes.ravel(),
     )
 
 

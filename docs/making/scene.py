@@ -20,7 +20,8 @@ def page() -> str:
     words = {"keys": markdown_reference(Scene).rstrip(), "presets": "\n".join(_presets()).rstrip()}
     rows = {"units": _units(), "loads": _loads(), "profiles": _profiles()}
     return filled(
-        Path(__file__).with_name("scene.template.md"), words | {name: lines(found) for name, found in rows.items()}
+        Path(__file__).with_name("scene.template.md"),
+        words | {name: lines(found) for name, found in rows.items()},
     )
 
 
@@ -36,13 +37,23 @@ def _keys_with_units() -> Iterator[tuple[str, Dimension]]:
 
 def _units() -> Iterator[list[str]]:
     """A row for each dimension that a key of a scene has; regions have those of their tables."""
-    loads = {name: kind.dimension for shape in SHAPES.values() for name, kind in shape.loads.items() if kind.dimension}
+    loads = {
+        name: kind.dimension
+        for shape in SHAPES.values()
+        for name, kind in shape.loads.items()
+        if kind.dimension
+    }
     keys: dict[Dimension, list[str]] = {}
-    for key, dimension in (*_keys_with_units(), *((f"loads.{name}.value", unit) for name, unit in loads.items())):
+    for key, dimension in (
+        *_keys_with_units(),
+        *((f"loads.{name}.value", unit) for name, unit in loads.items()),
+    ):
         if not key.startswith("regions.NAME.material."):
             keys.setdefault(dimension, []).append(f"`{key}`")
     for dimension, names in keys.items():
-        unit = " ".join(f"{name}^{power}" if power != 1 else name for name, power in dimension.powers)
+        unit = " ".join(
+            f"{name}^{power}" if power != 1 else name for name, power in dimension.powers
+        )
         yield [dimension.name, f"`{dimension.example}`", f"`{unit}`", ", ".join(names)]
 
 
@@ -60,7 +71,9 @@ def _loads() -> Iterator[list[str]]:
         for name, kind in table.loads.items():
             unit = f", in the unit of {kind.dimension.name}" if kind.dimension else ""
             shapes.setdefault((name, f"{kind.meaning}{unit}"), []).append(f"`{shape}`")
-    yield from ([f"`{name}`", ", ".join(having), meaning] for (name, meaning), having in shapes.items())
+    yield from (
+        [f"`{name}`", ", ".join(having), meaning] for (name, meaning), having in shapes.items()
+    )
 
 
 def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
@@ -83,7 +96,9 @@ def _presets() -> Iterator[str]:
             rows = {row: having for row, having in rows.items() if first.get(row) != having}
         groups: dict[str, list[str]] = {"all": []}
         for (key, value), having in rows.items():
-            groups.setdefault("all" if having == list(shapes) else ", ".join(having), []).append(f"{key} = {value}")
+            groups.setdefault("all" if having == list(shapes) else ", ".join(having), []).append(
+                f"{key} = {value}"
+            )
         texts = ("\n".join([f"# {of}", *keys]) for of, keys in groups.items())
         yield from ("```toml", "\n\n".join(texts), "```", "")
 

@@ -51,7 +51,9 @@ def layer_mean(setting: Any) -> Row:
 
 def stiff_tendon(name: str, **changes: Any) -> Row:
     """The tendon with four times the energy of its chains (erratum 1): its stretch at the end."""
-    row = last_row(scenes()[name].with_values({"output.fields": False, "material.energy_factor": 4, **changes}))
+    row = last_row(
+        scenes()[name].with_values({"output.fields": False, "material.energy_factor": 4, **changes})
+    )
     return {name: row[name] for name in ("time", "mean_stretch")}
 
 
@@ -78,5 +80,7 @@ def study(folder: Path, keep: bool) -> list[str]:
     for name, (function, cases) in tables.items():
         if not (keep and (folder / f"{name}.csv").is_file()):
             print(f"verification: {name}", file=sys.stderr, flush=True)
-            Page(folder, name).save_table(by_column(side_by_side(function, cases)), ["docs/making/studies.py"])
+            Page(folder, name).save_table(
+                by_column(side_by_side(function, cases)), ["docs/making/studies.py"]
+            )
     return list(tables)

@@ -28,9 +28,16 @@ RESIDUAL = (
     "a: hoop stress without load, before any remodeling; b: under the paper's loads at t = 150; c: fibre angle at "
     "t = 150, 0 is circumferential. Isotropic cells at t = 0, one radius, for opening angles of 0 to 160 degrees.",
 )
-TIME, STEP, TOLERANCE, RAMP_END = 40.0, 4.0, 1.0, 24.0  # of turnover; the first step; degrees, of chosen steps
+TIME, STEP, TOLERANCE, RAMP_END = (
+    40.0,
+    4.0,
+    1.0,
+    24.0,
+)  # of turnover; the first step; degrees, of chosen steps
 END = 60 * TIME
-AT_REST = 2.5e-4 / TIME  # largest d ln m/dt, d ln rho/dt; steps of half a T leave 2e-4 of rounding and error
+AT_REST = (
+    2.5e-4 / TIME
+)  # largest d ln m/dt, d ln rho/dt; steps of half a T leave 2e-4 of rounding and error
 SLOW = 40 * TIME  # what rests later rests slowly
 WIDE = 10.0  # times the outer radius at the start: far beyond any vessel
 FASTER = 1.1  # the rates at the end over their least: from where on growth speeds up
@@ -46,7 +53,9 @@ def through_the_wall(simulation: Simulation) -> Columns:
         "radius": local.coordinates[..., 0],
         "depth": local.depth,
         "stress": simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1],
-        "angle": simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, local.axes),
+        "angle": simulation.scene.geometry.fibre_angle(
+            cells.dimension_values, cells.axis_values, local.axes
+        ),
     }
     order = np.argsort(found["radius"].reshape(-1))
     return {name: values.reshape(-1)[order] for name, values in found.items()}
@@ -64,18 +73,29 @@ def residual(opening_angle: float) -> Columns:
         list(simulation.steps())
         after = through_the_wall(simulation)
     found = {"unloaded": before["stress"], "loaded": after["stress"], "angle": after["angle"]}
-    return {"radius": before["radius"]} | {f"{name}_{opening_angle}": values for name, values in found.items()}
+    return {"radius": before["radius"]} | {
+        f"{name}_{opening_angle}": values for name, values in found.items()
+    }
 
 
 def draw_walls(table: Columns) -> Figure:
     """Three panels over the radius, a curve for each opening angle."""
     figure = Figure(figsize=(7.2, 2.7), layout="constrained")
     panels = figure.subplots(1, 3)
-    labels = {"unloaded": "hoop stress, t = 0", "loaded": "hoop stress, t = 150", "angle": "fibre angle, degrees"}
+    labels = {
+        "unloaded": "hoop stress, t = 0",
+        "loaded": "hoop stress, t = 150",
+        "angle": "fibre angle, degrees",
+    }
     for letter, axes, (name, label) in zip("abc", panels, labels.items(), strict=True):
         axes.set_title(letter, loc="left", fontweight="bold")
         for colour, opening_angle in zip(COLOURS, OPENING_ANGLES, strict=False):
-            axes.plot(table["radius"], table[f"{name}_{opening_angle}"], color=colour, label=f"{opening_angle}°")
+            axes.plot(
+                table["radius"],
+                table[f"{name}_{opening_angle}"],
+                color=colour,
+                label=f"{opening_angle}°",
+            )
         axes.set(xlabel="radius without load", ylabel=label)
     panels[1].set_yscale("log")
     panels[2].set_ylim(0, 90)
@@ -101,7 +121,9 @@ MAP = (
 )
 
 
-def scene_of(wall: Wall, turnover: dict[str, float] | None, end: float = END, **remodeling: Any) -> Scene:
+def scene_of(
+    wall: Wall, turnover: dict[str, float] | None, end: float = END, **remodeling: Any
+) -> Scene:
     """A wall on one radius."""
     ramp = [[0.0, 0.0], [RAMP_END, 1.0]]
     loads = {"pressure": wall.pressure, "elongation": 0.1}
@@ -133,7 +155,9 @@ def outcome(wall: Wall, stretch: float, gain: float) -> dict[str, Any]:
         try:
             for step in simulation.steps():
                 found |= {"time": step.time, "outer_radius": step.row["outer_radius"]}
-                rate = float(np.abs(simulation.stepper.turnover.rates()).max())  # of content and natural length
+                rate = float(
+                    np.abs(simulation.stepper.turnover.rates()).max()
+                )  # of content and natural length
                 if step.time > RAMP_END:
                     least = min(least, rate)
                     if rate < AT_REST:
@@ -152,7 +176,9 @@ def map_of_walls() -> Iterator[dict[str, Any]]:
     for name, wall in WALLS.items():
         for stretch in STRETCHES:
             for gain in GAINS:
-                yield {"wall": name, "deposition_stretch": stretch, "gain": gain} | outcome(wall, stretch, gain)
+                yield {"wall": name, "deposition_stretch": stretch, "gain": gain} | outcome(
+                    wall, stretch, gain
+                )
 
 
 def draw_map(table: Columns) -> Figure:
@@ -173,7 +199,9 @@ def draw_map(table: Columns) -> Figure:
 def _map(axes: Axes, table: dict[str, Any]) -> Any:
     shape = len(STRETCHES), len(GAINS)
     angles, outcomes = table["opening_angle"].reshape(shape), table["outcome"].reshape(shape)
-    image = axes.imshow(angles.T, origin="lower", aspect="auto", cmap="viridis", vmin=0.0, vmax=180.0)
+    image = axes.imshow(
+        angles.T, origin="lower", aspect="auto", cmap="viridis", vmin=0.0, vmax=180.0
+    )
     for i, j in np.ndindex(shape):
         if np.isnan(angles[i, j]):
             text, colour = outcomes[i, j], {"slower": "0.35", "faster": COLOURS[1]}[outcomes[i, j]]

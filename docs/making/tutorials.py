@@ -56,7 +56,9 @@ def printed_as(shown: str, printed: str) -> Iterator[str]:
         if line == "...":
             yield line
             continue
-        found = next((each for each in lines if without_numbers(each) == without_numbers(line)), None)
+        found = next(
+            (each for each in lines if without_numbers(each) == without_numbers(line)), None
+        )
         if found is None:
             raise LookupError(f"{line!r} was not printed, but: {printed[-2000:]}")
         yield found.rstrip()
@@ -94,7 +96,9 @@ def brought_up_to_date(text: str) -> str:
 
 def make(keep: bool) -> None:
     """All pages in one folder: they use each other's files. There is nothing to keep."""
-    order = re.findall(r"\((tutorial_\w+|fit)\.md\)", (DOCS / "index.md").read_text(encoding="utf-8"))
+    order = re.findall(
+        r"\((tutorial_\w+|fit)\.md\)", (DOCS / "index.md").read_text(encoding="utf-8")
+    )
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         Path("demos").symlink_to(DOCS.parent / "demos")

@@ -43,8 +43,14 @@ DEMOS = DOCS.parent / "demos"
 Row = dict[str, Any]
 BANDS = ("fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer")
 FORCE = "reduced_axial_force"
-CAROTID = {"mean": 0.7, "b": (3.4, 1.9)}  # Fischer et al. 2024, abstract: von Mises, mean +- standard deviation
-SHEET = {"before": (25.3, 37.4), "after": (7.1, 18.5)}  # Nguyen et al. 2009, abstract: mean and dispersion, degrees
+CAROTID = {
+    "mean": 0.7,
+    "b": (3.4, 1.9),
+}  # Fischer et al. 2024, abstract: von Mises, mean +- standard deviation
+SHEET = {
+    "before": (25.3, 37.4),
+    "after": (7.1, 18.5),
+}  # Nguyen et al. 2009, abstract: mean and dispersion, degrees
 DAYS = 5.0
 CAPTION = (
     "Fibre angles of walls against the human common carotid artery",
@@ -82,7 +88,9 @@ SHEETS = {
 def agreements() -> Iterator[Row]:
     """Against others and closed forms: a row for each number."""
 
-    def row(case: str, source: str, theirs: float, ours: float, tolerance: float, relative: bool = True) -> Row:
+    def row(
+        case: str, source: str, theirs: float, ours: float, tolerance: float, relative: bool = True
+    ) -> Row:
         difference = abs(ours - theirs) / (abs(theirs) if relative else 1.0)
         return {"case": case, "source": source, "theirs": theirs, "ours": ours, "difference": difference,
                 "tolerance": tolerance}  # fmt: skip
@@ -90,11 +98,23 @@ def agreements() -> Iterator[Row]:
     columns = {"output.columns": ["inner_radius", "outer_radius", "axial_force"]}
     rows = passive(**columns)
     for found, radius in zip(rows, (1.16158, 1.49517, 1.96467, 2.25815), strict=True):
-        yield row(f"V1 tube, p = {found['pressure']:.1f}, radius", PYMECHT, radius, found["inner_radius"], 1e-4)
+        yield row(
+            f"V1 tube, p = {found['pressure']:.1f}, radius",
+            PYMECHT,
+            radius,
+            found["inner_radius"],
+            1e-4,
+        )
     yield row("V1 tube, axial force", PYMECHT, 62.867, rows[-1]["axial_force"], 5e-4)
     for opening, radius in ((60, 2.43220), (120, 2.54422), (160, 2.57366)):
         found = passive(**columns, **{"natural.opening_angle": opening})[-1]
-        yield row(f"V1 tube, opening angle {opening}, radius", PYMECHT, radius, found["inner_radius"], 1e-4)
+        yield row(
+            f"V1 tube, opening angle {opening}, radius",
+            PYMECHT,
+            radius,
+            found["inner_radius"],
+            1e-4,
+        )
     for (cells, x, y), elongations in SHEETS.items():
         found = last_row({
             "geometry": {"shape": "sheet", "length_x": 1.0, "length_y": 1.0, "thickness": 1.0},
@@ -108,7 +128,11 @@ def agreements() -> Iterator[Row]:
             yield row(label, FELUPE, 1 + theirs, 1 + found[f"elongation_{axis}"], 1e-6)
     found = passive(**columns, **{"cells.initial": [0.8, 0.6, 0.0], "loads.pressure.value": 2.4,
                                   "material.lame_lambda": 27.293, "mesh.formulation": "displacement"})[-1]  # fmt: skip
-    for name, theirs in (("inner_radius", 1.313393), ("outer_radius", 3.012636), ("axial_force", 34.79425)):
+    for name, theirs in (
+        ("inner_radius", 1.313393),
+        ("outer_radius", 3.012636),
+        ("axial_force", 34.79425),
+    ):
         yield row(f"V2 tube, {name.replace('_', ' ')}", FELUPE, theirs, found[name], 1e-6)
     for exponent, theirs in ((1.0, 35.26), (2.0, 26.57), (3.5, 16.56), (4.0, 14.04)):
         found = last_row(isotropic(
@@ -126,16 +150,31 @@ def agreements() -> Iterator[Row]:
             "loads.pressure.value": pressure,
         })[-1]  # fmt: skip
         yield row(
-            f"V9 tube of Gasser, Ogden and Holzapfel, p = {pressure}", PYMECHT, theirs, found["inner_radius"], 1e-4
+            f"V9 tube of Gasser, Ogden and Holzapfel, p = {pressure}",
+            PYMECHT,
+            theirs,
+            found["inner_radius"],
+            1e-4,
         )
     for forces in ((0.4, 0.2), (0.4, 0.4), (0.4, 0.1), (0.1, 0.3)):
-        changes = {f"loads.force_{axis}.value": f"{force} N" for axis, force in zip("xy", forces, strict=True)}
-        found = last_row(read_scene(DEMOS / "sheet.toml").with_values({**changes, "remodeling.half_life": 2.0}))
+        changes = {
+            f"loads.force_{axis}.value": f"{force} N"
+            for axis, force in zip("xy", forces, strict=True)
+        }
+        found = last_row(
+            read_scene(DEMOS / "sheet.toml").with_values({**changes, "remodeling.half_life": 2.0})
+        )
         theirs = np.degrees(np.arctan2(found["cauchy_stress_y"], found["cauchy_stress_x"]))
         label = "V10 sheet at rest, forces {} and {} N, degrees".format(*forces)
         yield row(label, "tan a = sigma_y / sigma_x", theirs, found["fibre_angle"], 0.05, False)
     force = 1.381e-23 * 310.0 / 14.5e-9 * 0.5 * extend.CHAINS["wormlike"].stiffness(0.5, 1.0)
-    yield row("Wormlike chain, 14.5 nm, half extended, pN", "Marko and Siggia 1995", 0.369, 1e12 * force, 1e-3)
+    yield row(
+        "Wormlike chain, 14.5 nm, half extended, pN",
+        "Marko and Siggia 1995",
+        0.369,
+        1e12 * force,
+        1e-3,
+    )
 
 
 # ---------------------------------------------------------------- against measurements
@@ -161,7 +200,9 @@ def tube(outer_radius: float, opening_angle: float, **tables: Any) -> dict[str, 
     } | tables  # fmt: skip
 
 
-def wall(outer_radius: float, pressure: float, opening_angle: float, elongation: float = 0.1) -> dict[str, float]:
+def wall(
+    outer_radius: float, pressure: float, opening_angle: float, elongation: float = 0.1
+) -> dict[str, float]:
     """Bands of the angle of a tube that has come to rest, and its axial force without that of its closed ends."""
     loads = {"pressure": {"value": pressure}, "elongation": {"value": elongation}}
     found = last_row(tube(outer_radius, opening_angle, loads=loads, time={"end": "equilibrium"}))
@@ -173,10 +214,14 @@ def walls() -> Iterator[Row]:
     yield from ({"case": label} | wall(*numbers) for label, numbers in WALLS.items())
 
 
-def at_rest(label: str, driver: str, exponent: float, elongation: float, pulse: bool = False) -> list[Row]:
+def at_rest(
+    label: str, driver: str, exponent: float, elongation: float, pulse: bool = False
+) -> list[Row]:
     """Rows of a wall that comes to rest; with a pulse the pressure then goes to 3/4 and 5/4 within no time."""
     outer, pressure, opening = WALLS[WALL_OF.get(label, label)]
-    times = [[0.0, 0.0], [10.0, 1.0], [150.0, 1.0]] + ([[150.01, 0.75], [150.02, 1.25]] if pulse else [])
+    times = [[0.0, 0.0], [10.0, 1.0], [150.0, 1.0]] + (
+        [[150.01, 0.75], [150.02, 1.25]] if pulse else []
+    )
     return run(tube(
         outer, opening, regions=LAYERS if label == TWO_LAYERS else {},
         remodeling={"exponent": exponent, "driver": driver, "kappa": 0.2},
@@ -213,7 +258,9 @@ def pulled(case: tuple[str, str, float, float]) -> Row:
         rows = at_rest(label, driver, exponent, length, pulse=True)
     except (RemodelError, ValueError):
         return found | nothing
-    rest, less = (next(row for row in rows if row["time"] >= time - 1e-9) for time in (150.0, 150.01))
+    rest, less = (
+        next(row for row in rows if row["time"] >= time - 1e-9) for time in (150.0, 150.01)
+    )
     return found | {
         "elongation": length,
         **{name: rest[name] for name in BANDS},
@@ -237,7 +284,9 @@ def growth(volume: float) -> Row:
         {"remodeling.turnover.volume": volume, "time.end": 4000.0, "output.columns": [*GROWN]}
     )
     rows = run(scene)
-    before, after = (next(row for row in rows if row["time"] >= time - 1e-9) for time in (1600.0, 4000.0))
+    before, after = (
+        next(row for row in rows if row["time"] >= time - 1e-9) for time in (1600.0, 4000.0)
+    )
     return {"volume": volume} | {name: after[name] / before[name] for name in GROWN}
 
 
@@ -249,9 +298,15 @@ def tissue() -> Row:
     scene, data = read_scene(DEMOS / "biaxial" / "scene.toml"), DEMOS / "biaxial" / "tissue.toml"
     best: Row = {"misfit": np.inf}
     for angle in CELL_ANGLES:
-        cells = [float(0.96 * np.cos(np.radians(angle))), float(0.96 * np.sin(np.radians(angle))), 0.28]
+        cells = [
+            float(0.96 * np.cos(np.radians(angle))),
+            float(0.96 * np.sin(np.radians(angle))),
+            0.28,
+        ]
         with TemporaryDirectory() as folder:
-            _, found = fit(scene.with_values({"cells.initial": cells}), data, folder, starts=1, profiles=False)
+            _, found = fit(
+                scene.with_values({"cells.initial": cells}), data, folder, starts=1, profiles=False
+            )
         if found.misfit < best["misfit"]:
             (table,), (model,) = found.tables, found.modelled
             best = {"misfit": found.misfit, "angle": angle} | dict(
@@ -259,18 +314,30 @@ def tissue() -> Row:
             )
             for axis in "xy":
                 values = table.columns[f"nominal_stress_{axis}"]
-                left = ((values - model[f"nominal_stress_{axis}"]) ** 2).sum() / ((values - values.mean()) ** 2).sum()
+                left = ((values - model[f"nominal_stress_{axis}"]) ** 2).sum() / (
+                    (values - values.mean()) ** 2
+                ).sum()
                 best[f"R2 {axis}"] = float(1 - left)
     return best
 
 
 def runs(page: Page) -> None:
     """Make the tables."""
-    page.save_table(by_column([tissue()]), ["a tissue's seven protocols, fitted with one cell"], "tissue")
-    page.save_table(by_column(agreements()), ["the program against other codes and closed forms"], "agreed")
+    page.save_table(
+        by_column([tissue()]), ["a tissue's seven protocols, fitted with one cell"], "tissue"
+    )
+    page.save_table(
+        by_column(agreements()), ["the program against other codes and closed forms"], "agreed"
+    )
     page.save_table(by_column(walls()), list(CAPTION))
-    page.save_table(by_column(map(growth, (0.0, 0.3, 0.5))), ["after over before a pressure x 1.5"], "growth")
-    page.save_table(by_column(map(mapped, product(*MAP))), ["the thin wall at rest over pressure and length"], "map")
+    page.save_table(
+        by_column(map(growth, (0.0, 0.3, 0.5))), ["after over before a pressure x 1.5"], "growth"
+    )
+    page.save_table(
+        by_column(map(mapped, product(*MAP))),
+        ["the thin wall at rest over pressure and length"],
+        "map",
+    )
     rows = side_by_side(pulled, product(PULLED, DRIVERS, EXPONENTS, SHARES))
     page.save_table(by_column(rows), ["walls that pull along their axis"], "pulled")
 
@@ -279,18 +346,28 @@ def runs(page: Page) -> None:
 def measured() -> tuple[float, float, float]:
     """The angle of the carotid artery, and one standard deviation of its concentration to each side."""
     mean, spread = CAROTID["b"]
-    middle, narrow, wide = (von_mises_angle(CAROTID["mean"], b) for b in (mean, mean + spread, mean - spread))
+    middle, narrow, wide = (
+        von_mises_angle(CAROTID["mean"], b) for b in (mean, mean + spread, mean - spread)
+    )
     return middle, narrow, wide
 
 
 def of_wall(row: Row) -> float:
     """The angle of the second moment of the three bands together, in degrees."""
-    return float(np.degrees(np.arcsin(np.sqrt(np.mean([np.sin(np.radians(row[name])) ** 2 for name in BANDS])))))
+    return float(
+        np.degrees(
+            np.arcsin(np.sqrt(np.mean([np.sin(np.radians(row[name])) ** 2 for name in BANDS])))
+        )
+    )
 
 
 def fitted(rows: list[Row], angle: float) -> str:
     """The least exponent at which the wall has this angle: ln tan goes with it, exactly in a thin wall."""
-    known = [(row["exponent"], np.log(np.tan(np.radians(of_wall(row))))) for row in rows if np.isfinite(row[BANDS[0]])]
+    known = [
+        (row["exponent"], np.log(np.tan(np.radians(of_wall(row)))))
+        for row in rows
+        if np.isfinite(row[BANDS[0]])
+    ]
     asked = np.log(np.tan(np.radians(angle)))
     for (n, value), (next_n, next_value) in zip(known, known[1:], strict=False):
         if (value - asked) * (next_value - asked) <= 0:
@@ -301,15 +378,27 @@ def fitted(rows: list[Row], angle: float) -> str:
 def tables() -> dict[str, str]:
     """What the template names, from the kept tables alone."""
     parts = ("", "-agreed", "-pulled", "-growth", "-map", "-tissue")
-    resting, agreed, pulling, grown, maps, tissues = (rows_of(FIGURES / f"validation{part}.csv") for part in parts)
-    over = [f"{row[BANDS[1]]:.0f} ({row[FORCE]:.1f})" if np.isfinite(row[FORCE]) else "-" for row in maps]
+    resting, agreed, pulling, grown, maps, tissues = (
+        rows_of(FIGURES / f"validation{part}.csv") for part in parts
+    )
+    over = [
+        f"{row[BANDS[1]]:.0f} ({row[FORCE]:.1f})" if np.isfinite(row[FORCE]) else "-"
+        for row in maps
+    ]
     before, after = (normal_angle(*SHEET[name]) for name in ("before", "after"))
     kappa = np.log(np.sin(np.radians(before)) ** 2 / np.sin(np.radians(after)) ** 2) / DAYS
     middle, narrow, wide = measured()
     fits = []
     for label, driver in product(PULLED, DRIVERS):
-        some = [row for row in pulling if (row["wall"], row["driver"], row["share"]) == (label, driver, SHARES[-1])]
-        angles = ("/".join("-" if np.isnan(row[name]) else f"{row[name]:.0f}" for name in BANDS) for row in some)
+        some = [
+            row
+            for row in pulling
+            if (row["wall"], row["driver"], row["share"]) == (label, driver, SHARES[-1])
+        ]
+        angles = (
+            "/".join("-" if np.isnan(row[name]) else f"{row[name]:.0f}" for name in BANDS)
+            for row in some
+        )
         fits.append([label, driver, *angles, fitted(some, middle)])
     pulses = {(row["wall"], row["driver"]): f"{row['pulse']:.2f}" for row in pulling
               if row["share"] == SHARES[-1] and row["exponent"] == 2 and np.isfinite(row["pulse"])}  # fmt: skip
@@ -357,8 +446,17 @@ def draw(found: Columns) -> Figure:
     axes.axhspan(narrow, wide, color="0.85", label="carotid arteries, measured")
     axes.axhline(middle, color="0.6")
     for number, label in enumerate(WALLS):
-        style = {"color": COLOURS[number // 2], "linestyle": "-" if number % 2 else "--", "marker": "o"}
-        axes.plot(["inside", "half-way", "outside"], [found[name][number] for name in BANDS], label=label, **style)
+        style = {
+            "color": COLOURS[number // 2],
+            "linestyle": "-" if number % 2 else "--",
+            "marker": "o",
+        }
+        axes.plot(
+            ["inside", "half-way", "outside"],
+            [found[name][number] for name in BANDS],
+            label=label,
+            **style,
+        )
     axes.set(ylabel="angle to the circumference, degrees", ylim=(0, 90))
     axes.legend(fontsize=7)
     return figure

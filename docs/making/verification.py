@@ -23,7 +23,13 @@ from remodel_fenicsx.studies.study import COLOURS, Page, read_notes
 from remodel_fenicsx.system.children import cores
 from tests.reference.radial import RadialHistory, solve_radial
 
-MORE_TABLES = ("fig6-snapshots", "fig7-history", "fig10-history", "fig11-history", "radial-reference-radii")
+MORE_TABLES = (
+    "fig6-snapshots",
+    "fig7-history",
+    "fig10-history",
+    "fig11-history",
+    "radial-reference-radii",
+)
 REFERENCE = {
     "cauchy": {"driver": "cauchy"}, "pk2": {"driver": "pk2"}, "finger": {"driver": "finger"}, "rate": {"law": "rate"},
 }  # fmt: skip
@@ -41,15 +47,21 @@ REFERENCE_CAPTION = (
 def radial_reference(page: Page) -> None:
     """Layer means and final radii of the one-dimensional reference, and the picture that compares it with the runs."""
     histories = {name: solve_radial(**settings) for name, settings in REFERENCE.items()}  # type: ignore[arg-type]
-    curves = {name: (history.points, history.fibre_angle(-2)) for name, history in histories.items()}
+    curves = {
+        name: (history.points, history.fibre_angle(-2)) for name, history in histories.items()
+    }
     for stretch, pressure in CASES:
-        histories[f"case_{stretch:g}_{pressure:g}"] = solve_radial(pressure=pressure, stretch=stretch / 100)
+        histories[f"case_{stretch:g}_{pressure:g}"] = solve_radial(
+            pressure=pressure, stretch=stretch / 100
+        )
     middle = (EDGES[1:] + EDGES[:-1]) / 2
     table = {"layer": np.arange(1, 9), "radius": middle}
     table |= {name: layer_means(history) for name, history in histories.items()}
     made = f"{_made_with(page.folder)}; tests/reference/radial.py"
     drawn(page, draw_reference, layer_angles(page.folder), curves, middle, made=made)
-    page.save_table(table, ["tests/reference/radial.py: means over the element layers at t = 150, degrees"])
+    page.save_table(
+        table, ["tests/reference/radial.py: means over the element layers at t = 150, degrees"]
+    )
     inner, outer = (np.array([getattr(history, f"{face}_radii")[-1] for history in histories.values()])
                     for face in ("inner", "outer"))  # fmt: skip
     radii = {"name": list(histories), "inner_radius": inner, "outer_radius": outer}
@@ -58,10 +70,14 @@ def radial_reference(page: Page) -> None:
 
 def layer_means(history: RadialHistory) -> np.ndarray:
     """Fibre angles; row -2: the cells with which the last step was solved, as in a run's last row."""
-    return np.array([history.mean_fibre_angle(a, b, -2) for a, b in zip(EDGES, EDGES[1:], strict=False)])
+    return np.array(
+        [history.mean_fibre_angle(a, b, -2) for a, b in zip(EDGES, EDGES[1:], strict=False)]
+    )
 
 
-def draw_reference(runs: Columns, curves: dict[str, tuple[np.ndarray, np.ndarray]], middle: np.ndarray) -> Figure:
+def draw_reference(
+    runs: Columns, curves: dict[str, tuple[np.ndarray, np.ndarray]], middle: np.ndarray
+) -> Figure:
     """Points: means of layers; lines: the reference."""
     figure = Figure(figsize=(5.4, 3.6))
     axes = figure.add_axes((0.11, 0.14, 0.86, 0.83))
@@ -71,7 +87,11 @@ def draw_reference(runs: Columns, curves: dict[str, tuple[np.ndarray, np.ndarray
         axes.plot(radius, angle, color=colour, lw=1.2)
         axes.plot(middle, runs[name], "o", ms=4, color=colour, label=labels[name])
     axes.plot([], [], color="0.3", lw=1.2, label="radial reference")
-    axes.set(xlabel="reference radius $R$", ylabel="reference fibre angle at $t$ = 150 (degrees)", xlim=(1, 3))
+    axes.set(
+        xlabel="reference radius $R$",
+        ylabel="reference fibre angle at $t$ = 150 (degrees)",
+        xlim=(1, 3),
+    )
     axes.set_ylim(-2, 92)
     axes.set_yticks(range(0, 91, 15))
     axes.legend(loc="upper left")
@@ -81,7 +101,10 @@ def draw_reference(runs: Columns, curves: dict[str, tuple[np.ndarray, np.ndarray
 def layer_angles(folder: Path) -> Columns:
     """Layer means of the runs at t = 150 by driver or law."""
     files = {"cauchy": "fig10", "pk2": "fig10", "finger": "fig11", "rate": "rate"}
-    return {name: read_table(folder / f"{file}.csv")[f"fibre_angle_{name}"] for name, file in files.items()}
+    return {
+        name: read_table(folder / f"{file}.csv")[f"fibre_angle_{name}"]
+        for name, file in files.items()
+    }
 
 
 # ---------------------------------------------------------------- the numbers on the page
@@ -97,9 +120,14 @@ class Numbers:
         v = self.values
         if how == "percent":
             return Numbers(100 * v, self.places)
-        return {"first": v[0], "last": v[-1], "least": v.min(), "most": v.max(), "mean": v.mean(), "spread": np.ptp(v)}[
-            how
-        ]
+        return {
+            "first": v[0],
+            "last": v[-1],
+            "least": v.min(),
+            "most": v.max(),
+            "mean": v.mean(),
+            "spread": np.ptp(v),
+        }[how]
 
     def __getitem__(self, place: int) -> float:
         return float(self.values[self.places == place].item())
@@ -114,7 +142,9 @@ class Tables(dict[str, Any]):
 
     def __missing__(self, name: str) -> dict[str, Numbers]:
         table = read_table(self.folder / f"{name}.csv")
-        self[name] = {column: Numbers(values, next(iter(table.values()))) for column, values in table.items()}
+        self[name] = {
+            column: Numbers(values, next(iter(table.values()))) for column, values in table.items()
+        }
         return dict(self[name])
 
 
@@ -124,13 +154,17 @@ def all_numbers(folder: Path) -> dict[str, str]:
 
 
 def _runs(folder: Path) -> dict[str, str]:
-    cube, tendon, artery = (read_table(folder / f"{name}.csv") for name in ("fig5", "fig6", "fig7-history"))
+    cube, tendon, artery = (
+        read_table(folder / f"{name}.csv") for name in ("fig5", "fig6", "fig7-history")
+    )
     kappas = ("0.01", "0.025", "0.05", "0.1")
     error = max(np.abs(cube[f"angle_kappa_{k}"] - cube[f"exact_kappa_{k}"]).max() for k in kappas)
     outer, inner, time = artery["outer_radius"], artery["inner_radius"], artery["time"]
     at_24 = int(np.argmin(np.abs(time - 24.0)))
     return {
-        "cube_within": f"within {error:.1g} degrees" if error > 0 else "in all 7 digits of the table",
+        "cube_within": (
+            f"within {error:.1g} degrees" if error > 0 else "in all 7 digits of the table"
+        ),
         "tendon_spread_end": f"{tendon['max_stretch'][-1] - tendon['min_stretch'][-1]:.3f}",
         "left_of_start": f"{100 * np.exp(-0.025 * 149):.1f}",
         "artery_stretch_outside": f"{outer[-1] / 3.0:.2f}",  # R_i = 1, R_o = 3
@@ -143,7 +177,9 @@ def _cases(folder: Path) -> dict[str, str]:
     table = read_table(folder / "fig9.csv")
 
     def angles(stretch: float, pressure: float) -> np.ndarray:
-        return table["fibre_angle"][np.isclose(table["stretch"], stretch) & np.isclose(table["pressure"], pressure)]
+        return table["fibre_angle"][
+            np.isclose(table["stretch"], stretch) & np.isclose(table["pressure"], pressure)
+        ]
 
     stretched, pressed = angles(0.1, 0.0), angles(0.0, 4.8)
     return {
@@ -159,10 +195,16 @@ def _drivers(folder: Path) -> dict[str, str]:
     angles = layer_angles(folder)
     reference = read_table(folder / "radial-reference.csv")
     radii = read_table(folder / "radial-reference-radii.csv")
-    exact = {face: radii[f"{face}_radius"][radii["name"] == "finger"].item() for face in ("inner", "outer")}
+    exact = {
+        face: radii[f"{face}_radius"][radii["name"] == "finger"].item()
+        for face in ("inner", "outer")
+    }
     drifted = read_table(folder / "fig11-history.csv")
     inner, outer = (drifted[f"{face}_radius_finger"][-1] for face in ("inner", "outer"))
-    found = {f"mean_difference_{name}": f"{np.abs(angles[name] - reference[name]).mean():.1f}" for name in angles}
+    found = {
+        f"mean_difference_{name}": f"{np.abs(angles[name] - reference[name]).mean():.1f}"
+        for name in angles
+    }
     rate = next(row for row in rows_of(folder / "comparison-drivers.csv") if row["law"] == "rate")
     return found | {
         "rate_mean_outside": f"{rate['angle_mean_outside']:.2f}",
@@ -178,8 +220,12 @@ def _drivers(folder: Path) -> dict[str, str]:
 def _energy(folder: Path) -> dict[str, str]:
     table, curve = read_table(folder / "energy.csv"), read_table(folder / "fig6.csv")
     is_tendon = table["demo"] == "tendon"
-    time, power, energy = (table[name][is_tendon] for name in ("time", "remodeling_power", "stored_energy"))
-    held = (time >= 12.0) & (time < time[-1])  # the passes between the solved states of t = 12 and of the end
+    time, power, energy = (
+        table[name][is_tendon] for name in ("time", "remodeling_power", "stored_energy")
+    )
+    held = (time >= 12.0) & (
+        time < time[-1]
+    )  # the passes between the solved states of t = 12 and of the end
     shorter = curve["mean_stretch"][curve["time"] == 12.0].item() - curve["mean_stretch"][-1]
     return {
         "tendon_supplied": f"{-power[held].sum() * (time[1] - time[0]):.0f}",
@@ -198,7 +244,9 @@ def case_table(folder: Path) -> tuple[str, str]:
     differences = []
     for stretch, pressure in CASES:
         header.append(f"{stretch:g} %, p = {pressure:g}")
-        chosen = np.isclose(table["stretch"], stretch / 100) & np.isclose(table["pressure"], pressure)
+        chosen = np.isclose(table["stretch"], stretch / 100) & np.isclose(
+            table["pressure"], pressure
+        )
         angles = table["fibre_angle"][chosen]
         differences.append(angles - reference[f"case_{stretch:g}_{pressure:g}"])
         for row, angle in zip(rows, angles, strict=True):
@@ -234,7 +282,10 @@ def elements_of(row: dict[str, Any]) -> str:
 def driver_of(row: dict[str, Any]) -> str:
     """Driver, supports and elements of a comparison, as cells of a table."""
     symbol = {"cauchy": "σ", "pk2": "S", "finger": "b"}[row["driver"]]
-    law = {"explicit": "(11)", "rate": f"(10), front {row['front_from']:g} < R < {row['front_to']:g}"}[row["law"]]
+    law = {
+        "explicit": "(11)",
+        "rate": f"(10), front {row['front_from']:g} < R < {row['front_to']:g}",
+    }[row["law"]]
     return f"{symbol}, eq. {law} | {row['supports']} | {elements_of(row)}"
 
 
@@ -254,7 +305,12 @@ def page(kept: Path = FIGURES) -> str:
         "table_errors_drivers": error_table(kept, "comparison-drivers", "driver | supports | elements", driver_of),
         "made_with": _made_with(kept),
     }  # fmt: skip
-    return Path(__file__).with_suffix(".template.md").read_text(encoding="utf-8").format_map(Tables(kept, values))
+    return (
+        Path(__file__)
+        .with_suffix(".template.md")
+        .read_text(encoding="utf-8")
+        .format_map(Tables(kept, values))
+    )
 
 
 def write_page() -> None:
@@ -271,7 +327,10 @@ def make(keep: bool) -> None:
     radial_reference(Page(folder, "radial-reference", *REFERENCE_CAPTION))
     studies = study(folder, keep)
     pictures = (*figures.FIGURES, "radial-reference")
-    files = [*(f"{name}.png" for name in pictures), *(f"{name}.json" for name in (*pictures, *studies))]
+    files = [
+        *(f"{name}.png" for name in pictures),
+        *(f"{name}.json" for name in (*pictures, *studies)),
+    ]
     for file in (*files, *(f"{name}.csv" for name in (*pictures, *MORE_TABLES, *studies))):
         shutil.copyfile(folder / file, FIGURES / file)
     write_page()

@@ -17,7 +17,9 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 napoleon_google_docstring = False
 napoleon_use_ivar = True
-default_role = "py:obj"  # what docstrings have in backticks: a link where it is a public name, else code
+default_role = (
+    "py:obj"  # what docstrings have in backticks: a link where it is a public name, else code
+)
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 toc_object_entries_show_parents = "hide"  # else they are wider than their column
@@ -26,7 +28,11 @@ html_theme = "pydata_sphinx_theme"
 html_title = "remodel_fenicsx"
 html_search_scorer = str(Path(__file__).with_name("scorer.js"))
 html_copy_source = html_show_sourcelink = False
-html_theme_options = {"show_toc_level": 2, "header_links_before_dropdown": 6, "secondary_sidebar_items": ["page-toc"]}
+html_theme_options = {
+    "show_toc_level": 2,
+    "header_links_before_dropdown": 6,
+    "secondary_sidebar_items": ["page-toc"],
+}
 # KaTeX in the site's own folder: formulas need no network
 mathjax_path = "katex/katex.min.js"
 html_css_files = ["katex/katex.min.css", "site.css"]
@@ -34,7 +40,9 @@ html_js_files = [
     ("katex/contrib/auto-render.js", {"defer": "defer"}),
     (
         None,
-        {"body": "addEventListener('load', () => window.renderMathInElement && renderMathInElement(document.body))"},
+        {
+            "body": "addEventListener('load', () => window.renderMathInElement && renderMathInElement(document.body))"
+        },
     ),
 ]
 

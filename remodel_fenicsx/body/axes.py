@@ -62,10 +62,15 @@ def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     axial = _axial(radial, dx, starts, ends, thickness)
     (trial, test), r, a = _arguments(stiffness.space), _unit(radial), _unit(axial)
     along_r = SpdSolver(ufl.inner(r, ufl.grad(trial)) * ufl.inner(r, ufl.grad(test)) * dx)
-    through = [_length(along_r, r, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))]
+    through = [
+        _length(along_r, r, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))
+    ]
     # Unlike lengths through the wall, these are not along single lines, which would differ over the
     # section of a bend.
-    along = [_length(stiffness, a, dx, facets, sign, True) for facets, sign in ((starts, 1.0), (ends, -1.0))]
+    along = [
+        _length(stiffness, a, dx, facets, sign, True)
+        for facets, sign in ((starts, 1.0), (ends, -1.0))
+    ]
     return [radial, axial, *through, *along]
 
 
@@ -77,13 +82,22 @@ def slopes(mesh: Mesh, degree: int, dx: ufl.Measure) -> SpdSolver:
 
 def harmonic(stiffness: SpdSolver, low: Facets, high: Facets) -> Function:
     """Compute the harmonic function that is 0 on some facets and 1 on others. Collective."""
-    return stiffness.solve(None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)])
+    return stiffness.solve(
+        None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)]
+    )
 
 
 def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Function:
     """Project the unit gradients of the harmonic function onto continuous vectors."""
-    mesh, slope, (trial, test) = phi.function_space.mesh, ufl.grad(phi), _arguments(phi.function_space)
-    least, way = (dolfinx.fem.Constant(mesh, number) for number in (np.float64(LEAST_SLOPE / thickness), np.zeros(3)))
+    mesh, slope, (trial, test) = (
+        phi.function_space.mesh,
+        ufl.grad(phi),
+        _arguments(phi.function_space),
+    )
+    least, way = (
+        dolfinx.fem.Constant(mesh, number)
+        for number in (np.float64(LEAST_SLOPE / thickness), np.zeros(3))
+    )
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
     mass, found = SpdSolver(trial * test * dx), lagrange(mesh, degree, (3,))
     for component in range(3):
@@ -92,7 +106,9 @@ def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Fu
     return found
 
 
-def _axial(radial: Function, dx: ufl.Measure, starts: Facets, ends: Facets, thickness: float) -> Function:
+def _axial(
+    radial: Function, dx: ufl.Measure, starts: Facets, ends: Facets, thickness: float
+) -> Function:
     """Minimise the integral of |grad a|^2 + k (a . r)^2 / thickness^2, with the ends' normals."""
     space, normal = radial.function_space, _unit(radial)
     weight = dolfinx.fem.Constant(space.mesh, np.float64(SQUARE_TO_RADIAL / thickness**2))
@@ -103,10 +119,17 @@ def _axial(radial: Function, dx: ufl.Measure, starts: Facets, ends: Facets, thic
 
 
 def _length(
-    form: SpdSolver, direction: Expr, dx: ufl.Measure, facets: Facets, sign: float, multigrid: bool = False
+    form: SpdSolver,
+    direction: Expr,
+    dx: ufl.Measure,
+    facets: Facets,
+    sign: float,
+    multigrid: bool = False,
 ) -> Function:
     """Compute the function, 0 on facets, whose gradient fits a direction in the form's norm."""
-    test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(form.space.mesh, np.float64(sign))
+    test, factor = ufl.TestFunction(form.space), dolfinx.fem.Constant(
+        form.space.mesh, np.float64(sign)
+    )
     flux = factor * ufl.inner(direction, ufl.grad(test)) * dx
     return form.solve(flux, [_held(form.space, facets, 0.0)], multigrid)
 
@@ -131,8 +154,12 @@ def _normal_to_ends(function: Function, starts: Facets, ends: Facets) -> Dirichl
     values, layout = sums.x.array.reshape(-1, 3), space.dofmap.dof_layout
     for facets, sign in ((starts, -1.0), (ends, 1.0)):
         cells, local = cells_of(space.mesh, facets)
-        for cell, number, vector in zip(cells, local, outward_areas(space.mesh, facets), strict=True):
-            values[space.dofmap.cell_dofs(int(cell))[layout.entity_closure_dofs(2, number)]] += sign * vector
+        for cell, number, vector in zip(
+            cells, local, outward_areas(space.mesh, facets), strict=True
+        ):
+            values[space.dofmap.cell_dofs(int(cell))[layout.entity_closure_dofs(2, number)]] += (
+                sign * vector
+            )
     sums.x.scatter_reverse(dolfinx.la.InsertMode.add)
     sums.x.scatter_forward()
     sizes = np.linalg.norm(values, axis=1)
@@ -182,7 +209,9 @@ class UndefinedAxes(SceneError):
 def compute_local_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
     """Compute the local axes of a mesh with the faces `ROLES`. Collective."""
     if missing := [face for face in ROLES if face not in domain.faces]:
-        raise UndefinedAxes(f"geometry.faces: the local axes need a face {', '.join(map(repr, missing))}")
+        raise UndefinedAxes(
+            f"geometry.faces: the local axes need a face {', '.join(map(repr, missing))}"
+        )
     try:
         radial, axial, *lengths = _fields(domain, quadrature)
     except LinearSolveFailure as stopped:
@@ -194,7 +223,9 @@ def compute_local_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
     share = quadrature.mean((~known).astype(np.float64))
     if share > 0:
         x, y, z = _first_place(quadrature, ~known)
-        words = f"undefined in {100 * share:.2g} % of the wall, first at ({x:.4g}, {y:.4g}, {z:.4g})"
+        words = (
+            f"undefined in {100 * share:.2g} % of the wall, first at ({x:.4g}, {y:.4g}, {z:.4g})"
+        )
         if share > MOST_UNDEFINED:
             raise UndefinedAxes(
                 f"geometry.faces: the local axes are {words}; must be at most "
@@ -240,5 +271,7 @@ def _fill(axes: Array, known: Flags, quadrature: Quadrature) -> None:
     """Copy the axes of the nearest point with axes to each point without. Collective."""
     good = quadrature.owned(known)
     own = quadrature.owned(quadrature.coordinates)[good], quadrature.owned(axes)[good]
-    places, candidates = map(np.concatenate, zip(*allgather(quadrature.mesh.comm, own), strict=True))
+    places, candidates = map(
+        np.concatenate, zip(*allgather(quadrature.mesh.comm, own), strict=True)
+    )
     axes[~known] = candidates[spatial.cKDTree(places).query(quadrature.coordinates[~known])[1]]

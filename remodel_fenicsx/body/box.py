@@ -39,7 +39,9 @@ class Box(Shape):
     face_names = ("x0", "x1", "y0", "y1", "z0", "z1")
     _counts: ClassVar[tuple[int, int, int]]
     reductions = {
-        "point": homogeneous_bar("z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape._lengths)),
+        "point": homogeneous_bar(
+            "z0", "z1", lambda shape: shape.sides, lambda shape: box(*shape._lengths)
+        ),
     }
 
     @property
@@ -130,8 +132,14 @@ def _nominal(row: int, column: int) -> Callable[[Any], float]:
 
     def value(m: Any) -> float:
         def mean() -> Array:
-            stress = np.linalg.det(m.F)[..., None, None] * m.stress @ np.swapaxes(np.linalg.inv(m.F), -1, -2)
-            return np.array([[m.quadrature.mean(stress[..., i, j]) for j in range(3)] for i in range(3)])
+            stress = (
+                np.linalg.det(m.F)[..., None, None]
+                * m.stress
+                @ np.swapaxes(np.linalg.inv(m.F), -1, -2)
+            )
+            return np.array(
+                [[m.quadrature.mean(stress[..., i, j]) for j in range(3)] for i in range(3)]
+            )
 
         return float(m.cached_for_step("nominal stress", mean)[row, column])
 
@@ -146,7 +154,9 @@ def _force(side: int) -> LoadKind:
         return float(getattr(shape, f"length_{other}") * shape.thickness)
 
     return LoadKind(
-        lambda shape, loading, name: loading.add_dead_force(name, f"{axis}1", side, getattr(shape, f"length_{axis}")),
+        lambda shape, loading, name: loading.add_dead_force(
+            name, f"{axis}1", side, getattr(shape, f"length_{axis}")
+        ),
         f"force along {axis} on the edge {axis} = length_{axis}: dead load, or the reaction",
         FORCE,
         value=lambda m: nominal(m) * area(m.observer.shape),
@@ -212,7 +222,9 @@ class Sheet(Box):
             lambda m: m.quadrature.nanmean(m.fibre_angle),
             by_case=False,
         ),
-        Column("thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)),
+        Column(
+            "thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)
+        ),
         *cauchy_columns("x", "y", "xy"),
         *(
             Column(
@@ -295,8 +307,12 @@ def box_domain(
     x, y, z = (mesh.refinement * count for count in counts)
 
     def draw() -> None:
-        corners = model.points(np.array(lengths[:2]) * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
-        y0, x1, y1, x0 = (model.line(corners[i], corners[(i + 1) % 4], n) for i, n in enumerate((x, y, x, y)))
+        corners = model.points(
+            np.array(lengths[:2]) * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        )
+        y0, x1, y1, x0 = (
+            model.line(corners[i], corners[(i + 1) % 4], n) for i, n in enumerate((x, y, x, y))
+        )
         section = model.block([y0, x1, y1, x0], corners, mesh.element)
         sides = {"x0": x0, "x1": x1, "y0": y0, "y1": y1}
         model.extrude([section], lengths[2], z, mesh.element, sides, ends=("z0", "z1"))

@@ -158,7 +158,9 @@ class Domain:
             One row per local element.
         """
         wanted = self.comm.gather(self.element_number, root=0)
-        parts = None if wanted is None or values is None else [values[numbers] for numbers in wanted]
+        parts = (
+            None if wanted is None or values is None else [values[numbers] for numbers in wanted]
+        )
         return np.asarray(self.comm.scatter(parts, root=0))
 
     def gather_nodes(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
@@ -199,7 +201,9 @@ class Domain:
 
     def _gather(self, values: npt.NDArray[Any], number: Integers) -> npt.NDArray[Any] | None:
         if allreduce(self.comm, len(values) < len(number), MPI.LOR):
-            raise ValueError(f"{len(values)} rows for {len(number)} owned entities on rank {self.comm.rank}")
+            raise ValueError(
+                f"{len(values)} rows for {len(number)} owned entities on rank {self.comm.rank}"
+            )
         own = number, values[: len(number)]
         parts = [own] if self.comm.size == 1 else self.comm.gather(own, root=0)
         if parts is None:
@@ -224,14 +228,19 @@ class SymbolicMesh(ufl.Mesh):
 
 def symbolic_mesh(kind: str, degree: int) -> SymbolicMesh:
     """Return a mesh of the element of dolfinx's Gmsh reader, so that all bodies share kernels."""
-    return SymbolicMesh(basix.ufl.element("Lagrange", kind, degree, basix.LagrangeVariant.equispaced, shape=(3,)))
+    return SymbolicMesh(
+        basix.ufl.element("Lagrange", kind, degree, basix.LagrangeVariant.equispaced, shape=(3,))
+    )
 
 
 # ---------------------------------------------------------------- meshes by Gmsh
 
 
 def build_domain(
-    draw: Callable[[], None], shape: str, dimensions: dict[str, float], comm: MPI.Intracomm | None = None
+    draw: Callable[[], None],
+    shape: str,
+    dimensions: dict[str, float],
+    comm: MPI.Intracomm | None = None,
 ) -> Domain:
     """Draw and mesh a body on rank 0, then distribute the mesh. Collective."""
     comm = comm or MPI.COMM_WORLD
@@ -246,7 +255,9 @@ def build_domain(
                 groups = named_groups()
             except BaseException as error:  # any error must reach the other ranks, which wait
                 failure = error
-        verdict = failure and f"Gmsh could not mesh the {shape}: {str(failure) or type(failure).__name__}"
+        verdict = (
+            failure and f"Gmsh could not mesh the {shape}: {str(failure) or type(failure).__name__}"
+        )
         verdict, groups = comm.bcast((verdict, groups), root=0)
         if failure is not None and not isinstance(failure, Exception):  # Ctrl-C on rank 0 stays one
             raise failure
@@ -256,9 +267,18 @@ def build_domain(
     symbolic = SymbolicMesh(mesh.ufl_domain().ufl_coordinate_element())
     region = np.zeros(len(mesh.topology.original_cell_index), dtype=np.int32)
     region[cell_tags.indices] = cell_tags.values
-    drawn = type(mesh)(mesh._cpp_object, symbolic), facet_tags, groups[0], shape, dimensions, groups[1]
+    drawn = (
+        type(mesh)(mesh._cpp_object, symbolic),
+        facet_tags,
+        groups[0],
+        shape,
+        dimensions,
+        groups[1],
+    )
     domain = Domain(*drawn, region)
-    return replace(domain, element_region=domain.scatter_elements(domain.gather_elements(region)))  # with ghosts
+    return replace(
+        domain, element_region=domain.scatter_elements(domain.gather_elements(region))
+    )  # with ghosts
 
 
 # ---------------------------------------------------------------- facets
@@ -297,17 +317,28 @@ def lattice_domain(
 ) -> Domain:  # fmt: skip
     """Mesh nodes in rows by lines or quadrilaterals. Collective."""
     comm = comm or MPI.COMM_WORLD
-    first, *second = (degree * np.arange(count)[:, None] + np.arange(degree + 1) for count in counts)
+    first, *second = (
+        degree * np.arange(count)[:, None] + np.arange(degree + 1) for count in counts
+    )
     kind, elements = "interval", first[:, [0, degree, *range(1, degree)]]
     if second:
         nodes = second[0][:, None, :, None] * (degree * counts[0] + 1) + first[None, :, None, :]
-        kind, elements = "quadrilateral", nodes.reshape(counts[0] * counts[1], -1)[:, _QUADRILATERAL[degree]]
+        kind, elements = (
+            "quadrilateral",
+            nodes.reshape(counts[0] * counts[1], -1)[:, _QUADRILATERAL[degree]],
+        )
     here = slice(None) if comm.rank == 0 else slice(0)
-    mesh: Any = dolfinx.mesh.create_mesh(comm, cells=elements[here], x=points[here], e=symbolic_mesh(kind, degree))
+    mesh: Any = dolfinx.mesh.create_mesh(
+        comm, cells=elements[here], x=points[here], e=symbolic_mesh(kind, degree)
+    )
     dimension = mesh.topology.dim - 1
-    found = [dolfinx.mesh.locate_entities_boundary(mesh, dimension, marker) for marker in faces.values()]
+    found = [
+        dolfinx.mesh.locate_entities_boundary(mesh, dimension, marker) for marker in faces.values()
+    ]
     values = np.repeat(np.arange(1, len(found) + 1, dtype=np.int32), [len(one) for one in found])
     facets = np.concatenate(found).astype(np.int32)
     order = np.argsort(facets)
     tags = dolfinx.mesh.meshtags(mesh, dimension, facets[order], values[order])
-    return Domain(mesh, tags, {name: number + 1 for number, name in enumerate(faces)}, shape, dimensions)
+    return Domain(
+        mesh, tags, {name: number + 1 for number, name in enumerate(faces)}, shape, dimensions
+    )

@@ -31,14 +31,22 @@ SOLID = ("tetra", "hexa", "wedge")  # prefixes of the names of element types
 SAME_PLACE = 1e-4
 SYMMETRIC_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
 ALL_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")
-GROUPS = {"structure_tensor": ALL_COMPONENTS, "fibre": tuple("xyz"), "fibre_2": tuple("xyz")}  # columns of a table
+GROUPS = {
+    "structure_tensor": ALL_COMPONENTS,
+    "fibre": tuple("xyz"),
+    "fibre_2": tuple("xyz"),
+}  # columns of a table
 OF_GROUPS = {name: tuple(f"{name}_{c}" for c in parts) for name, parts in GROUPS.items()}
 OF_ONE_COLUMN = ("element", "angle", "weight")
 OF_TABLES = (*"xyz", *OF_ONE_COLUMN, *itertools.chain(*OF_GROUPS.values()))
 # ParaView writes the number of a component, and Points for positions.
-SPELLINGS = {f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)}
+SPELLINGS = {
+    f"{name}:{n}": f"{name}_{c}" for name, parts in GROUPS.items() for n, c in enumerate(parts)
+}
 SPELLINGS |= {f"points{mark}{n}": c for n, c in enumerate("xyz") for mark in ":_"}
-EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [f"axis_{i}_{c}" for i in (1, 2, 3) for c in "xyz"]
+EXPORTED = [f"cell_dimension_{i}" for i in (1, 2, 3)] + [
+    f"axis_{i}_{c}" for i in (1, 2, 3) for c in "xyz"
+]
 
 
 @dataclass(frozen=True)
@@ -62,10 +70,15 @@ class FibreFile:
         count, centres = len(next(iter(self.measured.values()))), corners.mean(axis=1)
         sizes = 2 * np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
         if count == len(centres):
-            if self.places is None or (np.abs(self.places - centres) < SAME_PLACE * sizes[:, None]).all():
+            if (
+                self.places is None
+                or (np.abs(self.places - centres) < SAME_PLACE * sizes[:, None]).all()
+            ):
                 return np.arange(count), None
         if self.places is None:
-            raise UnreadableFile(f"has {count} rows without positions x, y, z; the mesh has {len(centres)} elements")
+            raise UnreadableFile(
+                f"has {count} rows without positions x, y, z; the mesh has {len(centres)} elements"
+            )
         rows = np.zeros(len(centres), dtype=np.int64)
         far, rows[chosen] = cKDTree(self.places).query(centres[chosen])
         if (far > sizes[chosen]).any():
@@ -113,16 +126,24 @@ def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
             measured[name] = np.stack([columns[key] for key in keys], axis=1)
             used |= {*keys}
     if left := [name for name in columns if name not in used]:
-        raise UnreadableFile(f"has {', '.join(left)} without the other columns of x, y, z or of the tensor")
+        raise UnreadableFile(
+            f"has {', '.join(left)} without the other columns of x, y, z or of the tensor"
+        )
     places, elements = measured.pop("places", None), measured.pop("element", None)
     if not set(measured) & set(FIBRE_INPUTS):
-        raise UnreadableFile(f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z")
+        raise UnreadableFile(
+            f"has columns {', '.join(columns)}; {_NEEDED} with _xx ... or _x, _y, _z"
+        )
     if elements is None:
         return measured, places
     order = np.argsort(elements[:, 0])
     if not np.array_equal(elements[order, 0], np.arange(1, len(order) + 1)):
-        raise UnreadableFile(f"the column element must have the numbers 1 to {len(order)}, each once")
-    return {name: values[order] for name, values in measured.items()}, None if places is None else places[order]
+        raise UnreadableFile(
+            f"the column element must have the numbers 1 to {len(order)}, each once"
+        )
+    return {name: values[order] for name, values in measured.items()}, (
+        None if places is None else places[order]
+    )
 
 
 _NEEDED = f"must have one of {', '.join(FIBRE_INPUTS)}"
@@ -133,16 +154,25 @@ def _of_mesh(path: Path) -> tuple[dict[str, Array], Array, bytes]:
     mesh = read_exchange_file(path)
     try:
         solid = [rows for kind, rows in mesh.cells if kind.startswith(SOLID)]
-        chosen = np.repeat([kind.startswith(SOLID) for kind, _ in mesh.cells], [len(rows) for _, rows in mesh.cells])
+        chosen = np.repeat(
+            [kind.startswith(SOLID) for kind, _ in mesh.cells],
+            [len(rows) for _, rows in mesh.cells],
+        )
         of_cells = {
-            name: _columns(values)[chosen] for name, values in mesh.cell_data.items() if name in MEASURED and solid
+            name: _columns(values)[chosen]
+            for name, values in mesh.cell_data.items()
+            if name in MEASURED and solid
         }
-        of_points = {name: _columns(values) for name, values in mesh.point_data.items() if name in MEASURED}
+        of_points = {
+            name: _columns(values) for name, values in mesh.point_data.items() if name in MEASURED
+        }
         points = np.asarray(mesh.points, dtype=np.float64)
         points = np.pad(points, [(0, 0), (0, 3 - points.shape[1])])
         centres = [points[rows].mean(axis=1) for rows in solid]
     except (ValueError, TypeError, IndexError) as error:
-        raise UnreadableFile(f"has arrays that do not fit its elements: {' '.join(str(error).split())}") from error
+        raise UnreadableFile(
+            f"has arrays that do not fit its elements: {' '.join(str(error).split())}"
+        ) from error
     if set(of_cells) & set(FIBRE_INPUTS):
         return of_cells, np.concatenate(centres), mesh.data
     if set(of_points) & set(FIBRE_INPUTS):

@@ -40,7 +40,9 @@ def mesh_length_problem(lengths: Mapping[str, float]) -> tuple[str, str] | None:
     for name, length in lengths.items():
         if not SMALLEST_LENGTH <= length <= LARGEST_LENGTH:
             return name, f"{length:g} long; must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
-    smallest, largest = min(lengths, key=lambda k: lengths[k]), max(lengths, key=lambda k: lengths[k])
+    smallest, largest = min(lengths, key=lambda k: lengths[k]), max(
+        lengths, key=lambda k: lengths[k]
+    )
     if lengths[largest] <= LARGEST_LENGTH_RATIO * lengths[smallest]:
         return None
     return smallest, (
@@ -77,11 +79,16 @@ def named_groups() -> tuple[dict[str, int], dict[str, int]]:
     # waiting.
     faces, regions, kinds = _groups(2), _groups(3), gmsh.model.mesh.getElements(3)[0]
     if not regions or len(kinds) != 1 or not faces:
-        raise GeometryError(f"{len(regions)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces")
+        raise GeometryError(
+            f"{len(regions)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces"
+        )
     for _, volume in gmsh.model.getEntities(3):
         groups = gmsh.model.getPhysicalGroupsForEntity(3, volume)
         if len(groups) != 1 and len(gmsh.model.mesh.getElements(3, volume)[0]):
-            names = " and ".join(repr(name) for name, tag in regions.items() if tag in groups) or "no named one"
+            names = (
+                " and ".join(repr(name) for name, tag in regions.items() if tag in groups)
+                or "no named one"
+            )
             raise GeometryError(f"volume {volume} is in {names}; each must be in one named volume")
     return faces, regions
 
@@ -165,7 +172,12 @@ def ring(
     part, found = len(inner_lines) // blocks, []
     for i in range(blocks):
         k, m, next_spoke = i * part, (i + 1) * part % len(inner), spokes[(i + 1) % len(spokes)]
-        edges = [spokes[i], outer_lines[k : k + part], reverse(next_spoke), reverse(inner_lines[k : k + part])]
+        edges = [
+            spokes[i],
+            outer_lines[k : k + part],
+            reverse(next_spoke),
+            reverse(inner_lines[k : k + part]),
+        ]
         found.append(block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
     return found
 
@@ -180,7 +192,12 @@ def extrude(
 ) -> None:
     """Extrude a plane section along z, mesh it, and name the volume and the faces."""
     made = gmsh.model.geo.extrude(
-        [(2, surface) for surface in section], 0.0, 0.0, length, numElements=[layers], recombine=element == "hexahedron"
+        [(2, surface) for surface in section],
+        0.0,
+        0.0,
+        length,
+        numElements=[layers],
+        recombine=element == "hexahedron",
     )
     gmsh.model.geo.synchronize()
     volumes = [tag for dimension, tag in made if dimension == 3]
@@ -188,7 +205,9 @@ def extrude(
     groups = {ends[0]: list(section), ends[1]: tops}
     for name, curves in sides.items():
         # A boundary curve bounds only two faces: the section and the face that it sweeps.
-        swept = {int(face) for curve in curves for face in gmsh.model.getAdjacencies(1, abs(curve))[0]}
+        swept = {
+            int(face) for curve in curves for face in gmsh.model.getAdjacencies(1, abs(curve))[0]
+        }
         groups[name] = sorted(swept - set(section))
     for name, surfaces in groups.items():
         gmsh.model.addPhysicalGroup(2, surfaces, name=name)
@@ -210,7 +229,9 @@ def raise_degree(degree: int, bulge: Callable[[Array], npt.NDArray[Any]]) -> Non
     (kind,), _, (nodes,) = mesh.getElements(3)
     _, _, _, count, local, corners = mesh.getElementProperties(kind)
     cells = row[nodes].reshape(-1, count)
-    weights = mesh.getBasisFunctions(straight, local[3 * corners :], "Lagrange")[1].reshape(-1, corners)
+    weights = mesh.getBasisFunctions(straight, local[3 * corners :], "Lagrange")[1].reshape(
+        -1, corners
+    )
     mean = np.einsum("kc,ncd->nkd", weights, old[cells[:, :corners]])
     radius = np.hypot(*np.moveaxis(old[cells[:, :corners], :2], 2, 0)) @ weights.T
     chord = np.hypot(mean[..., 0], mean[..., 1])

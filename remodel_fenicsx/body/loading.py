@@ -110,7 +110,8 @@ class Loading:
             self._prescribe_face(face, component, self.constant(0.0))
         elif face in self.domain.faces and component != 2:
             raise SceneError(
-                f"model.kinematics = {self.kinematics.name!r}: {face} " "is constrained laterally, so the body bulges"
+                f"model.kinematics = {self.kinematics.name!r}: {face} "
+                "is constrained laterally, so the body bulges"
             )
         elif self._begins.setdefault(component, face) != face:
             self._prescribe_strain(component, self.constant(0.0))
@@ -136,17 +137,22 @@ class Loading:
         subspace = self.kinematics.subspace(self.space, component)
         collapsed, _ = subspace.collapse()
         dofs = dolfinx.fem.locate_dofs_geometrical(
-            (subspace, collapsed), lambda x: np.linalg.norm(x - np.reshape(point, (3, 1)), axis=0) < tolerance
+            (subspace, collapsed),
+            lambda x: np.linalg.norm(x - np.reshape(point, (3, 1)), axis=0) < tolerance,
         )
         owned = subspace.dofmap.index_map.size_local * subspace.dofmap.index_map_bs
         found = self.domain.mesh.comm.allreduce(int(np.sum(dofs[0] < owned)), MPI.SUM)
         if found != 1:
             raise ValueError(f"{found} mesh nodes at {point}: a support needs exactly one")
         # With the dofs of the subspace only, the value is a Constant, as for faces.
-        self.boundary_conditions.append(dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace))
+        self.boundary_conditions.append(
+            dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace)
+        )
 
     @partial(with_old_arguments, "hold_facets")
-    def hold_facets(self, facets: NDArray[np.int32], name: str | None = None, direction: Array | float = 0.0) -> None:
+    def hold_facets(
+        self, facets: NDArray[np.int32], name: str | None = None, direction: Array | float = 0.0
+    ) -> None:
         """Prescribe u = magnitude times `direction` on local facets, for the full displacement.
 
         Parameters
@@ -165,13 +171,17 @@ class Loading:
         """
         self._check_three_dimensional("fixed facets")
         value = dolfinx.fem.Constant(self.domain.mesh, np.zeros(3, dtype=PETSc.ScalarType))
-        dofs = dolfinx.fem.locate_dofs_topological(self.space, self.domain.mesh.topology.dim - 1, facets)
+        dofs = dolfinx.fem.locate_dofs_topological(
+            self.space, self.domain.mesh.topology.dim - 1, facets
+        )
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
         if name is not None:
             self._take(name, value, direction)
 
     # ------------------------------------------------------------ loads
-    def add_dead_force(self, name: str, face: str, component: int, length: float | None = None) -> None:
+    def add_dead_force(
+        self, name: str, face: str, component: int, length: float | None = None
+    ) -> None:
         """Add a dead load: a total force on a face along a coordinate axis.
 
         The nominal traction is constant, force over reference area.
@@ -214,7 +224,9 @@ class Loading:
         normal = ufl.FacetNormal(self.domain.mesh)
         measure = self.surface_measure(face)
         F = self.kinematics.deformation_gradient
-        self.add_term(lambda u, v: pressure * ufl.inner(ufl.cofac(F(u)) * normal, v) * self.weight * measure)
+        self.add_term(
+            lambda u, v: pressure * ufl.inner(ufl.cofac(F(u)) * normal, v) * self.weight * measure
+        )
 
     def add_cavity_pressure(self, name: str, face: str) -> None:
         """Add the pressure of a cavity between a face and two plane caps across z.
@@ -230,7 +242,11 @@ class Loading:
         face
             Name of the face in `Domain.faces`.
         """
-        pressure, normal, measure = self.magnitude(name), ufl.FacetNormal(self.domain.mesh), self.surface_measure(face)
+        pressure, normal, measure = (
+            self.magnitude(name),
+            ufl.FacetNormal(self.domain.mesh),
+            self.surface_measure(face),
+        )
 
         def potential(u: Function) -> ufl.Form:
             place = ufl.SpatialCoordinate(self.domain.mesh) + self.kinematics.displacement(u)
@@ -265,10 +281,15 @@ class Loading:
         """
         shear = self.kinematics.shear()
         if shear is None:
-            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: " "must be 'point' for a prescribed shear")
+            raise SceneError(
+                f"model.kinematics = {self.kinematics.name!r}: "
+                "must be 'point' for a prescribed shear"
+            )
         self._take(name, shear, 1.0)
 
-    def add_prescribed_elongation(self, name: str, face: str, component: int, length: float) -> None:
+    def add_prescribed_elongation(
+        self, name: str, face: str, component: int, length: float
+    ) -> None:
         """Prescribe u_component = elongation * length on a face, the engineering strain.
 
         Parameters
@@ -386,7 +407,10 @@ class Loading:
 
     def residual_of_potentials(self, test: ufl.Argument) -> ufl.Form | None:
         """Return the residual of the loads with a potential, such as springs, or None."""
-        terms = [ufl.derivative(potential(self.unknown), self.unknown, test) for potential in self._potentials]
+        terms = [
+            ufl.derivative(potential(self.unknown), self.unknown, test)
+            for potential in self._potentials
+        ]
         return sum(terms) if terms else None
 
     def set(self, values: Mapping[str, float]) -> None:
@@ -433,11 +457,15 @@ class Loading:
 
     def _check_three_dimensional(self, what: str) -> None:
         if not self.kinematics.three_dimensional:
-            raise SceneError(f"model.kinematics = {self.kinematics.name!r}: must be 'full' for {what}")
+            raise SceneError(
+                f"model.kinematics = {self.kinematics.name!r}: must be 'full' for {what}"
+            )
 
     def _prescribe_strain(self, component: int, value: Constant) -> None:
         number, _ = self.kinematics.uniform_unknown(self.space, component)
-        self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, number.dofmap.list.flatten(), number))
+        self.boundary_conditions.append(
+            dolfinx.fem.dirichletbc(value, number.dofmap.list.flatten(), number)
+        )
 
     def _prescribe_face(self, face: str, component: int, value: Constant) -> None:
         subspace = self.kinematics.subspace(self.space, component)
@@ -449,7 +477,10 @@ class Loading:
 
 
 def _setter(
-    value: Function, dofs: NDArray[np.int32], component: int, displacement: Callable[[float, Array], Array]
+    value: Function,
+    dofs: NDArray[np.int32],
+    component: int,
+    displacement: Callable[[float, Array], Array],
 ) -> Callable[[float], None]:
     """Return a function that sets one component of the values on a face for a magnitude."""
     places = value.function_space.tabulate_dof_coordinates()[dofs]

@@ -77,9 +77,14 @@ def oriented(surface: Surface, name: str) -> Surface:
         raise SceneError(f"{name}: the surface is closed; cut the ends of the vessel open")
     if (parts := mesh.connectivity()["RegionId"].max() + 1) > 1:
         raise SceneError(f"{name}: has {parts} disconnected parts; must be one lumen")
-    normals = mesh.compute_normals(point_normals=False, split_vertices=False, auto_orient_normals=False)
+    normals = mesh.compute_normals(
+        point_normals=False, split_vertices=False, auto_orient_normals=False
+    )
     points, triangles = surface.points, normals.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
-    volume, area = _signed_volume(points, triangles), np.linalg.norm(area_vectors(points[triangles]), axis=1).sum()
+    volume, area = (
+        _signed_volume(points, triangles),
+        np.linalg.norm(area_vectors(points[triangles]), axis=1).sum(),
+    )
     if abs(volume) <= HOLLOW * area**1.5:
         raise SceneError(f"{name}: the surface is flat and encloses no lumen")
     if volume < 0:
@@ -127,7 +132,9 @@ def by_gmsh(file: str) -> dict[str, Any]:
             gmsh.option.setNumber(option, float(read["size"]))
         gmsh.model.mesh.generate(2)
         points, blocks = of_gmsh()
-    used, triangles = np.unique(next(b.nodes for b in blocks if b.kind == "triangle"), return_inverse=True)
+    used, triangles = np.unique(
+        next(b.nodes for b in blocks if b.kind == "triangle"), return_inverse=True
+    )
     return {"points": points[used], "triangles": triangles.reshape(-1, 3)}
 
 
@@ -184,7 +191,9 @@ def extrude_wall(
 
     Each layer has its fraction of the thickness.
     """
-    ends, counts = np.cumsum([0.0, *layers.values()]), shared_out([*layers.values()], max(through, len(layers)))
+    ends, counts = np.cumsum([0.0, *layers.values()]), shared_out(
+        [*layers.values()], max(through, len(layers))
+    )
     levels = Wall((*layers,), (*ends,), counts).nodes(1) / ends[-1]
     openings = rims(surface.triangles)
     size, layer = len(surface.points), np.arange(len(levels) - 1)[:, None, None]
@@ -192,7 +201,9 @@ def extrude_wall(
     tetrahedra = split_wedges(wedges.reshape(-1, 6)).reshape(-1, 4)
     normals = _normals(surface, openings)
     for _ in range(SMOOTHINGS):
-        points = (surface.points + levels[:, None, None] * thickness[:, None] * normals).reshape(-1, 3)
+        points = (surface.points + levels[:, None, None] * thickness[:, None] * normals).reshape(
+            -1, 3
+        )
         folded = np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) <= 0
         if not folded.any():
             break
@@ -200,7 +211,8 @@ def extrude_wall(
     else:
         place = points[tetrahedra[folded][0]].mean(axis=0)
         raise SceneError(
-            f"--thickness: too thick: the wall folds at {format_position(place)}, " "where the lumen is concave"
+            f"--thickness: too thick: the wall folds at {format_position(place)}, "
+            "where the lumen is concave"
         )
     _check_self_intersection(surface.points, points[-size:], thickness)
     of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(surface.triangles))
@@ -208,7 +220,9 @@ def extrude_wall(
     quads = [np.concatenate([rim, rim[:, ::-1] + size], axis=1) + size * layer for rim in openings]
     sides = [split_quads(each.reshape(-1, 4)) for each in quads]
     sides.sort(key=lambda side: float(np.linalg.norm(points[side].mean(axis=(0, 1)))))
-    faces |= {"inlet": sides[0]} | {f"outlet_{number}": side for number, side in enumerate(sides[1:], 1)}
+    faces |= {"inlet": sides[0]} | {
+        f"outlet_{number}": side for number, side in enumerate(sides[1:], 1)
+    }
     rim_edges, key = np.sort(np.concatenate(openings), axis=1), [len(points), 1]
     keys = np.unique(np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2) @ key)
     pairs = np.column_stack(np.divmod(keys, len(points)))
@@ -233,7 +247,9 @@ def extrude_wall(
 def _straightened(points: Array, tetrahedra: Integers) -> int:
     """Straighten edges of inverted elements until none is left; return the number of edges."""
     done: set[int] = set()
-    body: Any = SimpleNamespace(kind="tetrahedron", degree=2, points=points, cells=tetrahedra[:, ORDERS["tetra10"]])
+    body: Any = SimpleNamespace(
+        kind="tetrahedron", degree=2, points=points, cells=tetrahedra[:, ORDERS["tetra10"]]
+    )
     while True:
         twisted = tetrahedra[(jacobian_determinants(body) <= 0).any(axis=1)]
         middles = twisted[:, 4:]
@@ -266,14 +282,21 @@ def _check_self_intersection(inner: Array, outer: Array, thickness: Array) -> No
     distance, _ = cKDTree(inner).query(outer)
     if (crossed := distance < MIN_CLEARANCE * thickness).any():
         place = outer[int(np.argmax(crossed))]
-        raise SceneError(f"--thickness: too thick: the wall intersects the vessel at {format_position(place)}")
+        raise SceneError(
+            f"--thickness: too thick: the wall intersects the vessel at {format_position(place)}"
+        )
 
 
 # ---------------------------------------------------------------- the command
 
 
 def write_wall(
-    surface: Path, path: Path, thickness: str | None, layers: Sequence[str], size: float, through: int
+    surface: Path,
+    path: Path,
+    thickness: str | None,
+    layers: Sequence[str],
+    size: float,
+    through: int,
 ) -> list[str]:
     """Write the mesh of a wall to a new file, and return lines that describe it."""
     if path.suffix.lower() != ".msh":
@@ -286,10 +309,17 @@ def write_wall(
         raise SceneError(f"--through: must be an integer from 1 to {MOST_THROUGH}")
     shares, read = _thicknesses(layers), read_surface(surface)
     area = np.linalg.norm(area_vectors(read.points[read.triangles]), axis=1).sum()
-    number = 3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)  # for equilateral triangles
+    number = (
+        3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)
+    )  # for equilateral triangles
     if number > LARGEST_MESH:
-        raise SceneError(f"--size {size:g}: about {number:.2g} tetrahedra; must be at most {LARGEST_MESH:g}")
-    depth, radius = _thickness(thickness, shares, read), 2 * _signed_volume(read.points, read.triangles) / area
+        raise SceneError(
+            f"--size {size:g}: about {number:.2g} tetrahedra; must be at most {LARGEST_MESH:g}"
+        )
+    depth, radius = (
+        _thickness(thickness, shares, read),
+        2 * _signed_volume(read.points, read.triangles) / area,
+    )
     _check_units(radius, size, depth)
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: remeshing {len(read.triangles)} triangles takes minutes")
@@ -300,16 +330,24 @@ def write_wall(
     names = list(shares) or ["wall"]
     of_names = {2: {name: number for number, name in enumerate(wall.faces, 1)}}
     of_names[3] = {name: number for number, name in enumerate(names, len(wall.faces) + 1)}
-    blocks = [Block("triangle6", np.full(len(face), of_names[2][name]), face) for name, face in wall.faces.items()]
-    blocks += [Block("tetra10", len(wall.faces) + 1 + wall.layers, wall.tetrahedra[:, ORDERS["tetra10"]])]
+    blocks = [
+        Block("triangle6", np.full(len(face), of_names[2][name]), face)
+        for name, face in wall.faces.items()
+    ]
+    blocks += [
+        Block("tetra10", len(wall.faces) + 1 + wall.layers, wall.tetrahedra[:, ORDERS["tetra10"]])
+    ]
     write_new(path, gmsh_text(wall.points, blocks, of_names).encode())
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))
     nodes = np.unique(outer)
-    between = np.linalg.norm(wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1)
+    between = np.linalg.norm(
+        wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1
+    )
     lines = [
         f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, {max(through, len(names))} through the wall",
         f"thickness {between.min():.4g} to {between.max():.4g} at the nodes",
-        f"faces {', '.join(wall.faces)}; " + (f"regions {', '.join(names)}" if shares else "one region"),
+        f"faces {', '.join(wall.faces)}; "
+        + (f"regions {', '.join(names)}" if shares else "one region"),
     ]
     if wall.straight:
         lines.append(f"{wall.straight} edges are straight: curved ones would invert elements")
@@ -323,8 +361,14 @@ def _halved(face: Integers) -> Integers:
 
 def _check_units(radius: float, size: float, thickness: Array) -> None:
     """Check that the lengths are plausible for a vessel of this mean radius of the lumen."""
-    for option, length in (("--thickness", thickness.max()), ("--thickness", thickness.min()), ("--size", size)):
-        if length > MOST_RADII * radius or (option == "--thickness" and length < LEAST_RADII * radius):
+    for option, length in (
+        ("--thickness", thickness.max()),
+        ("--thickness", thickness.min()),
+        ("--size", size),
+    ):
+        if length > MOST_RADII * radius or (
+            option == "--thickness" and length < LEAST_RADII * radius
+        ):
             raise SceneError(
                 f"{option}: {length:.3g} is {length / radius:.3g} times the lumen's radius, which is {radius:.3g}: "
                 "is it in another unit than the surface?"
@@ -337,7 +381,9 @@ def _thicknesses(said: Sequence[str]) -> dict[str, float]:
     for text in said:
         name, _, number = text.partition("=")
         if not name.isidentifier() or name in found or (value := _positive(number)) is None:
-            raise SceneError(f"--layers {text}: must be NAME=THICKNESS, each name once, from the lumen outwards")
+            raise SceneError(
+                f"--layers {text}: must be NAME=THICKNESS, each name once, from the lumen outwards"
+            )
         found[name] = value
     return found
 
@@ -346,7 +392,9 @@ def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) 
     """Return the thickness at the points, (n,): a number, an array, or the layers' sum."""
     whole = sum(layers.values())
     if said is None and not layers:
-        raise SceneError("--thickness: missing; must be a number or an array of the surface; or set --layers")
+        raise SceneError(
+            "--thickness: missing; must be a number or an array of the surface; or set --layers"
+        )
     value = _positive(said or "")
     if said is None or value is not None:
         number = value or whole
@@ -355,7 +403,9 @@ def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) 
         return np.full(len(surface.points), number)
     if said not in surface.arrays:
         known = ", ".join(surface.arrays) or "none"
-        raise SceneError(f"--thickness {said}: must be a positive number, or an array at the points: {known}")
+        raise SceneError(
+            f"--thickness {said}: must be a positive number, or an array at the points: {known}"
+        )
     if not ((surface.arrays[said] > 0) & np.isfinite(surface.arrays[said])).all():
         raise SceneError(f"--thickness {said}: values of the array must be positive and finite")
     return surface.arrays[said]

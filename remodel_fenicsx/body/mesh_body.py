@@ -42,7 +42,14 @@ from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
 from remodel_fenicsx.model.tensors import Array, Flags, Integers
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, LARGEST_MESH, Mesh, OnFace, Support, faces_of
+from remodel_fenicsx.schema.settings import (
+    CONSTANT_FIELDS,
+    LARGEST_MESH,
+    Mesh,
+    OnFace,
+    Support,
+    faces_of,
+)
 from remodel_fenicsx.schema.tables import SceneError, validation_error, format_value
 from remodel_fenicsx.schema.units import LENGTH, LENGTH_UNITS, METRES, STRESS
 
@@ -57,7 +64,9 @@ log = logging.getLogger(__name__)
 
 HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that prevent motion along the normal
 ON_FACES: dict[str, Callable[[str], LoadKind]] = {
-    "pressure": lambda face: LoadKind(_by_hold_faces, f"pressure on the deformed face {face}", STRESS),
+    "pressure": lambda face: LoadKind(
+        _by_hold_faces, f"pressure on the deformed face {face}", STRESS
+    ),
     "displacement": lambda face: LoadKind(
         _by_hold_faces, f"displacement of the face {face} along its outward normal", LENGTH
     ),
@@ -77,11 +86,15 @@ def _by_hold_faces(shape: Any, loading: Any, name: str) -> None:
 def _faces(value: Any) -> Any:
     """Validate names or numbers, one or a list, as tuples."""
     if not isinstance(value, Mapping):
-        raise validation_error("must be a table: names or numbers of the file's faces or volumes, as in inner = 3")
+        raise validation_error(
+            "must be a table: names or numbers of the file's faces or volumes, as in inner = 3"
+        )
     found = {}
     for name, entry in value.items():
         entries = entry if isinstance(entry, (list, tuple)) else [entry]
-        if not entries or not all(isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries):
+        if not entries or not all(
+            isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries
+        ):
             rule = "must be a name or a number in the file, or a list of them; a face may be { file = 'surface.vtp' }"
             raise validation_error(rule, str(name), entry)
         found[str(name)] = tuple(entries)
@@ -120,7 +133,11 @@ def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
     for face, one in faces.items() if isinstance(faces, Mapping) else ():
         if isinstance(one, Mapping) and _ends_with(one.get("file"), SURFACES):
             files, found[face] = [*files, one["file"]], Path(one["file"]).stem
-    return {**geometry, "file": [*dict.fromkeys(files)], "faces": {**faces, **found}} if found else dict(geometry)
+    return (
+        {**geometry, "file": [*dict.fromkeys(files)], "faces": {**faces, **found}}
+        if found
+        else dict(geometry)
+    )
 
 
 def _numbers(key: str, entries: Names, names: Mapping[str, int], groups: Integers) -> list[int]:
@@ -143,7 +160,9 @@ class FileBody(WithRegions, FromFile):
     thickness_in_words: ClassVar[str] = "cube root of the volume"
 
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
-        json_schema_extra={"allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"}
+        json_schema_extra={
+            "allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"
+        }
     )
     """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
     `.stl`, `.ply`, `.obj`), which are faces under the names of their files
@@ -152,7 +171,9 @@ class FileBody(WithRegions, FromFile):
         default=None,
         min_length=1,
         description="For files not in Gmsh's format: the integer array that numbers faces and "
-        "volumes. Default: the first of " + ", ".join(f"`{name}`" for name in TAGS) + " in the file.",
+        "volumes. Default: the first of "
+        + ", ".join(f"`{name}`" for name in TAGS)
+        + " in the file.",
         json_schema_extra={"allowed": "the name of an array"},
     )
     file_unit: Literal["m", "cm", "mm", "um"] | None = Field(
@@ -170,7 +191,9 @@ class FileBody(WithRegions, FromFile):
     """Whether parts of the boundary may belong to no face. Otherwise such a part is rejected as a
     hole."""
     sha256: str | None = Field(
-        default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
+        default=None,
+        pattern="^[0-9a-f]{64}$",
+        json_schema_extra={"allowed": "64 hexadecimal digits"},
     )
     """SHA-256 of the file, or of several files together. The scene that a run stores has it, and
     rejects other files."""
@@ -183,7 +206,9 @@ class FileBody(WithRegions, FromFile):
     @model_validator(mode="after")
     def _units_are_both_there(self) -> Any:
         if self.file_unit is not None and self.length_unit is None:
-            raise validation_error("needs geometry.length_unit, the unit of the scene", "file_unit", self.file_unit)
+            raise validation_error(
+                "needs geometry.length_unit, the unit of the scene", "file_unit", self.file_unit
+            )
         return self
 
     @classmethod
@@ -226,7 +251,9 @@ class FileBody(WithRegions, FromFile):
         """Check that the refinement is a power of 2, because edges are halved."""
         if mesh.refinement & (mesh.refinement - 1):
             raise validation_error(
-                "must be a power of 2: the elements of a file are halved", "mesh.refinement", mesh.refinement
+                "must be a power of 2: the elements of a file are halved",
+                "mesh.refinement",
+                mesh.refinement,
             )
 
     # ------------------------------------------------------------ mesh
@@ -238,10 +265,16 @@ class FileBody(WithRegions, FromFile):
 
         return shared(partial(self.checked, mesh), comm or MPI.COMM_WORLD, self.name)
 
-    def checked(self, mesh: Mesh | None = None) -> tuple[MeshFile, mesh_faces.Boundary, dict[str, int]]:
+    def checked(
+        self, mesh: Mesh | None = None
+    ) -> tuple[MeshFile, mesh_faces.Boundary, dict[str, int]]:
         """Return the mesh, its boundary, and the numbers of its regions by name, on rank 0."""
         file = self._mesh()
-        scale = METRES[self.file_unit] / METRES[self.length_unit] if self.file_unit and self.length_unit else 1.0
+        scale = (
+            METRES[self.file_unit] / METRES[self.length_unit]
+            if self.file_unit and self.length_unit
+            else 1.0
+        )
         file = replace(file, points=scale * file.points)
         extent = float(np.ptp(file.points, axis=0).max())
         if not SMALLEST_LENGTH <= extent <= LARGEST_LENGTH:
@@ -265,11 +298,14 @@ class FileBody(WithRegions, FromFile):
     def _refined(self, file: MeshFile, mesh: Mesh) -> tuple[MeshFile, mesh_faces.Boundary]:
         """Return the mesh with smaller elements, or with elements of degree 2, and its boundary."""
         if file.degree != 1:
-            asked = f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}: {self._name}"
+            asked = (
+                f"mesh.refinement = {mesh.refinement}, mesh.degree = {mesh.degree}: {self._name}"
+            )
             raise SceneError(f"{asked} has elements of degree {file.degree}, which are not refined")
         if (number := len(file.cells) * mesh.refinement**3) > LARGEST_MESH:
             raise SceneError(
-                f"mesh.refinement = {mesh.refinement}: {number} elements; " f"must be at most {LARGEST_MESH}"
+                f"mesh.refinement = {mesh.refinement}: {number} elements; "
+                f"must be at most {LARGEST_MESH}"
             )
         file = refined(file, mesh.refinement, mesh.degree)
         text = "split into %d elements of degree %d; the faces stay plane as in the file"
@@ -298,7 +334,10 @@ class FileBody(WithRegions, FromFile):
         """Return the boundary with the body's faces, and the file's further named faces."""
         names, found = file.names[2], file.facet_groups
         asked = {face: (face,) for face in self.face_names} | self.faces
-        groups = {face: _numbers(f"faces.{face}", entries, names, found) for face, entries in asked.items()}
+        groups = {
+            face: _numbers(f"faces.{face}", entries, names, found)
+            for face, entries in asked.items()
+        }
         others = {*unique_in_order(found)}.difference(*groups.values())
         further = {name: [n] for name, n in names.items() if n in others and name not in groups}
         return mesh_faces.boundary_of(file, groups, self.open_boundary, further)
@@ -320,10 +359,14 @@ class FileBody(WithRegions, FromFile):
             return file
         groups, numbers = file.cell_groups.copy(), dict[str, int]()
         for name, entries in self.regions.items():
-            numbers[name], *others = _numbers(f"regions.{name}", entries, file.names[3], file.cell_groups)
+            numbers[name], *others = _numbers(
+                f"regions.{name}", entries, file.names[3], file.cell_groups
+            )
             groups[np.isin(groups, others)] = numbers[name]
         own = ~mesh_faces.shared_entities(file.corners, groups, numbers.values())
-        further = {name: number for name, number in file.names[3].items() if number not in numbers.values()}
+        further = {
+            name: number for name, number in file.names[3].items() if number not in numbers.values()
+        }
         return replace(
             file,
             cells=file.cells[own],
@@ -354,36 +397,53 @@ class FileBody(WithRegions, FromFile):
 
     def held_faces(self, supports: Supports) -> list[str]:
         """Return the names of all faces with a support other than 'free'."""
-        return [face for face, support in self.supports_of(supports).items() if support.kind != "free"]
+        return [
+            face for face, support in self.supports_of(supports).items() if support.kind != "free"
+        ]
 
     def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
         """Check that the faces exist, no rigid motion is free, and loads fit the supports."""
         for name in supports:
             if name not in domain.faces:
-                raise SceneError(f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}")
+                raise SceneError(
+                    f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}"
+                )
         from remodel_fenicsx.body.mesh_domain import check_supports
 
         chosen = self.supports_of(supports)
         check_supports(domain, chosen, "elongation" in loads)  # type: ignore[arg-type]
         moved = {"outlet": "elongation"} if "elongation" in loads else {}
         for name, (face, load) in faces_of(loads).items():
-            key, kind = f"loads.{name}.face = {format_value(face)}", chosen.get(face, Support(kind="free")).kind
+            key, kind = (
+                f"loads.{name}.face = {format_value(face)}",
+                chosen.get(face, Support(kind="free")).kind,
+            )
             if face not in domain.faces:
-                raise SceneError(f"{key}: the body has no such face; it has {', '.join(domain.faces)}")
+                raise SceneError(
+                    f"{key}: the body has no such face; it has {', '.join(domain.faces)}"
+                )
             if load == "displacement":
                 if kind not in HELD_ACROSS:
                     able = " or ".join(map(repr, HELD_ACROSS))
                     rule = f"its support ({kind!r}) lets it move; a face that is displaced must be {able}"
                     raise SceneError(f"{key}: {rule}")
                 if domain.boundary.goes_around(face):  # type: ignore[attr-defined]
-                    raise SceneError(f"{key}: this face goes around the body, so that there is no direction")
+                    raise SceneError(
+                        f"{key}: this face goes around the body, so that there is no direction"
+                    )
                 if face in moved:
-                    raise SceneError(f"{key}: loads.{moved[face]} moves this face too; one of them is enough")
+                    raise SceneError(
+                        f"{key}: loads.{moved[face]} moves this face too; one of them is enough"
+                    )
                 moved[face] = name
             elif kind in HELD_ACROSS:
-                raise SceneError(f"{key}: its support ({kind!r}) carries the pressure; must be a face that moves")
+                raise SceneError(
+                    f"{key}: its support ({kind!r}) carries the pressure; must be a face that moves"
+                )
 
-    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
+    def hold_faces(
+        self, loading: Loading, supports: Supports, modulus: float, loads: Loads
+    ) -> None:
         """Add the scene's and default supports, and pressures on faces. Collective."""
         from remodel_fenicsx.body.mesh_domain import GUIDE, add_support
 
@@ -393,7 +453,9 @@ class FileBody(WithRegions, FromFile):
         unit = f" {self.length_unit}" if self.length_unit else ""
         if domain.comm.rank == 0:
             words = f"{self.thickness_in_words} {domain.thickness:.6g}{unit}, with plane faces"
-            log.info("%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else "")
+            log.info(
+                "%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else ""
+            )
         on_faces = faces_of(loads)
         ways = {on.face: (name, 1.0) for name, on in on_faces.items() if on.kind == "displacement"}
         if "elongation" in loads:
@@ -423,7 +485,9 @@ def _middle(m: Any) -> Flags:
     from remodel_fenicsx.fem.compat import geometry_dofmap
 
     depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
-    return (depths.min(axis=1) <= 0.5 + NODES_AT_A_DEPTH) & (depths.max(axis=1) >= 0.5 - NODES_AT_A_DEPTH)
+    return (depths.min(axis=1) <= 0.5 + NODES_AT_A_DEPTH) & (
+        depths.max(axis=1) >= 0.5 - NODES_AT_A_DEPTH
+    )
 
 
 def _mean_over(elements: Callable[[Any], Flags]) -> AngleOf:
@@ -516,8 +580,12 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         """Check that inner and outer are not swapped, and warn of a wall of one element."""
         inner, outer = boundary.area("inner"), boundary.area("outer")
         if inner > outer:
-            words = f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
-            raise SceneError(f"geometry.faces.inner = {format_value(self._asked('inner'))}: {words}")
+            words = (
+                f"its area is {inner:.4g}, that of outer {outer:.4g}: are inner and outer swapped?"
+            )
+            raise SceneError(
+                f"geometry.faces.inner = {format_value(self._asked('inner'))}: {words}"
+            )
         if mesh_faces.through_the_wall(boundary):
             log.warning(
                 "the wall is one element thick in places, which resolves neither bending nor the "
@@ -544,7 +612,12 @@ class Solid(FileBody):
             "angle between chains and `geometry.axis` in the reference configuration, volume mean",
             lambda m: m.quadrature.nanmean(m.fibre_angle),
         ),
-        Column("volume", "length^3", "deformed volume", lambda m: m.quadrature.integral(np.linalg.det(m.F))),
+        Column(
+            "volume",
+            "length^3",
+            "deformed volume",
+            lambda m: m.quadrature.integral(np.linalg.det(m.F)),
+        ),
     )
     columns_on_request = cauchy_columns("x", "y", "z")
     angle_in_words = ("along the axis", "across")
@@ -575,12 +648,17 @@ def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     """Halve the edges of a mesh of plane elements `log2(refinement)` times, and set the degree."""
     with gmsh_model("file") as gmsh:
         model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
-        for dimension, rows, groups in ((3, file.cells, file.cell_groups), (2, file.facets, file.facet_groups)):
+        for dimension, rows, groups in (
+            (3, file.cells, file.cell_groups),
+            (2, file.facets, file.facet_groups),
+        ):
             for group in unique_in_order(groups):
                 entity = model.addDiscreteEntity(dimension)
                 mesh.addNodes(dimension, entity, number, file.points.reshape(-1))
                 number = []
-                mesh.addElementsByType(entity, SPLIT[file.kind][dimension], [], 1 + rows[groups == group].reshape(-1))
+                mesh.addElementsByType(
+                    entity, SPLIT[file.kind][dimension], [], 1 + rows[groups == group].reshape(-1)
+                )
                 if group:
                     model.addPhysicalGroup(dimension, [entity], group)
         for _ in range(refinement.bit_length() - 1):

@@ -77,13 +77,17 @@ class MeshDomain(Domain):
         mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
         psi = harmonic(slopes(mesh, degree, dx), self.facets("inlet"), self.facets("outlet"))
-        slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(mesh, np.float64(1.0))
+        slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(
+            mesh, np.float64(1.0)
+        )
         volume, total = (integral(jit.form(value * dx)) for value in (one, slope))
         return volume / total
 
 
 def shared(
-    read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]], comm: MPI.Intracomm, shape: str = "mesh"
+    read: Callable[[], tuple[MeshFile, Boundary, dict[str, int]]],
+    comm: MPI.Intracomm,
+    shape: str = "mesh",
 ) -> MeshDomain:
     """Distribute the mesh that rank 0 reads. Collective."""
     found = raise_on_all_ranks(comm, lambda: read() if comm.rank == 0 else None)
@@ -92,9 +96,21 @@ def shared(
     points: Array = np.empty((0, 3))
     if found is not None:
         file, boundary, regions = found
-        points, cells, groups = file.points, file.cells[:, node_order(file)], file.cell_groups.astype(np.int32)
+        points, cells, groups = (
+            file.points,
+            file.cells[:, node_order(file)],
+            file.cell_groups.astype(np.int32),
+        )
         extent = float(np.ptp(points, axis=0).max())
-        told = file.kind, file.degree, cells[:0], extent, regions, boundary, rims_of(file, boundary, "inner")
+        told = (
+            file.kind,
+            file.degree,
+            cells[:0],
+            extent,
+            regions,
+            boundary,
+            rims_of(file, boundary, "inner"),
+        )
     kind, degree, none, extent, regions, boundary, lines = comm.bcast(told)
     mesh = dolfinx.mesh.create_mesh(
         comm, cells=none if cells is None else cells, x=points, e=symbolic_mesh(kind, degree)
@@ -103,11 +119,16 @@ def shared(
     rows = np.concatenate([part.facets for part in parts])
     numbers = np.repeat(np.arange(len(parts)), [len(part.facets) for part in parts])
     of_parts = _tags_of_facets(mesh, boundary.facets[rows], numbers)
-    faces = {name: number for number, name in enumerate(dict.fromkeys(part.name for part in parts), start=1)}
+    faces = {
+        name: number
+        for number, name in enumerate(dict.fromkeys(part.name for part in parts), start=1)
+    }
     of_faces = np.array([faces[part.name] for part in parts], dtype=np.int32)[of_parts.values]
     tags = dolfinx.mesh.meshtags(mesh, of_parts.dim, of_parts.indices, of_faces)
     more: dict[str, Any] = {"boundary": boundary, "part_tags": of_parts, "rims": lines}
-    domain = MeshDomain(mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), **more)
+    domain = MeshDomain(
+        mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), **more
+    )
     return replace(domain, element_region=domain.scatter_elements(groups))
 
 
@@ -118,7 +139,9 @@ def _tags_of_facets(mesh: Mesh, corners: Integers, values: Integers) -> MeshTags
         mesh.topology.create_connectivity(dimension, other)
     listed = corners[here].astype(np.int64), values[here].astype(np.int32)
     entities, found = dolfinx.io.distribute_entity_data(mesh, dimension, *listed)
-    return dolfinx.mesh.meshtags_from_entities(mesh, dimension, dolfinx.graph.adjacencylist(entities), found)
+    return dolfinx.mesh.meshtags_from_entities(
+        mesh, dimension, dolfinx.graph.adjacencylist(entities), found
+    )
 
 
 # ---------------------------------------------------------------- supports of faces
@@ -142,7 +165,9 @@ def add_support(
         loading.supports[face] = None
     elif support.kind != "free":
         density = _density(loading, face, support, moves)
-        half, measure = loading.constant((support.stiffness or stiffness) / 2), loading.surface_measure(face)
+        half, measure = loading.constant(
+            (support.stiffness or stiffness) / 2
+        ), loading.surface_measure(face)
 
         def potential(u: Function) -> ufl.Form:
             return half * density(loading.kinematics.displacement(u)) * loading.weight * measure
@@ -151,7 +176,9 @@ def add_support(
         loading.supports[face] = potential
 
 
-def _density(loading: Loading, face: str, support: Support, moves: tuple[str, float] | None) -> Callable[[Expr], Expr]:
+def _density(
+    loading: Loading, face: str, support: Support, moves: tuple[str, float] | None
+) -> Callable[[Expr], Expr]:
     """Return a function of u: the energy density of springs over half their stiffness."""
     domain: Any = loading.domain
     if support.kind == "elastic":  # (u . N)^2 + s |u - (u . N) N|^2, with the local N
@@ -172,12 +199,20 @@ def _density(loading: Loading, face: str, support: Support, moves: tuple[str, fl
 def check_supports(domain: MeshDomain, supports: Mapping[str, Support], elongated: bool) -> None:
     """Check that no rigid motion is free, and that an elongation strains the body."""
     if free := free_motions(domain.boundary.faces, supports):
-        kinds = ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
+        kinds = (
+            ", ".join(f"{name} {support.kind!r}" for name, support in supports.items()) or "none"
+        )
         raise SceneError(f"supports ({kinds}): {free} of 6 rigid motions are unconstrained")
     sliding = [
-        part for part in domain.boundary.faces if supports.get(part.name, Support(kind="free")).kind == "sliding"
+        part
+        for part in domain.boundary.faces
+        if supports.get(part.name, Support(kind="free")).kind == "sliding"
     ]
-    if elongated and len(sliding) == 2 and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL:
+    if (
+        elongated
+        and len(sliding) == 2
+        and np.linalg.norm(np.cross(sliding[0].normal, sliding[1].normal)) > PARALLEL
+    ):
         raise SceneError(
             "loads.elongation: both ends slide and are not parallel, so the elongation would only "
             "shift the body; one end must be 'guided' or 'held'"
@@ -209,7 +244,9 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
             # single facet also constrains rotations. Springs along N only are taken at the
             # midpoints: around a tube they would constrain the facets, but not the round body.
             share = 0.0 if support.kind == "elastic" and not support.tangential else 0.5
-            for places in np.swapaxes((1 - share) * part.places[:, None] + share * part.corners, 0, 1):
+            for places in np.swapaxes(
+                (1 - share) * part.places[:, None] + share * part.corners, 0, 1
+            ):
                 # Displacements (facets, 6, 3) of unit motions along and about the axes.
                 turns = np.cross(np.eye(3)[None], (places - middle)[:, None] / size)
                 motions = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
@@ -222,7 +259,9 @@ def free_motions(parts: Sequence[Face], supports: Mapping[str, Support]) -> int:
 def _held_directions(support: Support, part: Face, places: Array) -> Array:
     """Return a support's constraint at a position of each facet of a part, (facets, 3, 3)."""
     share = {"held": 1.0, "elastic": support.tangential}.get(support.kind, 0.0)
-    normals = part.normals if support.kind == "elastic" else np.broadcast_to(part.normal, places.shape)
+    normals = (
+        part.normals if support.kind == "elastic" else np.broadcast_to(part.normal, places.shape)
+    )
     found: Array = share * np.eye(3) + (1 - share) * np.einsum("fi,fj->fij", normals, normals)
     if support.kind == "guided":
         around = np.cross(part.normal, places - part.centre)

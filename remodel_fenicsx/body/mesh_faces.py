@@ -22,7 +22,14 @@ dolfinx, basix = Late("dolfinx"), Late("basix")
 # Corners of the facets of an element, in Gmsh's order, counterclockwise seen from outside.
 FACETS = {
     "tetrahedron": ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)),
-    "hexahedron": ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
+    "hexahedron": (
+        (0, 3, 2, 1),
+        (4, 5, 6, 7),
+        (0, 1, 5, 4),
+        (1, 2, 6, 5),
+        (2, 3, 7, 6),
+        (3, 0, 4, 7),
+    ),
 }
 FLAT = 1e-12  # det J over the mean |det J| up to which an element is degenerate
 ROLES = ("inner", "outer", "inlet", "outlet")  # faces of a vessel
@@ -75,7 +82,9 @@ class Boundary:
         return min(face.flatness for face in self.parts(name)) < NOT_AROUND
 
 
-def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Groups = MappingProxyType({})) -> Boundary:
+def boundary_of(
+    file: MeshFile, groups: Groups, open_boundary: bool, others: Groups = MappingProxyType({})
+) -> Boundary:
     """Find the named faces on a body's boundary, and the other groups that are faces."""
     facets, cell, twice = _facets(file)
     places = file.points[facets]
@@ -95,14 +104,19 @@ def boundary_of(file: MeshFile, groups: Groups, open_boundary: bool, others: Gro
                 words = f"shares facets with the face {owner[row]!r}"
             elif key in as_rows(np.sort(twice, axis=1)):
                 words = "has facets inside the body"
-            raise FaceError(name, f"{words}, the first at {format_position(file.points[list(key)].mean(axis=0))}")
+            raise FaceError(
+                name,
+                f"{words}, the first at {format_position(file.points[list(key)].mean(axis=0))}",
+            )
         else:
             owner[found] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
         where, share = format_position(places[bare][0].mean(axis=0)), bare.sum()
         rule = f"{share} of {len(bare)} boundary facets are in no face, first at {where}"
-        raise UnreadableFile(rule + "; add them to geometry.faces, or set geometry.open_boundary = true")
+        raise UnreadableFile(
+            rule + "; add them to geometry.faces, or set geometry.open_boundary = true"
+        )
     faces = []
     for name in (*groups, *others):
         rows = np.flatnonzero(owner == name)
@@ -134,15 +148,22 @@ def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
     if file.degree == 1:
         return lines
     element = basix.create_element(basix.ElementFamily.P, basix.CellType[file.kind], 2)
-    edges = file.cells[boundary.cell[there]][:, node_order(file)][:, np.array(element.entity_closure_dofs[1])]
+    edges = file.cells[boundary.cell[there]][:, node_order(file)][
+        :, np.array(element.entity_closure_dofs[1])
+    ]
     middles = {frozenset(ends): middle for *ends, middle in as_rows(edges.reshape(-1, 3))}
-    return [np.column_stack([line, [middles[frozenset(ends)] for ends in as_rows(line)]]) for line in lines]
+    return [
+        np.column_stack([line, [middles[frozenset(ends)] for ends in as_rows(line)]])
+        for line in lines
+    ]
 
 
 def rims(facets: Integers) -> list[Integers]:
     """Return the closed lines that bound facets, as edges (n, 2) in the direction of the facets."""
     edges = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
-    _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    _, first, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
+    )
     alone = np.sort(first[count == 1])
     label = components(edges[alone], int(facets.max(initial=0)) + 1)
     return [edges[alone[label == one]] for one in unique_in_order(label)]
@@ -152,7 +173,9 @@ def cap_volume(points: Array, rim: Integers) -> float:
     """Return the volume of the cone between the origin and a flat cap on a line of edges."""
     a, b = points[rim[:, 0]], points[rim[:, 1]]
     m = points[rim[:, 2]] if rim.shape[1] == 3 else (a + b) / 2
-    vector = (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(axis=0) / 6  # area times normal
+    vector = (4 * (np.cross(a, m) + np.cross(m, b)) - np.cross(a, b)).sum(
+        axis=0
+    ) / 6  # area times normal
     return float(a.mean(axis=0) @ vector / 3)
 
 
@@ -192,16 +215,22 @@ def _checked_signs(file: MeshFile) -> Array:
     ordered = np.sort(file.corners, axis=1)
     _, first, count = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
-        raise UnreadableFile(f"element {file.cell_numbers[first[count > 1][0]]} is duplicated: in two named volumes?")
+        raise UnreadableFile(
+            f"element {file.cell_numbers[first[count > 1][0]]} is duplicated: in two named volumes?"
+        )
     extent = np.ptp(file.points, axis=0).max()
     if extent == 0:
         raise UnreadableFile("all nodes coincide")
     bodies = len(unique_in_order(components(file.corners, len(file.points))))
     if bodies > 1:
-        raise UnreadableFile(f"{bodies} bodies without common nodes; must be one (in Gmsh: BooleanFragments)")
+        raise UnreadableFile(
+            f"{bodies} bodies without common nodes; must be one (in Gmsh: BooleanFragments)"
+        )
     determinants = jacobian_determinants(file)
     signs: Array = np.sign(determinants.mean(axis=1))
-    bad = np.flatnonzero((determinants * signs[:, None]).min(axis=1) <= FLAT * np.abs(determinants).mean())
+    bad = np.flatnonzero(
+        (determinants * signs[:, None]).min(axis=1) <= FLAT * np.abs(determinants).mean()
+    )
     if len(bad):
         cell = int(bad[0])
         where = format_position(file.points[file.corners[cell]].mean(axis=0))
@@ -216,11 +245,15 @@ def jacobian_determinants(file: MeshFile) -> Array:
     """Return det J at the quadrature points of each element, (elements, points)."""
     kind = basix.CellType[file.kind]
     points, _ = basix.make_quadrature(kind, 2 * file.degree)
-    element = basix.create_element(basix.ElementFamily.P, kind, file.degree, basix.LagrangeVariant.gll_warped)
+    element = basix.create_element(
+        basix.ElementFamily.P, kind, file.degree, basix.LagrangeVariant.gll_warped
+    )
     table: Any = element.tabulate(1, np.asarray(points))
     slopes = table[1:, :, :, 0]  # (3, points, nodes)
     nodes = file.points[file.cells[:, node_order(file)]]
-    jacobians = np.tensordot(nodes, slopes, axes=(1, 2))  # (elements, coordinates, directions, points)
+    jacobians = np.tensordot(
+        nodes, slopes, axes=(1, 2)
+    )  # (elements, coordinates, directions, points)
     return det(np.moveaxis(jacobians, 3, 1))
 
 

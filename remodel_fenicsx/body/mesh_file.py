@@ -79,7 +79,10 @@ class MeshFile:
         """Facets by their corners, and elements."""
         (kind,) = (name for name, of_kind in VOLUMES.items() if of_kind == (self.kind, self.degree))
         side = "triangle" if self.kind == "tetrahedron" else "quad"
-        return [Block(side, self.facet_groups, self.facets), Block(kind, self.cell_groups, self.cells)]
+        return [
+            Block(side, self.facet_groups, self.facets),
+            Block(kind, self.cell_groups, self.cells),
+        ]
 
     @property
     def corners(self) -> Integers:
@@ -151,7 +154,9 @@ def read_exchange_file(path: Path) -> ExchangeFile:
     names, points, *others = arrays.values()
     (kinds, of_points, of_cells, groups), rest = json.loads(names.tobytes()), iter(others)
     cells = [*zip(kinds, rest, strict=False)]  # each zip consumes its part of the iterator
-    data_of_points, data_of_cells = (dict(zip(one, rest, strict=False)) for one in (of_points, of_cells))
+    data_of_points, data_of_cells = (
+        dict(zip(one, rest, strict=False)) for one in (of_points, of_cells)
+    )
     return ExchangeFile(points, cells, data_of_points, data_of_cells, groups, data)
 
 
@@ -186,7 +191,9 @@ def _of_vtk(module: str, reader: str, file: str) -> Arrays:
     grid = _read_by_vtk(module, reader, file, is_surface=False)
     if not grid.GetNumberOfCells():
         raise UnreadableFile("has no elements")
-    types, nodes = numbers(grid.GetCellTypesArray()), numbers(grid.GetCells().GetConnectivityArray())
+    types, nodes = numbers(grid.GetCellTypesArray()), numbers(
+        grid.GetCells().GetConnectivityArray()
+    )
     starts = numbers(grid.GetCells().GetOffsetsArray())
     changes: Any = np.flatnonzero(np.diff(types)) + 1
     cells = []
@@ -206,15 +213,23 @@ def arrays_msh(file: str) -> Arrays:
     data = Path(file).read_bytes()
     version = _FORMAT.match(data)
     if version is None:  # Gmsh would run a script
-        raise UnreadableFile("is not a Gmsh mesh in format 2.2 or 4.1 as text (in Gmsh: Mesh.Binary = 0)")
+        raise UnreadableFile(
+            "is not a Gmsh mesh in format 2.2 or 4.1 as text (in Gmsh: Mesh.Binary = 0)"
+        )
     if rest := _SECTION.sub(b"", data).split():
         words = b" ".join(rest[:9])[:40].decode("ascii", "replace")
         raise UnreadableFile(f"has {words!r} outside of its sections: is it truncated?")
-    is_old, number, sections = version[1] == b"2.2", itertools.count(1), dict(_SECTION.findall(data))
+    is_old, number, sections = (
+        version[1] == b"2.2",
+        itertools.count(1),
+        dict(_SECTION.findall(data)),
+    )
     # Numbers of lines in a section for each number in its head. Gmsh ignores further lines.
     for name, lines in {"Nodes": (1, 2), "Elements": (1, 1), "Entities": (1, 1, 1, 1)}.items():
         head, *rows = sections.get(name.encode(), b"0").strip().splitlines()
-        if len(rows) != sum(count * int(number) for count, number in zip(lines, head.split(), strict=False)):
+        if len(rows) != sum(
+            count * int(number) for count, number in zip(lines, head.split(), strict=False)
+        ):
             raise UnreadableFile(f"has other {name.lower()} than ${name} announces")
     if is_old:  # its elements have their own groups, independent of entities, and an order
         data = _OLD_TAGS.sub(lambda found: b"%d%b%b" % (next(number), found[1], found[2]), data)
@@ -225,7 +240,9 @@ def arrays_msh(file: str) -> Arrays:
         names = [(*group, name) for group in groups if (name := gmsh.model.getPhysicalName(*group))]
         points, blocks = of_gmsh(is_old)
     groups = np.concatenate([[], *(block.groups for block in blocks)])
-    return as_arrays(points, [(block.kind, block.nodes) for block in blocks], {}, {TAGS[0]: groups}, names)
+    return as_arrays(
+        points, [(block.kind, block.nodes) for block in blocks], {}, {TAGS[0]: groups}, names
+    )
 
 
 def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
@@ -240,7 +257,9 @@ def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
         for kind, numbers, nodes in zip(*model.mesh.getElements(dimension, entity), strict=True):
             name = GMSH_KINDS.get(kind) or model.mesh.getElementProperties(kind)[0]
             rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(numbers), -1)
-            found.setdefault(name, []).extend((numbers, np.full(len(rows), group), rows) for group in groups or [0])
+            found.setdefault(name, []).extend(
+                (numbers, np.full(len(rows), group), rows) for group in groups or [0]
+            )
     blocks = []
     for name, parts in found.items():
         numbers, of_groups, rows = map(np.concatenate, zip(*parts, strict=True))
@@ -250,7 +269,11 @@ def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
 
 
 def as_arrays(
-    points: Array, cells: Blocks, point_data: Arrays, cell_data: Arrays, group_names: Sequence[object] = ()
+    points: Array,
+    cells: Blocks,
+    point_data: Arrays,
+    cell_data: Arrays,
+    group_names: Sequence[object] = (),
 ) -> Arrays:
     """Return an `ExchangeFile` as the child transfers it: names, and arrays in their order."""
     names = [[kind for kind, _ in cells], [*point_data], [*cell_data], group_names]
@@ -268,8 +291,12 @@ def _in_gmsh_order(kind: str, rows: Integers) -> tuple[str, Integers]:
 ARRAY = "array "  # prefix of the name of an array that a child transfers
 # Letters of Python's `struct`.
 PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-PLY_TYPES = dict(zip("char uchar short ushort int uint float double".split(), "bBhHiIfd", strict=True))
-PLY_TYPES |= dict(zip("int8 uint8 int16 uint16 int32 uint32 float32 float64".split(), "bBhHiIfd", strict=True))
+PLY_TYPES = dict(
+    zip("char uchar short ushort int uint float double".split(), "bBhHiIfd", strict=True)
+)
+PLY_TYPES |= dict(
+    zip("int8 uint8 int16 uint16 int32 uint32 float32 float64".split(), "bBhHiIfd", strict=True)
+)
 SURFACES = (".vtp", ".stl", ".ply", ".obj")  # suffixes
 
 
@@ -287,8 +314,15 @@ def triangles_of(path: Path) -> tuple[Surface, bytes]:
         found, data = read_guarded(path, f"{__name__}:{path.suffix[1:].lower()}")
     except UnreadableFile as error:
         raise UnreadableFile(f"{error}; save it again in ParaView, as VTP or binary STL") from None
-    points, triangles = found.pop("points").astype(np.float64), found.pop("triangles").astype(np.int64)
-    return Surface(points, triangles, {name.removeprefix(ARRAY): values for name, values in found.items()}), data
+    points, triangles = found.pop("points").astype(np.float64), found.pop("triangles").astype(
+        np.int64
+    )
+    return (
+        Surface(
+            points, triangles, {name.removeprefix(ARRAY): values for name, values in found.items()}
+        ),
+        data,
+    )
 
 
 # ---------------------------------------------------------------- in the child process
@@ -321,7 +355,9 @@ def ply(file: str) -> Arrays:
         points, polygons = _ply_numbers(header, order, body[body.index(b"\n") + 1 :])
         places = np.column_stack([points.pop(axis) for axis in "xyz"]).astype(np.float64)
     except (IndexError, KeyError, StopIteration, ValueError, struct.error):
-        raise UnreadableFile("has other numbers than its header announces: is it truncated?") from None
+        raise UnreadableFile(
+            "has other numbers than its header announces: is it truncated?"
+        ) from None
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
@@ -338,7 +374,9 @@ def ply(file: str) -> Arrays:
     return _triangulated(surface)
 
 
-def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[dict[str, Any], list[int]]:
+def _ply_numbers(
+    header: Sequence[list[str]], order: str, body: bytes
+) -> tuple[dict[str, Any], list[int]]:
     """Return point arrays by name, and polygons, each after the number of its corners."""
     is_text, at = order == "=", 0
     body = np.array(body.split(), dtype=np.float64).tobytes() if is_text else body
@@ -354,7 +392,11 @@ def _ply_numbers(header: Sequence[list[str]], order: str, body: bytes) -> tuple[
         }
         if all(len(kinds) == 1 for kinds in properties.values()):
             record = np.dtype([(name, order + kind) for name, (kind,) in properties.items()])
-            found = np.frombuffer(body, record, abs(int(count)), at) if int(count) else np.empty(0, record)
+            found = (
+                np.frombuffer(body, record, abs(int(count)), at)
+                if int(count)
+                else np.empty(0, record)
+            )
             at += found.nbytes
             points |= {name: found[name] for name in properties} if element == "vertex" else {}
             continue
@@ -379,11 +421,16 @@ def _triangulated(data: Any) -> Arrays:
 
     points = data.GetPoints()
     cells = [
-        numbers(each.GetConnectivityArray()) for each in (data.GetPolys(), data.GetStrips()) if each.GetNumberOfCells()
+        numbers(each.GetConnectivityArray())
+        for each in (data.GetPolys(), data.GetStrips())
+        if each.GetNumberOfCells()
     ]
     if not cells:
         raise UnreadableFile("has no triangles or other polygons")
-    if min(each.min() for each in cells) < 0 or max(each.max() for each in cells) >= data.GetNumberOfPoints():
+    if (
+        min(each.min() for each in cells) < 0
+        or max(each.max() for each in cells) >= data.GetNumberOfPoints()
+    ):
         raise UnreadableFile("has polygons with missing corners")
     if not np.isfinite(numbers(points.GetData())).all():
         raise UnreadableFile("has points whose coordinates are not finite")
@@ -398,7 +445,11 @@ def _triangulated(data: Any) -> Arrays:
     return {
         "points": numbers(found.GetPoints().GetData()),
         "triangles": numbers(found.GetPolys().GetConnectivityArray()).reshape(-1, 3),
-        **{ARRAY + name: values for name, values in vtk_arrays(found.GetPointData()).items() if values.ndim == 1},
+        **{
+            ARRAY + name: values
+            for name, values in vtk_arrays(found.GetPointData()).items()
+            if values.ndim == 1
+        },
     }
 
 
@@ -428,7 +479,9 @@ def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tuple[Any, ...]) -> MeshFile:
+def _read(
+    path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tuple[Any, ...]
+) -> MeshFile:
     mesh = read_exchange_file(path)
     points = np.asarray(mesh.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -438,8 +491,12 @@ def _read(path: Path, tags: str | None, surfaces: tuple[Path, ...], _changed: tu
         names.setdefault(dimension, {})[name] = number
     ends = np.cumsum([len(rows) for _, rows in mesh.cells])
     of_blocks = zip(mesh.cells, np.split(_tags(mesh, tags, bool(surfaces)), ends), strict=False)
-    blocks = [Block(kind, groups, np.asarray(rows, dtype=np.int64)) for (kind, rows), groups in of_blocks]
-    found = assembled(points, blocks, {dimension: names[dimension] for dimension in (2, 3)}, mesh.data)
+    blocks = [
+        Block(kind, groups, np.asarray(rows, dtype=np.int64)) for (kind, rows), groups in of_blocks
+    ]
+    found = assembled(
+        points, blocks, {dimension: names[dimension] for dimension in (2, 3)}, mesh.data
+    )
     for surface in surfaces:
         found = _with_surface(found, surface)
     return found
@@ -462,11 +519,15 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
         raise UnreadableFile(f"{path.name}: {error}") from None
     corners = surface.points[surface.triangles]
     away, nodes = cKDTree(file.points).query(corners)
-    far = away > SAME_NODE * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1, keepdims=True)
+    far = away > SAME_NODE * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(
+        axis=1, keepdims=True
+    )
     if far.any():
         where = f"at {format_position(corners[far][0])}, the nearest is {away[far][0]:.3g} away"
         rule = f"{where}: is it the surface of this mesh, in its unit?"
-        raise UnreadableFile(f"{path.name}: {far.sum()} triangle corners are not nodes of the mesh, the first {rule}")
+        raise UnreadableFile(
+            f"{path.name}: {far.sum()} triangle corners are not nodes of the mesh, the first {rule}"
+        )
     number = 1 + max([*unique_in_order(file.facet_groups), *file.names[2].values()], default=0)
     return replace(
         file,
@@ -474,7 +535,9 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
         facet_groups=np.append(file.facet_groups, np.full(len(nodes), number)),
         names={**file.names, 2: {**file.names[2], path.stem: number}},
         surfaces={**file.surfaces, path.name: data},
-        sha256=hashlib.sha256(f"{file.sha256} {hashlib.sha256(data).hexdigest()}".encode()).hexdigest(),
+        sha256=hashlib.sha256(
+            f"{file.sha256} {hashlib.sha256(data).hexdigest()}".encode()
+        ).hexdigest(),
     )
 
 
@@ -488,10 +551,15 @@ def _tags(mesh: ExchangeFile, asked: str | None, may_be_none: bool) -> Integers:
         wanted = repr(asked) if asked else " or ".join(map(repr, TAGS))
         there = ", ".join(map(repr, arrays)) or "none"
         raise UnreadableFile(
-            f"has no array {wanted} with the numbers of faces and volumes (geometry.tags); " f"it has {there}"
+            f"has no array {wanted} with the numbers of faces and volumes (geometry.tags); "
+            f"it has {there}"
         )
     numbers = np.asarray(arrays[name], dtype=np.float64)
-    if numbers.size != count or not np.isfinite(numbers).all() or (numbers != np.rint(numbers)).any():
+    if (
+        numbers.size != count
+        or not np.isfinite(numbers).all()
+        or (numbers != np.rint(numbers)).any()
+    ):
         raise UnreadableFile(f"the array {name!r} must have an integer for each element")
     return numbers.reshape(-1).astype(np.int64)
 
@@ -512,7 +580,9 @@ _SEEN = np.array(
         (5, 4, 3, 2, 1, 0),
     ]
 )
-_SPLIT = np.array([[(0, 1, 2, 4), (0, 4, 2, 5), (0, 4, 5, 3)], [(0, 1, 2, 5), (0, 1, 5, 4), (0, 4, 5, 3)]])
+_SPLIT = np.array(
+    [[(0, 1, 2, 4), (0, 4, 2, 5), (0, 4, 5, 3)], [(0, 1, 2, 5), (0, 1, 5, 4), (0, 4, 5, 3)]]
+)
 
 
 def split_wedges(nodes: Integers) -> Integers:
@@ -550,13 +620,19 @@ def _numbered(blocks: list[Block]) -> Iterator[tuple[Integers, Block]]:
         yield np.arange(start, start + len(block.nodes)), block
 
 
-def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int]], data: bytes) -> MeshFile:
+def assembled(
+    points: Array, blocks: list[Block], names: dict[int, dict[str, int]], data: bytes
+) -> MeshFile:
     """Check points and blocks of elements, and return them as a `MeshFile`."""
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
-        raise UnreadableFile(f"a node is at {tuple(points[bad][0].tolist())}: coordinates must be finite")
+        raise UnreadableFile(
+            f"a node is at {tuple(points[bad][0].tolist())}: coordinates must be finite"
+        )
     for number, block in _numbered(blocks):
-        if block.kind not in (*VOLUMES, *FACET_CORNERS, WEDGE) and not block.kind.startswith(("vertex", "line")):
+        if block.kind not in (*VOLUMES, *FACET_CORNERS, WEDGE) and not block.kind.startswith(
+            ("vertex", "line")
+        ):
             raise UnreadableFile(f"elements of type {block.kind!r}; must be {ALLOWED_ELEMENTS}")
         if (lost := ((block.nodes < 0) | (block.nodes >= len(points))).any(axis=1)).any():
             raise UnreadableFile(f"element {number[lost][0]} has a missing node")
@@ -573,7 +649,9 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
     kind, degree = kinds[0]
     corners = 3 if kind == "tetrahedron" else 4
     flat = [block for block in blocks if FACET_CORNERS.get(block.kind) == corners]
-    facets = np.concatenate([np.empty((0, corners), dtype=np.int64), *(block.nodes[:, :corners] for block in flat)])
+    facets = np.concatenate(
+        [np.empty((0, corners), dtype=np.int64), *(block.nodes[:, :corners] for block in flat)]
+    )
     cells = np.concatenate([block.nodes for _, block in solid])
     used, rows = np.unique(cells, return_inverse=True)  # Gmsh also writes nodes without elements
     row_of = np.full(len(points), -1, dtype=np.int64)
@@ -593,17 +671,30 @@ def assembled(points: Array, blocks: list[Block], names: dict[int, dict[str, int
     )
 
 
-def gmsh_text(points: Array, blocks: Iterable[Block], names: Mapping[int, Mapping[str, int]]) -> str:
+def gmsh_text(
+    points: Array, blocks: Iterable[Block], names: Mapping[int, Mapping[str, int]]
+) -> str:
     """Format a mesh as a Gmsh file, format 2.2, with nodes numbered 1, 2, ... in their order."""
     numbers = {kind: number for number, kind in GMSH_KINDS.items()}
-    groups = [f'{dimension} {number} "{name}"' for dimension, by in names.items() for name, number in by.items()]
+    groups = [
+        f'{dimension} {number} "{name}"'
+        for dimension, by in names.items()
+        for name, number in by.items()
+    ]
     places = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points]
     rows = [
         f"{numbers[kind]} 2 {group} {group} {' '.join(map(str, row))}"
         for kind, of_rows, nodes in blocks
         for group, row in zip(of_rows, as_rows(nodes + 1), strict=True)
     ]
-    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(groups)), *groups]
+    lines = [
+        "$MeshFormat",
+        "2.2 0 8",
+        "$EndMeshFormat",
+        "$PhysicalNames",
+        str(len(groups)),
+        *groups,
+    ]
     lines += ["$EndPhysicalNames"]
     for section, found in (("Nodes", places), ("Elements", rows)):
         listed = (f"{number} {row}" for number, row in enumerate(found, start=1))

@@ -72,7 +72,9 @@ def revolved(points: Array, quadrilaterals: Integers) -> Body:
     # Negative angles make the volumes of VTK's hexahedra positive; quadrilaterals have x before z.
     angles = -2 * np.pi * np.arange(ROUND + 1)[:, None] / ROUND
     radii, z = points[:, 0], np.broadcast_to(points[:, 2], (ROUND + 1, len(points)))
-    return _swept(np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1), quadrilaterals)
+    return _swept(
+        np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1), quadrilaterals
+    )
 
 
 _MIRRORED = {8: (0, 3, 2, 1, 4, 7, 6, 5), 4: (0, 2, 1, 3)}  # order of the corners of a mirror image
@@ -108,7 +110,9 @@ def box(*sides: float) -> Body:
 
 def cylinder(radius: float, length: float) -> Body:
     """Return a cylinder about z of hexahedra with one edge on the axis."""
-    return revolved(*extended(np.array([(0.0, 0.0, 0.0), (radius, 0.0, 0.0)]), np.array([[0, 1]]), length))
+    return revolved(
+        *extended(np.array([(0.0, 0.0, 0.0), (radius, 0.0, 0.0)]), np.array([[0, 1]]), length)
+    )
 
 
 # ---------------------------------------------------------------- buckling
@@ -213,7 +217,9 @@ def choice(scene: ReducedScene) -> Choice:
         return Choice(scene.model.kinematics, found)
     if buckling_risks(scene):
         return Choice("full", found)
-    exact = (name for name, reasons in found.items() if not reasons and not is_for_means(scene, name))
+    exact = (
+        name for name, reasons in found.items() if not reasons and not is_for_means(scene, name)
+    )
     return Choice(next(exact, "full"), found)
 
 
@@ -252,7 +258,11 @@ def for_means(scene: ReducedScene) -> str:
     """Return the cheapest kinematics that is right for means over many random seeds, or `auto`."""
     if buckling_risks(scene):
         return AUTO
-    found = (name for name in scene.geometry.reductions if is_for_means(scene, name) and not objections(scene, name))
+    found = (
+        name
+        for name in scene.geometry.reductions
+        if is_for_means(scene, name) and not objections(scene, name)
+    )
     return next(found, AUTO)
 
 
@@ -306,8 +316,12 @@ def too_many_elements(scene: ReducedScene) -> str:
     name, refinement = choice(scene).name, scene.mesh.refinement
     if (number := elements(scene, name)) <= LARGEST_MESH:
         return ""
-    dimension = {"interval": 1, "quadrilateral": 2}.get(KINEMATICS[name].element(scene.mesh.element), 3)
-    largest = math.floor(math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension))
+    dimension = {"interval": 1, "quadrilateral": 2}.get(
+        KINEMATICS[name].element(scene.mesh.element), 3
+    )
+    largest = math.floor(
+        math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension)
+    )
     return f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
 
 
@@ -372,7 +386,9 @@ def symmetric_law(scene: ReducedScene) -> str | None:
 def round_about_z(scene: ReducedScene) -> str | None:
     """Require cells that are equal in every half-plane through the z axis."""
     axes = scene.cells.axes
-    if axes == "cylindrical" or (axes == "global" and all(a == b == 0 for a, b, _ in _dimensions(scene))):
+    if axes == "cylindrical" or (
+        axes == "global" and all(a == b == 0 for a, b, _ in _dimensions(scene))
+    ):
         return None
     return f"cells.axes = {axes!r}: cells along x and along the diagonal differ"
 
@@ -380,7 +396,11 @@ def round_about_z(scene: ReducedScene) -> str | None:
 def symmetric_planes(scene: ReducedScene) -> str | None:
     """Require cells whose mirror images in x = 0 and y = 0 are cells of the body."""
     axes = scene.cells.axes
-    return None if axes in ("cylindrical", "global") else f"cells.axes = {axes!r} may have no planes of symmetry"
+    return (
+        None
+        if axes in ("cylindrical", "global")
+        else f"cells.axes = {axes!r} may have no planes of symmetry"
+    )
 
 
 def homogeneous(scene: ReducedScene) -> str | None:
@@ -410,11 +430,16 @@ def known_loads(name: str) -> Rule:
     def rule(scene: ReducedScene) -> str | None:
         kinds = scene.geometry.loads
         unknown = [f"loads.{load}" for load in scene.loads if name not in kinds[load].reductions]
-        return f"{', '.join(unknown)} would have to be applied to the whole body" if unknown else None
+        return (
+            f"{', '.join(unknown)} would have to be applied to the whole body" if unknown else None
+        )
 
     return rule
 
 
 def _dimensions(scene: ReducedScene) -> list[tuple[float, ...]]:
     """Return the initial l1, l2, l3 of the first cell of each region."""
-    return [tuple(map(float, properties.cells.dimensions(1)[0])) for properties in scene.properties().values()]
+    return [
+        tuple(map(float, properties.cells.dimensions(1)[0]))
+        for properties in scene.properties().values()
+    ]

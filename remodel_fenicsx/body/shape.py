@@ -102,7 +102,9 @@ class Column:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w .@+-]+", self.name):
-            raise ValueError(f"column {self.name!r}: must consist of letters, digits, spaces and _ . + - @")
+            raise ValueError(
+                f"column {self.name!r}: must consist of letters, digits, spaces and _ . + - @"
+            )
 
     def of_case(self, number: int) -> Column:
         """Return this column for another load case.
@@ -113,7 +115,9 @@ class Column:
             Number of the load case, from 1.
         """
         name, meaning = f"{self.name}@{number}", f"{self.meaning}, in load case {number}"
-        return replace(self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number)))
+        return replace(
+            self, name=name, meaning=meaning, value=lambda m: self.value(m.of_case(number))
+        )
 
 
 Columns = tuple[Column, ...]
@@ -127,7 +131,9 @@ PROFILE = tuple(f"angle_profile_{number}" for number in range(PROFILE_PLACES))
 def profile_weights(depth: Array) -> Array:
     """Return hat functions about equal depths from 0 to 1, on a new axis; they sum to one."""
     return np.maximum(
-        0.0, 1.0 - np.abs(np.asarray(depth)[..., None] * (PROFILE_PLACES - 1) - np.arange(PROFILE_PLACES))
+        0.0,
+        1.0
+        - np.abs(np.asarray(depth)[..., None] * (PROFILE_PLACES - 1) - np.arange(PROFILE_PLACES)),
     )
 
 
@@ -220,7 +226,13 @@ COLUMNS: dict[str, Column] = {
 
 def _turnover_warnings(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
     """Make a column of a function of `evolution.turnover.Turnover`."""
-    return Column(name, unit, meaning, lambda m: float(value(m.observer.stepper.part("turnover"))), by_case=False)
+    return Column(
+        name,
+        unit,
+        meaning,
+        lambda m: float(value(m.observer.stepper.part("turnover"))),
+        by_case=False,
+    )
 
 
 COLUMNS_ON_REQUEST: dict[str, Column] = {
@@ -348,7 +360,10 @@ def columns_of(
     of_loads = (
         kind.make_column(name)
         for name, kind in kinds.items()
-        if not kind.makes_length_unknown or loads is None or name in loads or kind.column_name(name) in requested
+        if not kind.makes_length_unknown
+        or loads is None
+        or name in loads
+        or kind.column_name(name) in requested
     )
     always = (FIRST_COLUMN, *of_loads)
     of_regions = [column for name in regions for column in columns_of_region(name)]
@@ -359,7 +374,10 @@ def columns_of(
     extra = (on_request[name] for name in requested if name not in known)
     found = (*always, *(chosen or others), *extra)
     differ = [column for column in found if column.by_case and not column.after_pass]
-    return (*found, *(column.of_case(number) for number in range(2, cases + 1) for column in differ))
+    return (
+        *found,
+        *(column.of_case(number) for number in range(2, cases + 1) for column in differ),
+    )
 
 
 def columns_on_request(
@@ -368,7 +386,12 @@ def columns_on_request(
     """Return the columns of this shape's history that a scene must name, by name."""
     of_regions = [column for name in regions for column in shape.region_columns_on_request(name)]
     of_supports = [
-        Column(f"support_force_{face}", "force", SUPPORT_FORCE.format(face), partial(_support_force, face))
+        Column(
+            f"support_force_{face}",
+            "force",
+            SUPPORT_FORCE.format(face),
+            partial(_support_force, face),
+        )
         for face in held
         if re.fullmatch(NAME, face)
     ]
@@ -717,7 +740,9 @@ class Shape(_Is):  # type: ignore[misc]
             Loading of the body, to which the conditions are added.
         """
 
-    def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
+    def support(
+        self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None
+    ) -> None:
         """Add supports, and loads with magnitude zero.
 
         Parameters
@@ -780,7 +805,9 @@ class Shape(_Is):  # type: ignore[misc]
             If a face cannot, on all ranks: one line with the key.
         """
 
-    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
+    def hold_faces(
+        self, loading: Loading, supports: Supports, modulus: float, loads: Loads
+    ) -> None:
         """Add the supports `[supports.NAME]` of faces.
 
         Parameters
@@ -919,7 +946,12 @@ def uniaxial_columns(top: str, length: str) -> Columns:
         return float(1.0 + m.face_mean(top, m.displacement[:, 2]) / m.domain.dimensions[length])
 
     return (
-        Column("mean_stretch", "", "deformed length over reference length, mean over the top", mean_stretch),
+        Column(
+            "mean_stretch",
+            "",
+            "deformed length over reference length, mean over the top",
+            mean_stretch,
+        ),
         Column(
             "min_stretch",
             "",
@@ -968,13 +1000,21 @@ def cauchy_columns(*names: str) -> Columns:
         return m.quadrature.mean(m.stress[..., row, column])
 
     return tuple(
-        Column(f"cauchy_stress_{name}", "stress", f"Cauchy stress {name}, volume mean", partial(mean, name))
+        Column(
+            f"cauchy_stress_{name}",
+            "stress",
+            f"Cauchy stress {name}, volume mean",
+            partial(mean, name),
+        )
         for name in names
     )
 
 
 def homogeneous_bar(
-    bottom: str, top: str, dimensions: Callable[[Any], dict[str, float]], whole: Callable[[Any], reduced.Body]
+    bottom: str,
+    top: str,
+    dimensions: Callable[[Any], dict[str, float]],
+    whole: Callable[[Any], reduced.Body],
 ) -> reduced.Reduction:
     """Return the reduction "point", of uniform strain, for a body between two faces across z."""
 
@@ -988,5 +1028,12 @@ def homogeneous_bar(
         points = length * ([1.0, 0.0, 0.0] + share * [0.0, 0.0, 1.0])
         return lattice_domain(points, [1], degree, faces, shape.name, dimensions(shape), comm)
 
-    rules = (reduced.same_cells, reduced.symmetric_law, reduced.homogeneous, reduced.known_loads("point"))
-    return reduced.Reduction(build, lambda scene: 1, rules, global_axes, lambda shape, points, corners: whole(shape))
+    rules = (
+        reduced.same_cells,
+        reduced.symmetric_law,
+        reduced.homogeneous,
+        reduced.known_loads("point"),
+    )
+    return reduced.Reduction(
+        build, lambda scene: 1, rules, global_axes, lambda shape, points, corners: whole(shape)
+    )

@@ -147,7 +147,9 @@ def outer_radius(area: float, refinement: int = 1, degree: int = 1) -> float:
     return float(np.sqrt(area / (number * sector)))
 
 
-def draw_tendon(length: float, area: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1) -> None:
+def draw_tendon(
+    length: float, area: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1
+) -> None:
     """Draw and mesh the tendon in Gmsh: a core and four ring quarters, extruded."""
     radius = outer_radius(area, refinement, degree)
     number, quarter = AROUND * refinement, CORE * refinement
@@ -173,5 +175,7 @@ def core_boundary(radius: float, refinement: int) -> Array:
     round_side = model.circle(radius, number, -quarter // 2)
     corner = round_side[::quarter]
     fraction = np.arange(quarter)[:, None] / quarter
-    square = np.concatenate([(1.0 - fraction) * corner[i] + fraction * corner[(i + 1) % 4] for i in range(4)])
+    square = np.concatenate(
+        [(1.0 - fraction) * corner[i] + fraction * corner[(i + 1) % 4] for i in range(4)]
+    )
     return (1.0 - CORE_ROUNDNESS) * square + CORE_ROUNDNESS * round_side

@@ -16,7 +16,16 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.body.reductions import ReducedScene
-from remodel_fenicsx.body.shape import Column, End, LoadKind, Loads, Regions, Shape, Supports, check_lengths
+from remodel_fenicsx.body.shape import (
+    Column,
+    End,
+    LoadKind,
+    Loads,
+    Regions,
+    Shape,
+    Supports,
+    check_lengths,
+)
 from remodel_fenicsx.body.wall import (
     FACES,
     AngleOf,
@@ -47,13 +56,21 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 # ---------------------------------------------------------------- meshes of reductions
 
 
-def build_in_half_plane(dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
+def build_in_half_plane(
+    dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None = None
+) -> Domain:
     """Mesh the wall on the x axis (1) or in the half-plane y = 0, x > 0 (2), with the body's elements there."""
     from remodel_fenicsx.body.domain import lattice_domain
 
-    shape, degree, counts = scene.geometry, scene.mesh.degree, _counts(scene.mesh)[1 : dimension + 1]
+    shape, degree, counts = (
+        scene.geometry,
+        scene.mesh.degree,
+        _counts(scene.mesh)[1 : dimension + 1],
+    )
     wall = shape.wall(counts[0], scene.regions)
-    along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [np.zeros(1)]
+    along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [
+        np.zeros(1)
+    ]
     z, radii = np.meshgrid(*along, wall.nodes(degree), indexing="ij")
     points = np.stack([radii.ravel(), np.zeros(radii.size), z.ravel()], axis=1)
     faces = {
@@ -64,14 +81,18 @@ def build_in_half_plane(dimension: int, scene: ReducedScene, comm: MPI.Intracomm
     }
     if not counts[1:]:  # a ray has no ends
         faces = {name: faces[name] for name in ("inner", "outer")}
-    return wall.marked(lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm))
+    return wall.marked(
+        lattice_domain(points, counts, degree, faces, shape.name, _dimensions(shape), comm)
+    )
 
 
 def build_quarter(scene: ReducedScene, comm: MPI.Intracomm | None = None) -> Domain:
     """Mesh the quarter x > 0, y > 0, with one layer along z if all sections are equal."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)
-    return whole_tube(scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1)
+    return whole_tube(
+        scene.geometry, counts, mesh.element, mesh.degree, comm, scene.regions, quarters=1
+    )
 
 
 def layers(scene: ReducedScene) -> int:
@@ -80,11 +101,19 @@ def layers(scene: ReducedScene) -> int:
     return 1 if alike else PAPER[2] * scene.mesh.refinement
 
 
-def _spoke(wall: Wall, number: int, corner: int, start: model.Point, stop: model.Point) -> list[int]:
+def _spoke(
+    wall: Wall, number: int, corner: int, start: model.Point, stop: model.Point
+) -> list[int]:
     """Add a chain of curves through the wall between the corners of one number on its two faces."""
-    inside = [model.points(model.circle(radius, number)[[corner]])[0] for radius in wall.radii[1:-1]]
+    inside = [
+        model.points(model.circle(radius, number)[[corner]])[0] for radius in wall.radii[1:-1]
+    ]
     pairs = itertools.pairwise([start, *inside, stop])
-    return [curve for pair, count in zip(pairs, wall.counts, strict=True) for curve in model.line(*pair, count)]
+    return [
+        curve
+        for pair, count in zip(pairs, wall.counts, strict=True)
+        for curve in model.line(*pair, count)
+    ]
 
 
 def _counts(mesh: Mesh) -> tuple[int, int, int]:
@@ -94,13 +123,19 @@ def _counts(mesh: Mesh) -> tuple[int, int, int]:
 
 
 def _dimensions(shape: Any) -> dict[str, float]:
-    return {name: float(getattr(shape, name)) for name in ("inner_radius", "outer_radius", "length")}
+    return {
+        name: float(getattr(shape, name)) for name in ("inner_radius", "outer_radius", "length")
+    }
 
 
 def _in_layers(points: Array, elements: Integers) -> reduced.Body:
     """Divide hexahedra as long as the body into layers for pictures; return others as is."""
     as_long = np.isclose(np.ptp(points[elements, 2], axis=1), np.ptp(points[:, 2])).all()
-    return reduced.divided_along(points, elements) if as_long and elements.shape[1] == 8 else (points, elements)
+    return (
+        reduced.divided_along(points, elements)
+        if as_long and elements.shape[1] == 8
+        else (points, elements)
+    )
 
 
 def springs_across(scene: ReducedScene) -> str | None:
@@ -127,9 +162,17 @@ REDUCTIONS = {
     "radial": reduced.Reduction(
         partial(build_in_half_plane, 1),
         lambda scene: PAPER[1] * scene.mesh.refinement,
-        (*_EVERYWHERE, reduced.round_about_z, reduced.free_ends, springs_across, reduced.known_loads("radial")),
+        (
+            *_EVERYWHERE,
+            reduced.round_about_z,
+            reduced.free_ends,
+            springs_across,
+            reduced.known_loads("radial"),
+        ),
         reduced.about_z,
-        lambda shape, points, lines: reduced.revolved(*reduced.extended(points, lines, shape.length)),
+        lambda shape, points, lines: reduced.revolved(
+            *reduced.extended(points, lines, shape.length)
+        ),
     ),
     "axisymmetric": reduced.Reduction(
         partial(build_in_half_plane, 2),
@@ -176,7 +219,9 @@ def _layer_angle(share: float) -> AngleOf:
 
     def mean(m: Any, angle: Array) -> float:
         inner, outer = (m.domain.dimensions[f"{face}_radius"] for face in FACES)
-        return m.quadrature.nanmean(angle, m.elements_touching_radius((1.0 - share) * inner + share * outer))
+        return m.quadrature.nanmean(
+            angle, m.elements_touching_radius((1.0 - share) * inner + share * outer)
+        )
 
     return mean
 
@@ -195,7 +240,11 @@ MEANS = {
 def _elongation(m: Any) -> float:
     """Return the prescribed elongation, or the solution if the length is an unknown."""
     strain = getattr(m.state.kinematics, "strain_of_length", None)
-    return float(m.step.loads.get("elongation", 0.0)) if strain is None else float(strain(m.state.unknown))
+    return (
+        float(m.step.loads.get("elongation", 0.0))
+        if strain is None
+        else float(strain(m.state.unknown))
+    )
 
 
 def _of_the_end(name: str, m: Any) -> float:
@@ -231,10 +280,14 @@ def _opening_angle(m: Any) -> float:
     rows = np.concatenate(comm.allgather(owned.reshape(-1, rows.shape[1])))
     edges, parts = m.cached("cut", lambda: _elements_through(m.domain, m.quadrature.element_degree))
     volumes, means = means_through(rows[:, 1], rows[:, 0], rows[:, 1:], parts)
-    (radii, density), (squared, changed, turnover) = means[:, :2].T, np.split(means[:, 2:], [3, 6], axis=1)
+    (radii, density), (squared, changed, turnover) = means[:, :2].T, np.split(
+        means[:, 2:], [3, 6], axis=1
+    )
     rings = Rings(radii, volumes * density, changed * at_first(radii), squared)
     try:
-        return cut(replace(tissue, **dict(zip(turned, turnover.T, strict=True))), rings, edges, closed)
+        return cut(
+            replace(tissue, **dict(zip(turned, turnover.T, strict=True))), rings, edges, closed
+        )
     except ArithmeticError as error:
         if comm.rank == 0:
             log.warning("time %g: no opening_angle: %s", m.step.time, error)
@@ -287,7 +340,9 @@ class Tube(RoundWall):
             reductions=tuple(REDUCTIONS),
         ),
         "elongation": LoadKind(
-            lambda shape, loading, name: loading.add_prescribed_elongation(name, "top", 2, shape.length),
+            lambda shape, loading, name: loading.add_prescribed_elongation(
+                name, "top", 2, shape.length
+            ),
             "engineering strain of the length (0.1: 10 % longer), prescribed or computed",
             column="axial_elongation",
             above=-1.0,
@@ -367,10 +422,15 @@ class Tube(RoundWall):
     length: Annotated[float, LENGTH] = Field(gt=0)
     """Length along z, in the scene's unit of length."""
 
-    def hold_faces(self, loading: Loading, supports: Supports, modulus: float, loads: Loads) -> None:
+    def hold_faces(
+        self, loading: Loading, supports: Supports, modulus: float, loads: Loads
+    ) -> None:
         """Add springs for the surrounding tissue."""
         for face, support in supports.items():
-            from remodel_fenicsx.body.mesh_domain import add_support, warn_of_twist  # few tubes need it
+            from remodel_fenicsx.body.mesh_domain import (
+                add_support,
+                warn_of_twist,
+            )  # few tubes need it
 
             add_support(loading, face, support, modulus, None)
             if loading.kinematics.has_rigid_modes:
@@ -383,16 +443,24 @@ class Tube(RoundWall):
     @model_validator(mode="after")
     def _has_a_wall(self) -> Tube:
         if self.inner_radius >= self.outer_radius:
-            limit = f"must be smaller than geometry.outer_radius = {format_value(self.outer_radius)}"
+            limit = (
+                f"must be smaller than geometry.outer_radius = {format_value(self.outer_radius)}"
+            )
             raise validation_error(limit, "inner_radius", self.inner_radius)
         wall = self.outer_radius - self.inner_radius
-        check_lengths(self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length})
+        check_lengths(
+            self, {"inner_radius": self.inner_radius, "outer_radius": wall, "length": self.length}
+        )
         return self
 
     def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
         """Warn of stresses at the inner face of linear elements that are too thick."""
         size = (self.outer_radius - self.inner_radius) / _counts(mesh)[1] / self.inner_radius
-        at_face = [name for name in columns if name in {f"{component}_stress_inner" for component in STRESSES}]
+        at_face = [
+            name
+            for name in columns
+            if name in {f"{component}_stress_inner" for component in STRESSES}
+        ]
         if mesh.degree > 1 or size < THICK_ELEMENTS:
             return []
         return [
@@ -419,7 +487,9 @@ class Tube(RoundWall):
         places = ((np.array(wall.radii) - wall.radii[0]) / np.ptp(wall.radii)).tolist()
         return dict(zip(wall.names, itertools.pairwise(places), strict=True)) if regions else {}
 
-    def support(self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None) -> None:
+    def support(
+        self, loading: Loading, ends: str = "free", loads: Collection[str] | None = None
+    ) -> None:
         """Add supports and loads; without elongation the top is fixed along z."""
         super().support(loading, ends, loads)
         if "elongation" not in loading.values:
@@ -481,7 +551,9 @@ class Tube(RoundWall):
         """Return the depth from the inner (0) to the outer face (1), (...,)."""
         # The plane faces of elements lie inside the cylinders.
         radii = np.linalg.norm(coordinates[..., :2], axis=-1)
-        return np.clip((radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0)
+        return np.clip(
+            (radii - self.inner_radius) / (self.outer_radius - self.inner_radius), 0.0, 1.0
+        )
 
     def axes_at(self, coordinates: Array) -> Array:
         """Return circumferential, axial and radial axes about z, rows (..., 3, 3)."""
@@ -510,7 +582,9 @@ def whole_tube(
     return wall.marked(build_domain(draw, shape.name, _dimensions(shape), comm))
 
 
-def draw_tube(wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int, quarters: int = 4) -> None:
+def draw_tube(
+    wall: Wall, length: float, counts: tuple[int, int], element: str, degree: int, quarters: int = 4
+) -> None:
     """Draw and mesh quarters of the tube in the current Gmsh model, extruded along z.
 
     `counts` are the elements around the whole tube and along.
@@ -518,7 +592,10 @@ def draw_tube(wall: Wall, length: float, counts: tuple[int, int], element: str, 
     number, along = counts
     quarter, is_whole = number // 4, quarters == 4
     nodes = quarters * quarter + (not is_whole)
-    inner, outer = (model.points(model.circle(radius, number)[:nodes]) for radius in (wall.radii[0], wall.radii[-1]))
+    inner, outer = (
+        model.points(model.circle(radius, number)[:nodes])
+        for radius in (wall.radii[0], wall.radii[-1])
+    )
     inner_lines, outer_lines = (model.polygon(nodes, is_whole) for nodes in (inner, outer))
     spokes = [_spoke(wall, number, k, inner[k], outer[k]) for k in range(0, nodes, quarter)]
     section = model.ring(inner, outer, inner_lines, outer_lines, spokes, element)

@@ -36,12 +36,16 @@ class Wall(NamedTuple):
     counts: tuple[int, ...]
 
     @classmethod
-    def from_regions(cls, inner_radius: float, outer_radius: float, elements: int, regions: Regions) -> Wall:
+    def from_regions(
+        cls, inner_radius: float, outer_radius: float, elements: int, regions: Regions
+    ) -> Wall:
         """Return the wall of a scene's regions with these elements, at least one a layer."""
         order = sorted(regions, key=lambda name: _outer(regions[name], outer_radius)) or ["body"]
         inside = [_outer(regions[name], outer_radius) for name in order[:-1]]
         radii = (inner_radius, *inside, outer_radius)
-        return cls(tuple(order), radii, shared_out([b - a for a, b in itertools.pairwise(radii)], elements))
+        return cls(
+            tuple(order), radii, shared_out([b - a for a, b in itertools.pairwise(radii)], elements)
+        )
 
     def nodes(self, degree: int) -> Array:
         """Return the radii of nodes of elements of this degree, equally spaced in each layer."""
@@ -56,7 +60,9 @@ class Wall(NamedTuple):
         radii = np.hypot(nodes[..., 0], nodes[..., 1])
         layer = np.searchsorted(self.radii[1:-1], (radii.min(axis=1) + radii.max(axis=1)) / 2)
         numbers = {name: number for number, name in enumerate(self.names, start=1)}
-        return dataclasses.replace(domain, regions=numbers, element_region=(layer + 1).astype(np.int32))
+        return dataclasses.replace(
+            domain, regions=numbers, element_region=(layer + 1).astype(np.int32)
+        )
 
 
 def _outer(region: Region, outer_radius: float) -> float:
@@ -94,7 +100,11 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
         raise validation_error(rule, "regions", None)
     for inside, radius in itertools.pairwise([inner_radius, *sorted(seen)]):
         key = f"regions.{seen[radius]}.outer_radius"
-        if (found := mesh_length_problem({key: radius - inside, "geometry.outer_radius": outer_radius})) is not None:
+        if (
+            found := mesh_length_problem(
+                {key: radius - inside, "geometry.outer_radius": outer_radius}
+            )
+        ) is not None:
             raise validation_error(f"the layer is {found[1]}", key, radius)
 
 
@@ -108,7 +118,9 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
     found = np.ones((*depth.shape, 3))
     for layer in natural.layers:
         if layer.region is not None:
-            found[domain.element_region == domain.regions[layer.region]] = layer.prestretch.stretches
+            found[domain.element_region == domain.regions[layer.region]] = (
+                layer.prestretch.stretches
+            )
         else:
             low, high = layer.share
             found[(depth >= low) & ((depth < high) | (high == 1.0))] = layer.prestretch.stretches
@@ -164,7 +176,11 @@ def stress_columns(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
             f"{name}_stress_{where}",
             "stress",
             f"Cauchy stress {direction} the deformed wall, "
-            + (FITTED_TO_FACE if where in FACES else f"mean over the elements of `fibre_angle_{where}`"),
+            + (
+                FITTED_TO_FACE
+                if where in FACES
+                else f"mean over the elements of `fibre_angle_{where}`"
+            ),
             partial(_stress, where, mean, component),
         )
         for name, (direction, component) in STRESSES.items()
@@ -179,16 +195,16 @@ def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
 
 
 FACES = ("inner", "outer")
-FITTED_TO_FACE = (
-    "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
-)
+FITTED_TO_FACE = "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
 ON_THE_FACE = 1e-6  # normalised depth within the rounding of coordinates
 SECOND_LAYER = 1.5  # depth over layer thickness, between the start of the second and third layer
 
 
 def _stress(where: str, mean: AngleOf, component: int, m: Any) -> float:
     if where in FACES:
-        return float(m.cached_for_step(("stress at", where), lambda: _fitted_to_face(where, m))[component])
+        return float(
+            m.cached_for_step(("stress at", where), lambda: _fitted_to_face(where, m))[component]
+        )
     return mean(m, m.wall_stress[..., component])
 
 
@@ -201,12 +217,20 @@ def _fitted_to_face(face: str, m: Any) -> Array:
 
     quadrature, comm = m.quadrature, m.domain.comm
     inner, outer = (m.cached(("area", name), lambda name=name: m.face_area(name)) for name in FACES)
-    widening, depths = outer / inner - 1, m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+    widening, depths = (
+        outer / inner - 1,
+        m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)],
+    )
     if face == "outer":
         widening, depths = inner / outer - 1, 1 - depths
     depths = quadrature.owned(depths)
-    volumes, at_face = quadrature.owned(quadrature.volumes.sum(axis=1)), depths.min(axis=1) < ON_THE_FACE
-    thickness, total = comm.allreduce(np.array([depths.max(axis=1), np.ones(len(depths))]) @ (volumes * at_face))
+    volumes, at_face = (
+        quadrature.owned(quadrature.volumes.sum(axis=1)),
+        depths.min(axis=1) < ON_THE_FACE,
+    )
+    thickness, total = comm.allreduce(
+        np.array([depths.max(axis=1), np.ones(len(depths))]) @ (volumes * at_face)
+    )
     near = depths.min(axis=1) < SECOND_LAYER * thickness / total
     if m.domain.regions:  # the circumferential stress of another tissue differs
         region = quadrature.owned(m.domain.element_region)
@@ -219,7 +243,9 @@ def _fitted_to_face(face: str, m: Any) -> Array:
     place = (2 + t * widening) * t / (1 + t * widening) ** 2  # (1 - (R_face/R)^2) / widening
     powers = place.reshape(-1)[:, None] ** np.arange(layers * quadrature.element_degree)
     weighted = powers.T * np.repeat(volumes[near], t.shape[1])
-    normal, right = comm.allreduce(weighted @ powers), comm.allreduce(weighted @ values.reshape(-1, 3))
+    normal, right = comm.allreduce(weighted @ powers), comm.allreduce(
+        weighted @ values.reshape(-1, 3)
+    )
     return np.linalg.solve(normal, right)[0]
 
 
@@ -256,7 +282,9 @@ class Walled(Shape):
     def region_columns_on_request(cls, name: str) -> Columns:
         """Return columns of the stresses in the region's wall."""
         words = f"of the region `{name}`"
-        return stress_columns({name: (words, lambda m, v: m.quadrature.nanmean(v, m.elements_of_region(name)))})
+        return stress_columns(
+            {name: (words, lambda m, v: m.quadrature.nanmean(v, m.elements_of_region(name)))}
+        )
 
     def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
         """Return the pitch of chains, degrees, (...,): circumferential 0, axial 90, else NaN."""
@@ -274,7 +302,9 @@ class RoundWall(Walled, WithRegions, Unloads):
     def wall(self, elements: int, regions: Regions) -> Wall:
         """Return its wall with so many elements through it."""
 
-    def layers_of_tissue(self, natural: Natural, regions: Regions, tissues: Mapping[str, Tissue]) -> Any:
+    def layers_of_tissue(
+        self, natural: Natural, regions: Regions, tissues: Mapping[str, Tissue]
+    ) -> Any:
         """Return where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
         from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
 
@@ -292,9 +322,19 @@ class RoundWall(Walled, WithRegions, Unloads):
             of_layer = [
                 layer.prestretch.stretches
                 for layer in natural.layers
-                if (layer.share[0] <= share < layer.share[1] if layer.region is None else layer.region == region)
+                if (
+                    layer.share[0] <= share < layer.share[1]
+                    if layer.region is None
+                    else layer.region == region
+                )
             ]
-            found.append(Layer((low, high), tissues[region if region in tissues else ""], (*of_layer, UNSTRETCHED)[0]))
+            found.append(
+                Layer(
+                    (low, high),
+                    tissues[region if region in tissues else ""],
+                    (*of_layer, UNSTRETCHED)[0],
+                )
+            )
         return found
 
     def covers_body(self, regions: Collection[str]) -> bool:

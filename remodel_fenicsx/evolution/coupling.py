@@ -51,9 +51,13 @@ class LoadStep(NamedTuple):
     rates: dict[str, float]
 
     @classmethod
-    def between(cls, duration: float, old: Mapping[str, float], new: Mapping[str, float]) -> LoadStep:
+    def between(
+        cls, duration: float, old: Mapping[str, float], new: Mapping[str, float]
+    ) -> LoadStep:
         """Return a step with the rates that lead from the old to the new loads."""
-        return cls(duration, {name: (new.get(name, old[name]) - old[name]) / duration for name in old})
+        return cls(
+            duration, {name: (new.get(name, old[name]) - old[name]) / duration for name in old}
+        )
 
 
 class Predictor:
@@ -63,7 +67,9 @@ class Predictor:
         self.state = state
         # Rates are increments over the duration of their steps, so that the step size may change.
         self._speeds = FieldHistory(state, "predictor_speed", state.unknown.copy, ORDER + FITTED)
-        self._numbers = StateNumbers(state, "predictor", {f"rate_{name}": 0.0 for name in state.loading.values})
+        self._numbers = StateNumbers(
+            state, "predictor", {f"rate_{name}": 0.0 for name in state.loading.values}
+        )
 
     def expected(self, step: LoadStep) -> Array | None:
         """Return predicted unknowns with boundary values, ghosts included; None if unknown."""
@@ -94,7 +100,9 @@ class Predictor:
     def _goes_on(self, step: LoadStep) -> bool:
         """Return whether the load rates are those of the last step."""
         rates = [(rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items()]
-        return all([abs(rate - last) <= SAME_RATE * max(abs(rate), abs(last)) for rate, last in rates])
+        return all(
+            [abs(rate - last) <= SAME_RATE * max(abs(rate), abs(last)) for rate, last in rates]
+        )
 
     def _weights(self, speeds: list[Array]) -> Array:
         """Fit the newest rates by the rates before them, by least squares. Collective."""
@@ -321,7 +329,13 @@ class Staggered:
 
     # ------------------------------------------------------------ one increment: the paper's step
     def _solve(
-        self, step: LoadStep, time: float, old_loads: LoadValues, loads: LoadValues, work: Work, again: bool
+        self,
+        step: LoadStep,
+        time: float,
+        old_loads: LoadValues,
+        loads: LoadValues,
+        work: Work,
+        again: bool,
     ) -> None:
         """Solve by the attempts `FROM_EXPECTED`, `FROM_LAST` and `IN_PARTS` in this order."""
         state, failure = self.state, None
@@ -353,7 +367,9 @@ class Staggered:
         unknown.x.array[:] = expected
         return self.newton.is_admissible_start(self._last["extension"])
 
-    def _tried(self, attempt: Attempt, work: Work, origin: Array | None = None) -> SolveFailure | None:
+    def _tried(
+        self, attempt: Attempt, work: Work, origin: Array | None = None
+    ) -> SolveFailure | None:
         """Solve from the present unknowns, and return the failure or None."""
         outcome = attempted(lambda: self.newton.solve(origin), SolveFailure)
         work.add(outcome)
@@ -365,7 +381,12 @@ class Staggered:
 
     # ------------------------------------------------------------ substeps
     def _solve_in_parts(
-        self, time: float, old_loads: LoadValues, new_loads: LoadValues, work: Work, failure: SolveFailure | None
+        self,
+        time: float,
+        old_loads: LoadValues,
+        new_loads: LoadValues,
+        work: Work,
+        failure: SolveFailure | None,
     ) -> None:
         """Apply the change of the cells and then that of the loads in substeps."""
         # `failure` is that of the full step, if it was tried.
@@ -373,19 +394,35 @@ class Staggered:
         loading.set(old_loads)
         if self.blend is not None and self._has_remodeled():
             blend = self.blend
-            cell_change = time, "the change of the cells", self._set_part, self.state, lambda: blend.newton
-            Continuation(*cell_change, halvings, blend.largest_part, loose_tolerance=True).advance(work)
+            cell_change = (
+                time,
+                "the change of the cells",
+                self._set_part,
+                self.state,
+                lambda: blend.newton,
+            )
+            Continuation(*cell_change, halvings, blend.largest_part, loose_tolerance=True).advance(
+                work
+            )
             failure = None  # the loads were not yet tried from this state
 
         def set_load_fraction(fraction: float) -> None:
             loading.set(between(old_loads, new_loads, fraction))
 
-        load_change = time, "the change of the loads", set_load_fraction, self.state, lambda: self.newton
+        load_change = (
+            time,
+            "the change of the loads",
+            set_load_fraction,
+            self.state,
+            lambda: self.newton,
+        )
         Continuation(*load_change, halvings).advance(work, failure)
         loading.set(new_loads)
         log.info("time %g solved in %d substeps", time, work.substeps)
 
-    def _combined_change(self, time: float, old_loads: LoadValues, new_loads: LoadValues) -> Continuation:
+    def _combined_change(
+        self, time: float, old_loads: LoadValues, new_loads: LoadValues
+    ) -> Continuation:
         """Return the change of cells and loads together."""
         blend = self.blend if self.blend is not None and self._has_remodeled() else None
 
@@ -396,9 +433,17 @@ class Staggered:
 
         halvings = self.settings.maximum_halvings
         if blend is None:
-            return Continuation(time, "the step", set_fraction, self.state, lambda: self.newton, halvings)
+            return Continuation(
+                time, "the step", set_fraction, self.state, lambda: self.newton, halvings
+            )
         return Continuation(
-            time, "the step", set_fraction, self.state, lambda: blend.newton, halvings, blend.largest_part
+            time,
+            "the step",
+            set_fraction,
+            self.state,
+            lambda: blend.newton,
+            halvings,
+            blend.largest_part,
         )
 
     def _set_part(self, fraction: float) -> None:
@@ -417,7 +462,11 @@ class Staggered:
 
 def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
     """Return the loads after a fraction of their change."""
-    return new if fraction == 1.0 else {name: old[name] + fraction * (new[name] - old[name]) for name in new}
+    return (
+        new
+        if fraction == 1.0
+        else {name: old[name] + fraction * (new[name] - old[name]) for name in new}
+    )
 
 
 class Extrapolated(Staggered):
@@ -461,7 +510,9 @@ class Extrapolated(Staggered):
         self._before(time)
         work = self.solve_equilibrium(time, loads)
         self._solved_target = self.remodeling.target(self.residual)
-        self._begins = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (self._solved_target.switch >= MIN_TARGET_WEIGHT)
+        self._begins = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (
+            self._solved_target.switch >= MIN_TARGET_WEIGHT
+        )
         if not count_points(self.state, self._begins):
             return work
         cells.set(*self._start[:2])
@@ -497,7 +548,9 @@ class Extrapolated(Staggered):
         cells = self.remodeling.followed(target, duration)
         lost = ~np.isfinite(cells.dimensions).all(axis=-1)
         if lost.any():
-            cells = self.remodeling.followed(target.where(lost, target_from_records(self._newest)), duration)
+            cells = self.remodeling.followed(
+                target.where(lost, target_from_records(self._newest)), duration
+            )
         points = count_points(self.state, lost)
         if points and self.state.comm.rank == 0:
             log.info("time %g: %d points follow the last stress, not extrapolated", time, points)
@@ -507,7 +560,11 @@ class Extrapolated(Staggered):
 def count_points(state: State, points: Flags) -> int:
     """Count selected points (n,) over all ranks. Collective."""
     quadrature = state.cells.quadrature
-    return int(allreduce(state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM))
+    return int(
+        allreduce(
+            state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM
+        )
+    )
 
 
 def target_from_records(records: NDArray[np.void]) -> Target:

@@ -83,7 +83,9 @@ class Homeostasis:
         self.remodels = [process for process in stepper.remodels if process.components]
         self.quadrature = self.state.cells.quadrature
         # No row of the path is a result; fronts report points with abrupt changes.
-        self.control = StepControl(stepper, plan.tolerance, plan.first, plan.stops, MAX_STEP, logging.INFO)
+        self.control = StepControl(
+            stepper, plan.tolerance, plan.first, plan.stops, MAX_STEP, logging.INFO
+        )
         self.steps, self._residual = 0, 0.0
         self._held: Snapshot | None = None  # the first state under constant loads
 
@@ -110,7 +112,9 @@ class Homeostasis:
         held = max(start, self.plan.held_from)
         self._integrate(self.control, time, loads, held, coarsens, work)
         if coarsens and self._held is not None and self._largest_jump()[0] > FRONT:
-            log.info("the cells have a front, which depends on the path; repeating it with error control")
+            log.info(
+                "the cells have a front, which depends on the path; repeating it with error control"
+            )
             state.restore(self._held)
             self._integrate(self.control, time, loads, held, False, work)
         state.complete_step(start, number)
@@ -132,7 +136,13 @@ class Homeostasis:
         self.state.complete_step(change, self.state.number)
 
     def _integrate(
-        self, control: StepControl, time: float, loads: LoadValues, held: float, coarsens: bool, work: Work
+        self,
+        control: StepControl,
+        time: float,
+        loads: LoadValues,
+        held: float,
+        coarsens: bool,
+        work: Work,
     ) -> None:
         """Integrate from the present state to the steady state."""
         # The error of a lagging row vanishes in the steady state, unless the cells reach another
@@ -149,7 +159,9 @@ class Homeostasis:
             work.add(step.work)
             work.substeps += step.work.substeps
             work.residual = step.work.residual
-            log.info("on the path: time %g, %d Newton iterations", step.time, step.work.newton_iterations)
+            log.info(
+                "on the path: time %g, %d Newton iterations", step.time, step.work.newton_iterations
+            )
             if state.time < held:
                 continue
             if coarsens:
@@ -181,7 +193,9 @@ class Homeostasis:
         """Return whether the path ends, because of equilibrium or because there is none."""
         if change <= STEADY_TOLERANCE:
             return True
-        if without := [text for process in self.remodels if (text := process.without_rest(waiting))]:
+        if without := [
+            text for process in self.remodels if (text := process.without_rest(waiting))
+        ]:
             self._log(logging.WARNING, without[0])
             return True
         if waiting > MAX_HOLD:
@@ -225,18 +239,27 @@ class Homeostasis:
             # If a pass reduces the remaining distance by s, the step f d reduces the change d to r
             # d with r = 1 - f (1 - s). The next factor is 1/(1 - s) with s = 1 - (1 - r)/f.
             pairs = zip(earlier, changes, strict=True)
-            ratios = [self._dot(old, new) / square for old, new in pairs if (square := self._dot(old, old))]
+            ratios = [
+                self._dot(old, new) / square
+                for old, new in pairs
+                if (square := self._dot(old, old))
+            ]
             ratio = 1 - (1 - max(ratios)) / factor
             factor = 1 / (1 - min(max(ratio, -1.0), LARGEST_RATIO))
         return False
 
     def _to_the_limit(self, time: float, residual: float) -> list[Array]:
         """Return the changes to the limit of all remodeling processes."""
-        return [process.to_the_limit(time, 1 / self.stepper.slowest, residual) for process in self.remodels]
+        return [
+            process.to_the_limit(time, 1 / self.stepper.slowest, residual)
+            for process in self.remodels
+        ]
 
     def _size(self, changes: Sequence[Array]) -> float:
         """Return the largest relative change."""
-        return max(process.size(change) for process, change in zip(self.remodels, changes, strict=True))
+        return max(
+            process.size(change) for process, change in zip(self.remodels, changes, strict=True)
+        )
 
     def _dot(self, first: Array, second: Array) -> float:
         """Return the sum of products over all ranks. Collective."""
@@ -271,7 +294,12 @@ class Homeostasis:
         self.remodeling.predict_limit(time, self._residual)
         quadrature, r0 = self.quadrature, self.remodeling.parameters.largest().end_to_end_length
         distance = self.remodeling.distance() / r0**2
-        self._log(NOTICE, "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps", distance, self.steps)
+        self._log(
+            NOTICE,
+            "cells and stress agree to |A_pass - A| = %.2g r0^2, after %d steps",
+            distance,
+            self.steps,
+        )
         jump, position = self._largest_jump()
         if jump > FRONT:
             self._log(

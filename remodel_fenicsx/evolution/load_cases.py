@@ -57,7 +57,9 @@ class FurtherCase(LoadCaseSolver):
     def seen(self, step: Step) -> Step:
         """Return a copy of a step with the loads and limits of this load case."""
         extension = self.coupling.equilibrium.extension()
-        return replace(step, loads=dict(self.state.loading.values), extension=extension, case=self.number)
+        return replace(
+            step, loads=dict(self.state.loading.values), extension=extension, case=self.number
+        )
 
 
 class LoadCases(Remodels):
@@ -91,7 +93,10 @@ def join(
 ) -> None:
     """Add further load cases to a stepper; `weights` are of all cases, in their order."""
     numbered = enumerate(zip(states, load_values, strict=True), start=2)
-    cases = [FurtherCase(number, state, values, stepper, solver, kappa) for number, (state, values) in numbered]
+    cases = [
+        FurtherCase(number, state, values, stepper, solver, kappa)
+        for number, (state, values) in numbered
+    ]
     stepper.state.join(states, weights)
     stepper.each_case += cases
     stepper.remodeling.further += [case.drive for case in cases]

@@ -20,7 +20,14 @@ from remodel_fenicsx.model import spectral, tensors
 from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, convected_axes
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.laws import Drive, LAWS, MEANS_OF_CASES, mean_target, relaxed, tensor_target
+from remodel_fenicsx.model.laws import (
+    Drive,
+    LAWS,
+    MEANS_OF_CASES,
+    mean_target,
+    relaxed,
+    tensor_target,
+)
 from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, switch_threshold
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
@@ -74,12 +81,16 @@ class RemodelingPass(Remodels):
         # Drives of further load cases, which have the same cells.
         self.further: list[Callable[[], Drive]] = []
         # Relaxation factor of a pass's change of the cells.
-        self.relaxation = settings.relaxation_factor if COUPLINGS[settings.coupling].relaxes else 1.0
+        self.relaxation = (
+            settings.relaxation_factor if COUPLINGS[settings.coupling].relaxes else 1.0
+        )
         self.parameters = state.parameters(tissue)
         self.driver, self.law = DRIVERS[settings.driver], LAWS[settings.law]
         self.frame = FRAMES[settings.frame]
         self.set_kappa(settings.kappa if kappa is None else kappa)
-        if self.fastest == 0.0 and self.law.stops_at_zero_kappa:  # cells that never change need no pass
+        if (
+            self.fastest == 0.0 and self.law.stops_at_zero_kappa
+        ):  # cells that never change need no pass
             self.law = LAWS["none"]
         if not self.law.remodels:
             return
@@ -170,7 +181,9 @@ class RemodelingPass(Remodels):
         # fraction of the stress at most.
         if not self.driver.is_stress:
             return Noise(spectral.ROUNDING, spectral.ROUNDING)
-        rounding = STRESS_ROUNDINGS * stress_rounding(self.parameters.largest(), self._max_chain_extension(F))
+        rounding = STRESS_ROUNDINGS * stress_rounding(
+            self.parameters.largest(), self._max_chain_extension(F)
+        )
         state = self.state
         displacement = float(np.abs(state.unknown.x.array).max(initial=0.0))
         displacement = allreduce(state.comm, displacement, MPI.MAX)
@@ -179,13 +192,18 @@ class RemodelingPass(Remodels):
         typical = float(np.sqrt(self.quadrature.mean(squares)))
         unbalanced = RESIDUAL_SHARE * residual / self._smallest_area
         limit = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
-        if unbalanced > max(WARNED_RESIDUAL_FRACTION * typical, limit) and not self._numbers["said"]:
+        if (
+            unbalanced > max(WARNED_RESIDUAL_FRACTION * typical, limit)
+            and not self._numbers["said"]
+        ):
             self._numbers["said"] = 1
             if state.comm.rank == 0:
                 log.warning(LOOSE_SOLVER, unbalanced, typical, limit)
         noise = Noise(rounded + min(unbalanced, limit), rounding)
         if self.law.target is not None and typical > self._numbers["stress"]:
-            self._numbers["stress"], self._numbers["floor"] = typical, float(switch_threshold(*noise))
+            self._numbers["stress"], self._numbers["floor"] = typical, float(
+                switch_threshold(*noise)
+            )
         return noise
 
     def relative_switch_threshold(self) -> float:
@@ -219,7 +237,9 @@ class RemodelingPass(Remodels):
         """Return the target of the structure tensor in the present state, if the law has one."""
         assert self._target is not None
         if self._averages_targets:
-            return mean_target([self._target(drive) for drive in self._drives(residual)], self.state.weights)
+            return mean_target(
+                [self._target(drive) for drive in self._drives(residual)], self.state.weights
+            )
         return self._target(self.drive(residual))
 
     @property
@@ -244,7 +264,9 @@ class RemodelingPass(Remodels):
         """Return the present or other cells after a time with a constant target; n points."""
         assert self.law.follow is not None
         r0 = self.parameters.at_points().end_to_end_length
-        return self.law.follow(cells or self.state.cells.point_cells, target, r0, self.kappa * duration)
+        return self.law.follow(
+            cells or self.state.cells.point_cells, target, r0, self.kappa * duration
+        )
 
     @property
     def full_pass_cells(self) -> UnitCell | None:
@@ -265,7 +287,9 @@ class RemodelingPass(Remodels):
         self._change = cells.point_cells.copy(), full_pass
         updated = self.law.relax(self._change[0], full_pass, factor)
         increment = self.parameters.at_points().energy_increment(F, self._change[0], updated)
-        power: float = 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
+        power: float = (
+            0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
+        )
         cells.set(*updated[:2])
         return power
 
@@ -309,7 +333,11 @@ class RemodelingPass(Remodels):
 
     def passed(self, values: UnitCell, time: float, residual: float) -> UnitCell:
         """Return cells after a pass up to a time."""
-        return self.updated_cells(self.state.time, time, residual, values)[0] if self.law.remodels else values
+        return (
+            self.updated_cells(self.state.time, time, residual, values)[0]
+            if self.law.remodels
+            else values
+        )
 
     def apart(self, values: UnitCell, other: UnitCell) -> float:
         """Return the RMS of the angle between chain directions over the body, in degrees."""

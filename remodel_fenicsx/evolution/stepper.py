@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-CHECK_INTERVAL = 5  # steps between two checks of slow changes; a check costs up to a third of a step
+CHECK_INTERVAL = (
+    5  # steps between two checks of slow changes; a check costs up to a third of a step
+)
 
 
 @with_old_names
@@ -405,7 +407,13 @@ class Stepper(LoadCaseSolver):
         if not state.number:
             for case in self.each_case:
                 release(case.state, case.coupling.equilibrium, self._solver, work)
-        step = Step(state.time, state.number, dict(state.loading.values), self.coupling.equilibrium.extension(), work)
+        step = Step(
+            state.time,
+            state.number,
+            dict(state.loading.values),
+            self.coupling.equilibrium.extension(),
+            work,
+        )
         for watcher in watchers:
             if step.number:
                 watcher.resumed(step)
@@ -460,7 +468,9 @@ class Stepper(LoadCaseSolver):
         if self._closed:
             raise RuntimeError("the stepper or its simulation has been closed; create a new one")
         if time <= state.time:
-            raise ValueError(f"time {time!r} does not come after {state.time!r}, that of the last step")
+            raise ValueError(
+                f"time {time!r} does not come after {state.time!r}, that of the last step"
+            )
         with state.transaction():
             work = (strategy or self.coupling).solve(time, self.load_values(time))
             extension = work.extension or self.coupling.equilibrium.extension()
@@ -513,7 +523,9 @@ class Stepper(LoadCaseSolver):
         remaining = list(times)
         self.start(watchers)
         for number, time in enumerate(remaining, start=1):
-            yield self.advance(time, watchers, is_last=number == len(remaining), control_error=control_error)
+            yield self.advance(
+                time, watchers, is_last=number == len(remaining), control_error=control_error
+            )
 
     def take(self, load_values: Callable[[float], LoadValues], kappa: float | Function) -> None:
         """Replace the loads and the rate kappa.
@@ -562,7 +574,11 @@ class FixedSteps:
     """Time stepping with a constant step size."""
 
     def __init__(
-        self, stepper: Stepper, end: float, step: float, control_error: Callable[[Step], object] = lambda step: None
+        self,
+        stepper: Stepper,
+        end: float,
+        step: float,
+        control_error: Callable[[Step], object] = lambda step: None,
     ):
         self.stepper, self.control_error = stepper, control_error
         self.end, self.step = end, step
@@ -579,7 +595,11 @@ class FixedSteps:
 def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work) -> None:
     """Equilibrate a body with prestretch, in substeps as needed. Collective."""
     G, identity = state.natural_gradient, np.eye(3)
-    if G is None or state.kinematics.closing is not None or not state.cells.quadrature.maximum(np.abs(G - identity)):
+    if (
+        G is None
+        or state.kinematics.closing is not None
+        or not state.cells.quadrature.maximum(np.abs(G - identity))
+    ):
         return
     prestretch = G.copy()
 
@@ -588,7 +608,12 @@ def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work
 
     with state.transaction(), closing(GuardedNewton(equilibrium, settings)) as newton:
         change = Continuation(
-            state.time, "the prestretch", set_fraction, state, lambda: newton, settings.maximum_halvings
+            state.time,
+            "the prestretch",
+            set_fraction,
+            state,
+            lambda: newton,
+            settings.maximum_halvings,
         )
         try:
             change.advance(work)
@@ -647,7 +672,13 @@ REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall
 class Pause(Watcher):
     """Watcher that raises `Paused` on all ranks on request, or before a time limit."""
 
-    def __init__(self, comm: MPI.Comm, folder: Path, is_requested: Callable[[], bool], deadline: float | None = None):
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        folder: Path,
+        is_requested: Callable[[], bool],
+        deadline: float | None = None,
+    ):
         self.comm, self.folder = comm, folder
         self.is_requested, self.deadline = is_requested, deadline
         self._last = clock.monotonic()

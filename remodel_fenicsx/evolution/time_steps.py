@@ -53,9 +53,13 @@ class TimeError:
         self.quadrature, self.kappa = stepper.state.cells.quadrature, stepper.remodeling.slowest
         self.remodels = [process for process in stepper.remodels if process.components]
         # Names of the errors of rows so far; "row" is that of the cells.
-        self._errors = ["row" if process is stepper.remodeling else process.name for process in self.remodels]
+        self._errors = [
+            "row" if process is stepper.remodeling else process.name for process in self.remodels
+        ]
         initial = {"speed": 0.0, "duration": 0.0, "fading": self.kappa, "answer": 1.0}
-        self._numbers = StateNumbers(stepper.state, "time_error", initial | dict.fromkeys(self._errors, 0.0))
+        self._numbers = StateNumbers(
+            stepper.state, "time_error", initial | dict.fromkeys(self._errors, 0.0)
+        )
         # The last error if rows lag behind, otherwise the last row.
         self._last = [
             FieldHistory(
@@ -86,7 +90,9 @@ class TimeError:
 
     def _better(self, process: Remodels) -> Values:
         return (
-            self.stepper.coupling.higher_order_cells if process is self.stepper.remodeling else process.higher_order()
+            self.stepper.coupling.higher_order_cells
+            if process is self.stepper.remodeling
+            else process.higher_order()
         )
 
     # ------------------------------------------------------------ rows that lag behind
@@ -97,11 +103,15 @@ class TimeError:
             strain, admissible = self._strain(step, self._expected(rows, betters, duration))
             if admissible:
                 pairs = zip(self.remodels, rows, strict=True)
-                betters = [process.passed(row, step.time, step.work.residual) for process, row in pairs]
+                betters = [
+                    process.passed(row, step.time, step.work.residual) for process, row in pairs
+                ]
         limit, angle = SLOWEST * angle, self._distance(rows, betters)
         if angle > limit:  # the pass leads to another state, to which this state does not tend
             betters, angle = first_betters, limit
-        for process, last, row, better in zip(self.remodels, self._last, rows, betters, strict=True):
+        for process, last, row, better in zip(
+            self.remodels, self._last, rows, betters, strict=True
+        ):
             last.push((process.as_components(better) - process.as_components(row)).ravel())
         return max(angle, strain)
 
@@ -109,14 +119,18 @@ class TimeError:
         """Return the values predicted by the last error; at first the higher-order values."""
         if not self._last[0].known:
             return betters
-        ratio, processes = duration / self._numbers["duration"], zip(self.remodels, self._last, rows, strict=True)
+        ratio, processes = duration / self._numbers["duration"], zip(
+            self.remodels, self._last, rows, strict=True
+        )
         return [
             process.moved(row, ratio * last.values[0].reshape(-1, process.components))
             for process, last, row in processes
         ]
 
     # ------------------------------------------------------------ accumulating errors
-    def _added_up(self, step: Step, rows: AllValues, betters: AllValues, duration: float) -> Estimate:
+    def _added_up(
+        self, step: Step, rows: AllValues, betters: AllValues, duration: float
+    ) -> Estimate:
         decay_rate = self._decay_rate(step, rows, duration)
         amplification = self._stress_amplification(decay_rate, duration)
         numbers, strain = self._numbers, 0.0
@@ -125,8 +139,12 @@ class TimeError:
             betters = _known(betters, rows)
             with self.state.tentative():
                 strain, _ = self._strain(step, betters)
-        for process, name, row, better in zip(self.remodels, self._errors, rows, _known(betters, rows), strict=True):
-            error = max(process.apart(row, better), strain if process is self.stepper.remodeling else 0.0)
+        for process, name, row, better in zip(
+            self.remodels, self._errors, rows, _known(betters, rows), strict=True
+        ):
+            error = max(
+                process.apart(row, better), strain if process is self.stepper.remodeling else 0.0
+            )
             # Bounded rates do not change for longer than the cells do.
             limits.append(_accumulated_error(error, max(self.kappa, process.slowest) * duration))
             rate = min(decay_rate, process.slowest) if decay_rate else process.slowest
@@ -139,17 +157,27 @@ class TimeError:
         numbers, speed = self._numbers, 0.0
         shape = self.quadrature.shape
         before, decay_rate = numbers["speed"], numbers["fading"]
-        present = [process.as_components(row).ravel() for process, row in zip(self.remodels, rows, strict=True)]
+        present = [
+            process.as_components(row).ravel()
+            for process, row in zip(self.remodels, rows, strict=True)
+        ]
         if self._last[0].known:
-            changes = [values - last.values[0] for values, last in zip(present, self._last, strict=True)]
+            changes = [
+                values - last.values[0] for values, last in zip(present, self._last, strict=True)
+            ]
             points = max(shape[0] * shape[1], 1)  # a rank may have no points
-            squares = [(change**2).reshape(*shape, change.size // points).sum(axis=-1) for change in changes]
+            squares = [
+                (change**2).reshape(*shape, change.size // points).sum(axis=-1)
+                for change in changes
+            ]
             speed = float(np.sqrt(self.quadrature.mean(sum(squares)))) / duration
         if not self._held(step):
             decay_rate = self.kappa
         elif before > 0 and speed > 0:
             rate = np.log(before / speed) / (0.5 * (duration + numbers["duration"]))
-            decay_rate = float(np.sqrt(decay_rate * np.clip(rate, self.kappa / SLOWEST, self.kappa)))
+            decay_rate = float(
+                np.sqrt(decay_rate * np.clip(rate, self.kappa / SLOWEST, self.kappa))
+            )
         for last, values in zip(self._last, present, strict=True):
             last.push(values)
         numbers["speed"], numbers["fading"] = speed, decay_rate
@@ -167,7 +195,10 @@ class TimeError:
     def _held(self, step: Step) -> bool:
         """Return whether all loads were constant over the step."""
         first, *further = self.stepper.each_case
-        time, loads = self.state.time, [step.loads, *(case.state.loading.values for case in further)]
+        time, loads = self.state.time, [
+            step.loads,
+            *(case.state.loading.values for case in further),
+        ]
         return all(
             values.get(name) == value
             for case, values in zip((first, *further), loads, strict=True)
@@ -177,7 +208,10 @@ class TimeError:
     # ------------------------------------------------------------ distances
     def _distance(self, rows: AllValues, betters: AllValues) -> float:
         """Return the largest distance over all remodeling processes, in degrees."""
-        return max(process.apart(*pair) for process, *pair in zip(self.remodels, rows, betters, strict=True))
+        return max(
+            process.apart(*pair)
+            for process, *pair in zip(self.remodels, rows, betters, strict=True)
+        )
 
     def _strain(self, step: Step, remodeled: AllValues) -> tuple[float, bool]:
         """Return length change, in degrees, and admissibility of the linear response."""
@@ -186,8 +220,12 @@ class TimeError:
         for process, values in zip(self.remodels, remodeled, strict=True):
             process.set(values)
         tangents = [case.coupling.tangents for case in cases] if cases[1:] else [step.work.tangents]
-        responses = [self._answered(*arguments) for arguments in zip(cases, before, tangents, strict=True)]
-        return max(strain for strain, _ in responses), all(admissible for _, admissible in responses)
+        responses = [
+            self._answered(*arguments) for arguments in zip(cases, before, tangents, strict=True)
+        ]
+        return max(strain for strain, _ in responses), all(
+            admissible for _, admissible in responses
+        )
 
     def _answered(self, case: LoadCaseSolver, before: Array, tangents: int) -> tuple[float, bool]:
         """Return length change and admissibility of one load case; `before` is its earlier F_e."""
@@ -306,7 +344,10 @@ class StepControl:
                 log.debug("time %g: %s; step rejected", time, outcome)
                 self._rejected.append(outcome)
                 max_factor = 1.0 if len(self._rejected) == 1 else HALVED
-                duration = max(self._optimal_step(outcome.error, outcome.duration, max_factor), self._shortest())
+                duration = max(
+                    self._optimal_step(outcome.error, outcome.duration, max_factor),
+                    self._shortest(),
+                )
                 continue
             failures += 1
             duration = (time - self.state.time) / 4
@@ -324,7 +365,10 @@ class StepControl:
     # ------------------------------------------------------------ within the step's transaction
     def _accept_or_reject(self, step: Step) -> None:
         """Accept a step and choose the next step size, or raise."""
-        error, duration = self.error.measure(step).controlled / self.tolerance, step.time - self.state.time
+        error, duration = (
+            self.error.measure(step).controlled / self.tolerance,
+            step.time - self.state.time,
+        )
         numbers, shortest = self._numbers, self._shortest()
         goes_on = numbers["in_vain"] > MAX_FUTILE_STEPS
         if error > 1 and not (goes_on or duration <= (1 + 1e-9) * STRETCHED * shortest):
@@ -352,7 +396,9 @@ class StepControl:
         # A lagging error rises a second time after a larger step, by the same amount.
         present = self._numbers["wanted"]
         best = self._optimal_step(
-            error + max(0.0, error - self._numbers["before"]), duration, LENGTHENING * present / duration
+            error + max(0.0, error - self._numbers["before"]),
+            duration,
+            LENGTHENING * present / duration,
         )
         return present if KEPT * present <= best < WORTHWHILE * present else best
 

@@ -27,7 +27,9 @@ Array = NDArray[np.float64]
 
 # Smallest volume over the initial volume. Below it hardly any tissue is left, and the step fails.
 LEAST_VOLUME = 0.05
-TISSUE_LOST = FailureCause("lost tissue", "lower remodeling.turnover.volume or gain, or raise the loads")
+TISSUE_LOST = FailureCause(
+    "lost tissue", "lower remodeling.turnover.volume or gain, or raise the loads"
+)
 # Largest |change of ln rho| in a step, as in the prototype; inactive near a steady state.
 LARGEST_TURNOVER = 0.5
 # Change factor of the natural length above which the rates may end a path to the steady state.
@@ -77,7 +79,9 @@ class Growth:
 
     def of_content(self, content: Array) -> Array:
         """Return J_g of the content at each point, flattened or (elements, points)."""
-        return np.asarray(1.0 + self.settings.volume * (content / self._reference.reshape(content.shape) - 1.0))
+        return np.asarray(
+            1.0 + self.settings.volume * (content / self._reference.reshape(content.shape) - 1.0)
+        )
 
     def follow(self, content: Array) -> None:
         """Set J_g = 1 + phi (m/m_ref - 1) and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
@@ -89,11 +93,15 @@ class Growth:
             # points.
             ratio = (
                 ratio
-                - self.quadrature.polynomial_residual(self.quadrature.element_degree - 1, ratio[..., None])[..., 0]
+                - self.quadrature.polynomial_residual(
+                    self.quadrature.element_degree - 1, ratio[..., None]
+                )[..., 0]
             )
         if (smallest := self.quadrature.minimum(ratio)) < LEAST_VOLUME:
             text = f"time {self.state.time:g}: tissue volume below {100 * LEAST_VOLUME:g} %"
-            raise StepFailure(self.state.time, f"{text} of its initial value: J_g = {smallest:.3g}", TISSUE_LOST)
+            raise StepFailure(
+                self.state.time, f"{text} of its initial value: J_g = {smallest:.3g}", TISSUE_LOST
+            )
         self.set(ratio)
 
     def set(self, ratio: Array) -> None:
@@ -113,9 +121,15 @@ class DecayMonitor:
         """Return whether the rate decays no faster than 1/t; False while this is unknown."""
         numbers = self.numbers
         if elapsed >= 2 * numbers["late_time"]:
-            numbers["early_time"], numbers["early_rate"] = numbers["late_time"], numbers["late_rate"]
+            numbers["early_time"], numbers["early_rate"] = (
+                numbers["late_time"],
+                numbers["late_rate"],
+            )
             numbers["late_time"], numbers["late_rate"] = elapsed, rate
-        return bool(numbers["early_time"] and rate * elapsed >= numbers["early_rate"] * numbers["early_time"])
+        return bool(
+            numbers["early_time"]
+            and rate * elapsed >= numbers["early_rate"] * numbers["early_time"]
+        )
 
 
 class TurnoverPass(Remodels):
@@ -138,7 +152,9 @@ class TurnoverPass(Remodels):
         self._parameters = state.parameters(replace(tissue, **turned_over))
         self.tissue = self._parameters.tissue
         self._numbers = StateNumbers(state, "turnover", {"duration": 0.0})
-        self._earlier = FieldHistory(state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1)
+        self._earlier = FieldHistory(
+            state, "turnover_rates", lambda: self.quadrature.function("", (2,)), 1
+        )
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
         self.growth = Growth(state, settings) if state.kinematics.grows else None
         # `_before` has the values of the last solved state.
@@ -166,7 +182,9 @@ class TurnoverPass(Remodels):
             return
         mean = rates
         if self._earlier.known:
-            mean = rates + duration / (2 * last) * (rates - self._earlier.values[0].reshape(-1, 2).T)
+            mean = rates + duration / (2 * last) * (
+                rates - self._earlier.values[0].reshape(-1, 2).T
+            )
         self._earlier.push(np.ravel(rates.T))
         self._start_rates = rates
         self.change(mean, duration)
@@ -241,8 +259,13 @@ class TurnoverPass(Remodels):
 
     def without_rest(self, waiting: float) -> str:
         """Return a message if the natural length grew much and rates decay no faster than 1/t."""
-        goes_on = self._slowing.is_unbounded(waiting, self.quadrature.maximum(self.fastest_changes()))
-        if not goes_on or self.quadrature.maximum(self.factors("natural_length")) <= MIN_UNBOUNDED_FACTOR:
+        goes_on = self._slowing.is_unbounded(
+            waiting, self.quadrature.maximum(self.fastest_changes())
+        )
+        if (
+            not goes_on
+            or self.quadrature.maximum(self.factors("natural_length")) <= MIN_UNBOUNDED_FACTOR
+        ):
             return ""
         return (
             "growth has not reached equilibrium: its rates decay no faster than 1/t "
@@ -272,7 +295,10 @@ class TurnoverPass(Remodels):
         states = (self.state, *self.state.other_cases)
         rates = [np.array(self._rates(state, present)) for state in states]
         return np.asarray(
-            sum(weight * case_rates for weight, case_rates in zip(self.state.weights, rates, strict=True))
+            sum(
+                weight * case_rates
+                for weight, case_rates in zip(self.state.weights, rates, strict=True)
+            )
         )
 
     def _rates(self, state: State, present: bool) -> TurnoverRates:
@@ -284,7 +310,9 @@ class TurnoverPass(Remodels):
     def power(self) -> float:
         """Return the stored energy per time that turnover releases, at F and cells of the row."""
         cells = self.state.equilibrium_cells.point_cells
-        increment = self._parameters.at_points().turnover_increment(self.state.elastic_gradient(), cells, *self.rates())
+        increment = self._parameters.at_points().turnover_increment(
+            self.state.elastic_gradient(), cells, *self.rates()
+        )
         return 0.0 - float(self.quadrature.integral(self.state.per_mesh_volume(increment)))
 
     def mean(self, name: str) -> float:
@@ -338,7 +366,12 @@ class UnboundedGrowth(WarnsOnce):
         rates = self.turnover.fastest_changes()
         rate = self.quadrature.maximum(rates)
         goes_on = self._slowing.is_unbounded(elapsed, rate)
-        if not (goes_on and step.is_last and elapsed >= MIN_TURNOVER_TIMES * period and rate * period >= FAR_FROM_REST):
+        if not (
+            goes_on
+            and step.is_last
+            and elapsed >= MIN_TURNOVER_TIMES * period
+            and rate * period >= FAR_FROM_REST
+        ):
             return ""
         return (
             "turnover has not reached equilibrium: content or natural length change by up to "

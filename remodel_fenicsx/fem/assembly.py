@@ -150,7 +150,9 @@ class SpdSolver:
         for thing in (solver, load, *([levels] if levels else [])):
             thing.destroy()
         if reason < 0:
-            raise LinearSolveFailure(f"no convergence in {iterations} iterations of the linear solve (reason {reason})")
+            raise LinearSolveFailure(
+                f"no convergence in {iterations} iterations of the linear solve (reason {reason})"
+            )
         return unknown
 
 
@@ -207,11 +209,17 @@ def coefficient(mesh: Mesh, name: str, value: float | Constant | Function) -> Co
     is_function = isinstance(value, dolfinx.fem.Function)
     element = value.function_space.ufl_element() if is_function else None
     if value.ufl_shape != () or (element and not (element.degree == 0 and element.discontinuous)):
-        words = f"a {type(value).__name__} of shape {value.ufl_shape}" + (f", {element}" if element else "")
-        raise ValueError(f"{name}: {words}; must be one number, or a scalar DG0 Function, one value an element")
+        words = f"a {type(value).__name__} of shape {value.ufl_shape}" + (
+            f", {element}" if element else ""
+        )
+        raise ValueError(
+            f"{name}: {words}; must be one number, or a scalar DG0 Function, one value an element"
+        )
     numbers = value.x.array if is_function else value.value
     if not mesh.comm.allreduce(bool(np.all(np.isfinite(numbers))), MPI.LAND):
-        raise ValueError(f"{name} = {value if is_function else value.value}: must be finite everywhere")
+        raise ValueError(
+            f"{name} = {value if is_function else value.value}: must be finite everywhere"
+        )
     if is_function:
         return dolfinx.fem.Function(value.function_space, value.x, name=name)
     own = dolfinx.fem.Constant(mesh, PETSc.ScalarType(value.value))
@@ -238,12 +246,22 @@ class CachedValue(Generic[T]):
 
     def __init__(self, comm: MPI.Intracomm | None, *expressions: Expr):
         self._comm = comm
-        terminals = {terminal for expression in expressions for terminal in traverse_unique_terminals(expression)}
-        functions = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Function)]
-        constants = [terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Constant)]
+        terminals = {
+            terminal
+            for expression in expressions
+            for terminal in traverse_unique_terminals(expression)
+        }
+        functions = [
+            terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Function)
+        ]
+        constants = [
+            terminal for terminal in terminals if isinstance(terminal, dolfinx.fem.Constant)
+        ]
         # Arrays are the functions' own memory. Small ones come first, because one difference is
         # enough.
-        self._arrays: list[NDArray[np.float64]] = sorted((f.x.array for f in functions), key=lambda array: array.size)
+        self._arrays: list[NDArray[np.float64]] = sorted(
+            (f.x.array for f in functions), key=lambda array: array.size
+        )
         self._numbers = [np.asarray(c.value) for c in constants]
         self._seen: list[NDArray[np.float64]] = []
         self._seen_numbers: list[bytes] | None = None
@@ -292,7 +310,9 @@ def _of_density(density: Expr, unknown: Function, test: Expr, trial: Expr) -> Ex
         return ufl.derivative(ufl.derivative(density, unknown, test), unknown, trial)
     by_number = [(ufl.variable(invariant), invariant) for invariant in found]
     function = ufl.replace(density, {invariant: number for number, invariant in by_number})
-    changes = [[ufl.derivative(invariant, unknown, way) for invariant in found] for way in (test, trial)]
+    changes = [
+        [ufl.derivative(invariant, unknown, way) for invariant in found] for way in (test, trial)
+    ]
     total = ufl.as_ufl(0)
     for (number, _), change in zip(by_number, changes[0], strict=True):
         slope = ufl.diff(function, number)
@@ -340,14 +360,21 @@ def create_matrix(form: Form) -> PETSc.Mat:
     block, matrix = form.function_spaces[0].dofmap.index_map_bs, PETSc.Mat()
     rows, columns = (shared.index_map(axis) for axis in (0, 1))
     size = rows.size_local
-    starts, numbers = shared.indptr[: size + 1].astype(PETSc.IntType), shared.indices[: shared.indptr[size]]
+    starts, numbers = (
+        shared.indptr[: size + 1].astype(PETSc.IntType),
+        shared.indices[: shared.indptr[size]],
+    )
     if form.mesh.comm.size == 1:
         numbers = numbers.astype(PETSc.IntType, copy=False)
-        matrix.createAIJWithArrays((size, size), (starts, numbers, shared.data), comm=form.mesh.comm)
+        matrix.createAIJWithArrays(
+            (size, size), (starts, numbers, shared.data), comm=form.mesh.comm
+        )
         matrix.setBlockSizes(block, block)  # for multigrid
     else:
         numbers = columns.local_to_global(numbers).astype(PETSc.IntType)
-        matrix.createAIJ(((size, None), (size, None)), block, csr=(starts, numbers, None), comm=form.mesh.comm)
+        matrix.createAIJ(
+            ((size, None), (size, None)), block, csr=(starts, numbers, None), comm=form.mesh.comm
+        )
     matrix.setAttr(SHARED, (shared, starts, numbers))
     return matrix
 

@@ -118,7 +118,9 @@ class Formulation:
         """
         return np.inf
 
-    def discretise(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> DiscreteFormulation:
+    def discretise(
+        self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature
+    ) -> DiscreteFormulation:
         """Return the formulation for these unknowns at these quadrature points.
 
         Parameters
@@ -180,7 +182,9 @@ class Selective(Formulation):
         """Return `pays` of the element, or infinity if there is no rule for it."""
         return self.pays.get(element, np.inf) if self.applies_to(element, degree) else np.inf
 
-    def discretise(self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature) -> DiscreteFormulation:
+    def discretise(
+        self, kinematics: Kinematics, unknown: Function, quadrature: Quadrature
+    ) -> DiscreteFormulation:
         """Return the formulation with J at the points of the rule."""
         degree = self.degrees[quadrature.element_kind, quadrature.element_degree]
         return _SplitFormulation(kinematics, unknown, quadrature, degree)
@@ -203,7 +207,9 @@ class _SplitFormulation(DiscreteFormulation):
         points = np.asarray(basix.make_quadrature(kind, degree)[0], dtype=np.float64)
         jacobian = ufl.det(kinematics.elastic_gradient(unknown))
         self._expression = jit.expression(jacobian, points, "J where the formulation takes it")
-        there, here = (shape_functions(kind.name, degree // 2, p)[0] for p in (points, quadrature.points))
+        there, here = (
+            shape_functions(kind.name, degree // 2, p)[0] for p in (points, quadrature.points)
+        )
         # Exactly one value if the rule has one point.
         self._interpolation = here @ np.linalg.pinv(there)
         self.jacobian = quadrature.function("jacobian_of_the_formulation", ())
@@ -247,7 +253,11 @@ FORMULATIONS: dict[str, Formulation] = {
     "displacement": AtAllPoints("at all quadrature points; a run whose elements lock warns"),
     NOT_LOCKING: Selective(
         "the volumetric part of the matrix at fewer points; not for tetrahedra of degree 1",
-        {(kind, degree): degree for kind in ("hexahedron", "quadrilateral", "interval") for degree in (1, 2)}
+        {
+            (kind, degree): degree
+            for kind in ("hexahedron", "quadrilateral", "interval")
+            for degree in (1, 2)
+        }
         | {("tetrahedron", 2): 1},
         STIFF_BULK,
     ),

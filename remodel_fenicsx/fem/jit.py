@@ -67,7 +67,9 @@ TANGENT_FLAGS = ["-O2", "-ftree-vectorize", "-fvect-cost-model=dynamic", *COMPIL
 SIMD_COMPONENTS = (16, 8, 4, 3, 2, 1)
 
 # Flags of the package's C functions: all sums keep the order in which they are written.
-LIBRARY_FLAGS = "-std=c17 -O3 -g0 -march=native -fno-math-errno -fno-trapping-math -Wall -Wextra".split()
+LIBRARY_FLAGS = (
+    "-std=c17 -O3 -g0 -march=native -fno-math-errno -fno-trapping-math -Wall -Wextra".split()
+)
 
 # By number of arguments: name of a form, seconds of its compilation (this energy, hexahedra, one
 # core), and flags.
@@ -105,7 +107,10 @@ def cache_folder() -> Path:
             # Its files are executed.
             if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():
                 return folder
-        log.warning("cannot write to %s, or it belongs to another user: forms are compiled below %s", *places)
+        log.warning(
+            "cannot write to %s, or it belongs to another user: forms are compiled below %s",
+            *places,
+        )
     raise PermissionError(f"{folder}: belongs to another user; set TMPDIR to a private folder")
 
 
@@ -168,7 +173,10 @@ def expression(
     name: str | None = None,
 ) -> PointValues:
     """Compile a UFL expression for evaluation at reference points, (n, 3). See `form`."""
-    flat = [ufl_expression[place] if place else ufl_expression for place in np.ndindex(ufl_expression.ufl_shape)]
+    flat = [
+        ufl_expression[place] if place else ufl_expression
+        for place in np.ndindex(ufl_expression.ufl_shape)
+    ]
     parts, sizes, comm = [], [], extract_unique_domain(ufl_expression).ufl_cargo().comm
     while flat:
         size = next(size for size in SIMD_COMPONENTS if size <= len(flat))
@@ -203,7 +211,9 @@ def library(
     what: str,
 ) -> ModuleType:
     """Compile the package's C functions, or take them from the cache. See `form`. Collective."""
-    text = "\0".join([declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()])
+    text = "\0".join(
+        [declarations, source, *LIBRARY_FLAGS, cffi.__version__, sysconfig.get_python_version()]
+    )
     name = f"libremodel_{hashlib.sha256(text.encode()).hexdigest()[:40]}"
     failure: BaseException | None = None
     if comm.rank == 0 and not _is_cached(name):
@@ -321,7 +331,11 @@ def _exclusive(kernel: str) -> Iterator[None]:
             except BlockingIOError:
                 lock.seek(0)
                 process = lock.read().strip() or "unknown"
-                log.log(NOTICE, "another run is compiling the same (process %s): waiting for it", process)
+                log.log(
+                    NOTICE,
+                    "another run is compiling the same (process %s): waiting for it",
+                    process,
+                )
                 fcntl.flock(lock, fcntl.LOCK_EX)
             lock.truncate(0)
             lock.write(f"{os.getpid()}\n")
@@ -332,6 +346,8 @@ def _exclusive(kernel: str) -> Iterator[None]:
                     path.unlink(missing_ok=True)
         except OSError as error:  # some network file systems have no locks
             log.warning(
-                "%s cannot be locked (%s): several runs at a time may wait for each other", lock.name, error.strerror
+                "%s cannot be locked (%s): several runs at a time may wait for each other",
+                lock.name,
+                error.strerror,
             )
         yield

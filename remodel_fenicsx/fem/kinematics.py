@@ -202,7 +202,9 @@ class SectorKinematics(FullKinematics):
     """Displacement of a quarter of a tube between its planes of symmetry x = 0 and y = 0."""
 
     name = "sector"
-    meaning = "the displacement in three dimensions on a quarter of a tube, between planes of symmetry"
+    meaning = (
+        "the displacement in three dimensions on a quarter of a tube, between planes of symmetry"
+    )
     reduced = True
     has_rigid_modes = False
     symmetry_planes: ClassVar[Mapping[str, int]] = {"plane_x": 0, "plane_y": 1}
@@ -343,7 +345,11 @@ class PointKinematics(_Reduced):
         """Return F, constant and diagonal except for F_xy."""
         stretches = (_along(i, unknown[i] / self.axial_length) for i in range(3))
         F = sum(stretches, ufl.Identity(3))
-        return F if self._shear is None else F + ufl.as_tensor([[0, self._shear, 0], [0, 0, 0], [0, 0, 0]])
+        return (
+            F
+            if self._shear is None
+            else F + ufl.as_tensor([[0, self._shear, 0], [0, 0, 0], [0, 0, 0]])
+        )
 
     def shear(self) -> Constant | None:
         """Return the Constant F_xy, from now on a part of F."""
@@ -366,12 +372,22 @@ class PointKinematics(_Reduced):
         """Return the displacement of the nodes of the bar, (nodes, 3)."""
         places: Array = self._nodes.tabulate_dof_coordinates()
         # a rank without the element has neither nodes nor numbers
-        return places * unknown.x.array.reshape(-1, 3)[:1] / self.body.axial_length if len(places) else places
+        return (
+            places * unknown.x.array.reshape(-1, 3)[:1] / self.body.axial_length
+            if len(places)
+            else places
+        )
 
 
 KINEMATICS: dict[str, Kinematics] = {
     kind.name: kind()
-    for kind in (FullKinematics, SectorKinematics, AxisymmetricKinematics, RadialKinematics, PointKinematics)
+    for kind in (
+        FullKinematics,
+        SectorKinematics,
+        AxisymmetricKinematics,
+        RadialKinematics,
+        PointKinematics,
+    )
 }
 """Kinematics by their name in scenes."""
 
@@ -482,7 +498,10 @@ class FreeLength(_KinematicsWrapper):
 
         dofs = unknown.function_space.sub(1).dofmap.list.flatten()
         here = float(unknown.x.array[dofs[0]]) if len(dofs) else -np.inf
-        return float(unknown.function_space.mesh.comm.allreduce(here, MPI.MAX)) / self.body.axial_length
+        return (
+            float(unknown.function_space.mesh.comm.allreduce(here, MPI.MAX))
+            / self.body.axial_length
+        )
 
 
 def global_constant_space(space: FunctionSpace, component: int) -> FunctionSpace:
@@ -516,7 +535,9 @@ def global_constant_space(space: FunctionSpace, component: int) -> FunctionSpace
     place[: old.size_local][owned] = np.arange(owned.sum())
     place[old.size_local :][ghosts] = size + np.arange(ghosts.sum())
     place[is_one] = size - 1 if is_owner else size + ghosts.sum()
-    return compat.space_with_dofs(space, size, new_ghosts, owners.astype(np.int32), place[dofmap.list])
+    return compat.space_with_dofs(
+        space, size, new_ghosts, owners.astype(np.int32), place[dofmap.list]
+    )
 
 
 def field_degree(space: FunctionSpace) -> int:

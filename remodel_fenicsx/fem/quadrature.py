@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 
 # Degrees of the elements' rules, because UFL's estimate for this energy is far too high.
 DEGREES = {
-    **{(kind, degree): 2 * degree for kind in ("interval", "quadrilateral", "hexahedron") for degree in (1, 2)},
+    **{
+        (kind, degree): 2 * degree
+        for kind in ("interval", "quadrilateral", "hexahedron")
+        for degree in (1, 2)
+    },
     ("tetrahedron", 1): 1,
     ("tetrahedron", 2): 2,
 }
@@ -35,7 +39,9 @@ DEGREES = {
 def shape_functions(kind: str, degree: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return values, then slopes of a Lagrange element, (1 + dimension, points, nodes)."""
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
-    element = basix.create_element(family, basix.CellType[kind], degree, variant, discontinuous=degree == 0)
+    element = basix.create_element(
+        family, basix.CellType[kind], degree, variant, discontinuous=degree == 0
+    )
     return np.asarray(element.tabulate(1, points))[..., 0]
 
 
@@ -104,9 +110,13 @@ class Quadrature:
         self.coordinates, lengths = self._geometry()
         # the product of an element's extents is |det J|, on lines and surfaces too
         self.volumes: NDArray[np.float64] = lengths.prod(axis=2) * self.weights
-        self.extent = float((self.integral(np.ones(self.shape)) / elements.size_global) ** (1 / dimension))
+        self.extent = float(
+            (self.integral(np.ones(self.shape)) / elements.size_global) ** (1 / dimension)
+        )
         if not isinstance(weight, (int, float)):
-            weight = self.evaluate(jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ())
+            weight = self.evaluate(
+                jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ()
+            )
         self.volumes = self.volumes * weight
         self.smallest_lengths: NDArray[np.float64] = np.asarray(lengths[..., -1], dtype=np.float64)
         self.largest_areas: NDArray[np.float64] = (self.volumes / lengths[..., -1]).sum(axis=1)
@@ -138,7 +148,9 @@ class Quadrature:
         """
         # One space for each shape: its dofmap takes time and memory.
         if value_shape not in self._spaces:
-            element = basix.ufl.quadrature_element(self.element_kind, value_shape=value_shape, degree=self.degree)
+            element = basix.ufl.quadrature_element(
+                self.element_kind, value_shape=value_shape, degree=self.degree
+            )
             self._spaces[value_shape] = dolfinx.fem.functionspace(self.mesh, element)
         return dolfinx.fem.Function(self._spaces[value_shape], name=name)
 
@@ -167,7 +179,9 @@ class Quadrature:
         """Return the volume mean of values (elements, points). Collective."""
         return self.integral(values) / self.volume
 
-    def nanmean(self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None) -> float:
+    def nanmean(
+        self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None
+    ) -> float:
         """Return the volume mean over the points whose value is not NaN. Collective.
 
         The mean is NaN if all values are NaN.
@@ -181,9 +195,15 @@ class Quadrature:
             Default: 1.
         """
         known = ~np.isnan(values)
-        counted = known if weights is None else known * (weights if weights.ndim == 2 else weights[:, None])
+        counted = (
+            known
+            if weights is None
+            else known * (weights if weights.ndim == 2 else weights[:, None])
+        )
         volume = self.integral(counted.astype(np.float64))
-        return self.integral(np.where(known, values, 0.0) * counted) / volume if volume > 0 else np.nan
+        return (
+            self.integral(np.where(known, values, 0.0) * counted) / volume if volume > 0 else np.nan
+        )
 
     @cached_property
     def gradients(self) -> NDArray[np.float64]:
@@ -209,7 +229,9 @@ class Quadrature:
     def element_nanmean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return each element's volume mean without NaN, (elements, points) to (elements,)."""
         known = ~np.isnan(values)
-        sums, shares = self.element_mean(np.where(known, values, 0.0)), self.element_mean(known.astype(np.float64))
+        sums, shares = self.element_mean(np.where(known, values, 0.0)), self.element_mean(
+            known.astype(np.float64)
+        )
         return np.divide(sums, shares, out=np.full_like(sums, np.nan), where=shares > 0)
 
     @cached_property
@@ -231,7 +253,9 @@ class Quadrature:
 
     def _fitted(self, degree: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the matrix from values to their least-squares polynomial at other points."""
-        polynomials, elsewhere = (shape_functions(self.element_kind, degree, x)[0] for x in (self.points, points))
+        polynomials, elsewhere = (
+            shape_functions(self.element_kind, degree, x)[0] for x in (self.points, points)
+        )
         roots = np.sqrt(self.weights)[:, None]
         return np.asarray(elsewhere @ (np.linalg.pinv(roots * polynomials) * roots.T))
 
@@ -246,7 +270,9 @@ class Quadrature:
 
     def superconvergent_from_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate nodal values (elements, nodes) to the superconvergent points."""
-        functions = shape_functions(self.element_kind, self.mesh.geometry.cmap.degree, self._superconvergent_points)
+        functions = shape_functions(
+            self.element_kind, self.mesh.geometry.cmap.degree, self._superconvergent_points
+        )
         return np.asarray(values @ functions[0].T)
 
     @cached_property
@@ -271,7 +297,10 @@ class Quadrature:
 
     def _means_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return nodal means by volume of values (owned elements, nodes or 1, n). Collective."""
-        nodes, number = geometry_dofmap(self.mesh)[: self.number_of_owned_elements], values.shape[-1] + 1
+        nodes, number = (
+            geometry_dofmap(self.mesh)[: self.number_of_owned_elements],
+            values.shape[-1] + 1,
+        )
         sums = dolfinx.la.vector(self.mesh.geometry.index_map(), number, dtype=np.float64)
         volumes = np.ones((*nodes.shape, 1)) * self.owned(self.volumes).sum(axis=1)[:, None, None]
         at_nodes = sums.array.reshape(-1, number)
@@ -304,4 +333,6 @@ class Quadrature:
 
     def norm(self, values: NDArray[np.float64]) -> float:
         """Return the root of the sum of squares of values (elements, ...). Collective."""
-        return float(np.sqrt(self.mesh.comm.allreduce(float(np.sum(self.owned(values) ** 2)), MPI.SUM)))
+        return float(
+            np.sqrt(self.mesh.comm.allreduce(float(np.sum(self.owned(values) ** 2)), MPI.SUM))
+        )

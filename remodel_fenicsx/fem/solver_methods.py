@@ -170,12 +170,20 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, ob
 
 def multigrid_options() -> dict[str, object]:
     """Return the PETSc options of the preconditioner of `iterative`."""
-    return {name: value for name, value in SOLVER_METHODS["iterative"].options.items() if name[:2] in ("pc", "mg")}
+    return {
+        name: value
+        for name, value in SOLVER_METHODS["iterative"].options.items()
+        if name[:2] in ("pc", "mg")
+    }
 
 
 def factor_options(kind: str) -> dict[str, object]:
     """Return PETSc options of a factorisation on one rank; `kind`: key of `FACTOR_OPTIONS`."""
-    return {name: value for name, value in FACTOR_OPTIONS[kind].items() if name.startswith(("pc_", "mat_"))}
+    return {
+        name: value
+        for name, value in FACTOR_OPTIONS[kind].items()
+        if name.startswith(("pc_", "mat_"))
+    }
 
 
 # ---------------------------------------------------------------- PETSc options in scenes
@@ -188,7 +196,8 @@ _PLAIN = re.compile(r"[A-Za-z0-9_.,+-]*")
 # PETSc's PetscViewerType. At the end of a value of a monitor or view each opens a file, a socket or
 # a window.
 _VIEWERS = tuple(
-    "adios ascii binary cgns draw exodusii glvis hdf5 " "mathematica matlab pyvista saws socket string vtk vu".split()
+    "adios ascii binary cgns draw exodusii glvis hdf5 "
+    "mathematica matlab pyvista saws socket string vtk vu".split()
 )
 # Options of MUMPS: units of its messages (each opens a file fort.N except 0 and 6), and factors
 # stored on the disk.
@@ -205,9 +214,15 @@ def option_problem(name: str, value: str | float | bool) -> str | None:
         return "not an option of a solver; allowed: snes_..., ksp_..., pc_..., mat_..."
     if _CODE.search(name) or any(map(_CODE.search, words)):
         return "would run custom code; allowed: PETSc's compiled solvers"
-    if _MUMPS_FILES.search(name) or _FILES.search(name) or (_FILE_OR_TERMINAL.search(name) and value is not True):
+    if (
+        _MUMPS_FILES.search(name)
+        or _FILES.search(name)
+        or (_FILE_OR_TERMINAL.search(name) and value is not True)
+    ):
         return "would write files; allowed: options that write no files"
-    if isinstance(value, str) and (not _PLAIN.fullmatch(value) or any(word.endswith(_VIEWERS) for word in words)):
+    if isinstance(value, str) and (
+        not _PLAIN.fullmatch(value) or any(word.endswith(_VIEWERS) for word in words)
+    ):
         return "names a file or a viewer; allowed: names, numbers, true (PETSc then prints), false"
     return None
 
@@ -258,7 +273,9 @@ class ProblemOptions:
 
     def unused(self) -> list[str]:
         """Return the scene's and the user's options without effect so far, perhaps misspelt."""
-        return sorted(key for key in self._names & self.given if not self._was_used(self.prefix + key))
+        return sorted(
+            key for key in self._names & self.given if not self._was_used(self.prefix + key)
+        )
 
     def close(self) -> None:
         """Remove the options from PETSc's database."""
@@ -279,5 +296,7 @@ class ProblemOptions:
 
     def _was_used(self, name: str) -> bool:
         answer = ctypes.c_int(0)  # petsc4py lacks this function
-        ctypes.CDLL(self._petsc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(answer))
+        ctypes.CDLL(self._petsc.__file__).PetscOptionsUsed(
+            None, name.encode(), ctypes.byref(answer)
+        )
         return bool(answer.value)

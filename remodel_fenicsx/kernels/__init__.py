@@ -64,13 +64,23 @@ def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
         following = found.string.count("\n", 0, found.end()) + 1
         return f'{source(found[1])}#line {following} "{name}"\n'
 
-    text = re.sub(r'^#include "(.+)"\n', included, (FOLDER / name).read_text(encoding="utf-8"), flags=re.MULTILINE)
-    return "".join(f"#define {key} {value!r}\n" for key, value in numbers.items()) + f'#line 1 "{name}"\n{text}'
+    text = re.sub(
+        r'^#include "(.+)"\n',
+        included,
+        (FOLDER / name).read_text(encoding="utf-8"),
+        flags=re.MULTILINE,
+    )
+    return (
+        "".join(f"#define {key} {value!r}\n" for key, value in numbers.items())
+        + f'#line 1 "{name}"\n{text}'
+    )
 
 
 def declarations(text: str) -> list[str]:
     """Return the declarations of a C text's non-static functions and enumerations."""
-    return re.findall(r"^((?!static)\w+ \w+\([^)]*\)(?=\n\{)|enum \{[^}]*\}(?=;))", text, flags=re.MULTILINE)
+    return re.findall(
+        r"^((?!static)\w+ \w+\([^)]*\)(?=\n\{)|enum \{[^}]*\}(?=;))", text, flags=re.MULTILINE
+    )
 
 
 def uses_numpy() -> bool:
@@ -84,13 +94,17 @@ def uses_numpy() -> bool:
 @functools.cache
 def _log_numpy_once() -> None:
     if MPI.COMM_WORLD.rank == 0:
-        log.log(NOTICE, "%s=numpy: using the numpy kernels (slower; for debugging)", environment.KERNELS)
+        log.log(
+            NOTICE, "%s=numpy: using the numpy kernels (slower; for debugging)", environment.KERNELS
+        )
 
 
 class Library:
     """Functions of a C file that can be called with arrays."""
 
-    def __init__(self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float] = NO_NUMBERS):
+    def __init__(
+        self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float] = NO_NUMBERS
+    ):
         text = source(name, numbers)
         called = "".join(f"{line};\n" for line in declarations(text))
         module = jit.library(comm, called, text, what)
@@ -113,7 +127,10 @@ def with_kernels(tissue: Tissue, comm: MPI.Intracomm) -> Tissue:
         return tissue
     kernels = TensorKernels(comm)
     return replace(
-        tissue, repulsion=replace(tissue.repulsion, sum=kernels.log_sum, derivatives=kernels.log_derivatives)
+        tissue,
+        repulsion=replace(
+            tissue.repulsion, sum=kernels.log_sum, derivatives=kernels.log_derivatives
+        ),
     )
 
 
@@ -124,7 +141,9 @@ class PointKernels:
     """Functions on arrays of n points in numpy, the reference for those in C."""
 
     principal: spectral.Pairing = staticmethod(spectral.principal)
-    positive_direction: Callable[..., tuple[Array, Flags]] = staticmethod(spectral.positive_direction)
+    positive_direction: Callable[..., tuple[Array, Flags]] = staticmethod(
+        spectral.positive_direction
+    )
     drop_noise_shear: Callable[..., Array] = staticmethod(spectral.drop_noise_shear)
     structure_tensor: Callable[..., Array] = staticmethod(cells.structure_tensor)
 
@@ -140,7 +159,11 @@ class CompiledPointKernels(PointKernels):
         self._call = Library(comm, "spectral.c", "the pass")
 
     def principal(
-        self, tensors: ArrayLike, previous: ArrayLike, tolerance: float = spectral.AGREEMENT, threshold: ArrayLike = 0.0
+        self,
+        tensors: ArrayLike,
+        previous: ArrayLike,
+        tolerance: float = spectral.AGREEMENT,
+        threshold: ArrayLike = 0.0,
     ) -> tuple[Array, Array]:
         """Compute by Jacobi's method; numpy computes the points that this leaves open."""
         tensors, previous = np.asarray(tensors), np.asarray(previous)
@@ -152,10 +175,14 @@ class CompiledPointKernels(PointKernels):
             if np.any(left_open == NOT_FINITE):
                 return super().principal(tensors, previous, tolerance, threshold)
             at = np.flatnonzero(left_open)
-            values[at], axes[at] = super().principal(tensors[at], previous[at], tolerance, limit[at])
+            values[at], axes[at] = super().principal(
+                tensors[at], previous[at], tolerance, limit[at]
+            )
         return values, axes
 
-    def positive_direction(self, values: ArrayLike, threshold: ArrayLike = 0.0) -> tuple[Array, Flags]:
+    def positive_direction(
+        self, values: ArrayLike, threshold: ArrayLike = 0.0
+    ) -> tuple[Array, Flags]:
         values = np.asarray(values)
         n, limit = len(values), np.broadcast_to(threshold, len(values))
         direction, active = np.empty((n, 3)), np.empty(n, np.bool_)
@@ -200,7 +227,9 @@ class TensorKernels:
         if turned_back and drive.frame.tensor is not corotational_tensor:
             turned_back, given = False, drive.frame.tensor(F, given)
         direction, switch = np.empty((n, 3, 3)), np.empty(n)
-        self.call("target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, switch)
+        self.call(
+            "target", n, F, given, turned_back, np.broadcast_to(drive.floor, n), direction, switch
+        )
         return tensor_law.Target(direction, switch)
 
     def log_sum(self, F: Array, cells: Sequence[UnitCell], end_to_end_length: Any) -> Array:
@@ -208,10 +237,18 @@ class TensorKernels:
         if np.iscomplexobj(F):
             return energy.log_sum(F, cells, end_to_end_length)
         result = np.empty(F.shape[:-2])
-        self.call("log_sum", result.size, F, np.broadcast_to(energy.total_structure_tensor(cells), F.shape), result)
+        self.call(
+            "log_sum",
+            result.size,
+            F,
+            np.broadcast_to(energy.total_structure_tensor(cells), F.shape),
+            result,
+        )
         return result
 
-    def log_derivatives(self, C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
+    def log_derivatives(
+        self, C: Array, A: Array, second: bool = True
+    ) -> tuple[Array, Array | None]:
         """Compute the derivatives of `energy.log_derivatives`."""
         first, matrices = np.empty(C.shape), np.empty((len(C), 6, 6)) if second else None
         self.call("log_derivatives", len(C), C, A, first, matrices)

@@ -17,7 +17,13 @@ Maker = Callable[[], Array]
 # name of a measured quantity: allowed numbers of columns
 NATURAL_GRADIENT = "natural_gradient"
 GROWTH = "growth"  # J_g
-MEASURED = {"structure_tensor": (9, 6), "fibre": (3,), "angle": (1,), "fibre_2": (3,), "weight": (1,)}
+MEASURED = {
+    "structure_tensor": (9, 6),
+    "fibre": (3,),
+    "angle": (1,),
+    "fibre_2": (3,),
+    "weight": (1,),
+}
 # These need one of SOURCES.
 MEASURED |= {NATURAL_GRADIENT: (9,), "content": (1,), "natural_length": (1,), GROWTH: (1,)}
 FIBRE_INPUTS = ("structure_tensor", "fibre", "angle")  # exactly one is needed
@@ -135,7 +141,8 @@ def push_forward_axes(axes: Array, deformation_gradient: Array) -> Array:
     """Return deformed axes, rows (..., 3, 3), from reference axes; see `LocalAxes.deformed`."""
     F, rows = components_first(deformation_gradient), components_first(axes)
     circumferential, axial = (
-        [F[i, 0] * rows[k, 0] + F[i, 1] * rows[k, 1] + F[i, 2] * rows[k, 2] for i in range(3)] for k in (0, 1)
+        [F[i, 0] * rows[k, 0] + F[i, 1] * rows[k, 1] + F[i, 2] * rows[k, 2] for i in range(3)]
+        for k in (0, 1)
     )
     radial = _unit(_cross(circumferential, axial))
     circumferential = _unit(circumferential)
@@ -220,7 +227,9 @@ def structure_tensors(measured: Mapping[str, Array], axes: Array) -> Array:
     return weight * _along(first) + (1 - weight) * remainder
 
 
-def cells_from_tensors(tensors: Array, end_to_end_length: float, previous: Array) -> tuple[Array, Array]:
+def cells_from_tensors(
+    tensors: Array, end_to_end_length: float, previous: Array
+) -> tuple[Array, Array]:
     """Return l_I (..., 3), longest first, and n_I as rows (..., 3, 3) with A = r0^2 T / tr T."""
     # Equal eigenvalues of T leave axes undetermined; these are then taken from `previous`,
     # (..., 3, 3).

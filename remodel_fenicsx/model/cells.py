@@ -156,7 +156,10 @@ def _local_components(dimensions: Array, axes: Array, local: Array) -> list[Arra
     l = components_first(dimensions, 1)
     n, d = components_first(axes), components_first(local)
     # Explicit sums of three products give the same numbers with every BLAS.
-    along = ([n[i, 0] * d[k, 0] + n[i, 1] * d[k, 1] + n[i, 2] * d[k, 2] for i in range(3)] for k in range(3))
+    along = (
+        [n[i, 0] * d[k, 0] + n[i, 1] * d[k, 1] + n[i, 2] * d[k, 2] for i in range(3)]
+        for k in range(3)
+    )
     return [np.sqrt((l[0] * x) ** 2 + (l[1] * y) ** 2 + (l[2] * z) ** 2) for x, y, z in along]
 
 
@@ -178,7 +181,9 @@ def angle_between(first: UnitCell, second: UnitCell) -> Array:
     first_root = first.dimensions / _norm(first.dimensions)[:, None]  # the roots of a_I
     scaled = second.axes * (second.dimensions / _norm(second.dimensions)[:, None])[:, :, None]
     second_root = np.swapaxes(second.axes, 1, 2) @ scaled
-    change = first.axes @ second_root @ np.swapaxes(first.axes, 1, 2) - first_root[:, :, None] * np.eye(3)
+    change = first.axes @ second_root @ np.swapaxes(first.axes, 1, 2) - first_root[
+        :, :, None
+    ] * np.eye(3)
     squared = first_root**2
     sums = squared[:, :, None] + squared[:, None, :]
     squares = (first_root[:, :, None] + first_root[:, None, :]) ** 2

@@ -90,7 +90,9 @@ class WithParameters:
         if not values:
             return self
         functions = {name: getattr(self, name) for name in self.functions}
-        bound = {name: partial(function, **values) for name, function in functions.items() if function}
+        bound = {
+            name: partial(function, **values) for name, function in functions.items() if function
+        }
         return replace(self, values=values, **bound)  # type: ignore[type-var]
 
 
@@ -157,7 +159,12 @@ class Chain(WithParameters):
         number, array or UFL
             Force in the unit of `k_theta` over the unit of length.
         """
-        return k_theta / persistence_length * self.stiffness(end_to_end_length, contour_length) * end_to_end_length
+        return (
+            k_theta
+            / persistence_length
+            * self.stiffness(end_to_end_length, contour_length)
+            * end_to_end_length
+        )
 
 
 CHAINS: dict[str, Chain] = {"wormlike": Chain(wormlike_energy, wormlike_stiffness)}

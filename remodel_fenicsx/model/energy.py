@@ -98,10 +98,14 @@ class Matrix:
         matrix.others = tuple(partial(term, **values) for term in self.others)
         return matrix
 
-    def __call__(self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray) -> UflOrArray:
+    def __call__(
+        self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray
+    ) -> UflOrArray:
         """Return the total energy of the matrix."""
         volumetric = self.volumetric(det(deformation_gradient), lame_lambda, lame_mu)
-        return sum((term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric)
+        return sum(
+            (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others), volumetric
+        )
 
     def distortional(
         self, deformation_gradient: UflOrArray, lame_lambda: UflOrArray, lame_mu: UflOrArray
@@ -115,7 +119,9 @@ class Matrix:
         lame_lambda, lame_mu
             Lame constants in the unit of stress.
         """
-        first, *remaining = (term(deformation_gradient, lame_lambda, lame_mu) for term in self.others)
+        first, *remaining = (
+            term(deformation_gradient, lame_lambda, lame_mu) for term in self.others
+        )
         return sum(remaining, first)
 
 
@@ -141,9 +147,13 @@ def mixture_matrix(matrices: Sequence[Matrix]) -> Matrix:
     numbers = {name: number for matrix in matrices for name, number in matrix.parameters.items()}
     numbers |= {name: Parameter(0.0, "1 in regions with this matrix, else 0.") for name in names}
 
-    def weighted_matrices(values: Mapping[str, UflOrArray]) -> Iterator[tuple[UflOrArray, UflOrArray]]:
+    def weighted_matrices(
+        values: Mapping[str, UflOrArray],
+    ) -> Iterator[tuple[UflOrArray, UflOrArray]]:
         for key, matrix in zip(names, matrices, strict=True):
-            yield values[key], matrix.with_parameters({name: values[name] for name in matrix.parameters})
+            yield values[key], matrix.with_parameters(
+                {name: values[name] for name in matrix.parameters}
+            )
 
     return Matrix(
         lambda J, lam, mu, **values: sum(
@@ -169,7 +179,9 @@ F = I. Formulations other than "displacement" require a `Matrix`."""
 # variant"). `length` is the simplest function of A; isotropic cells give it no shear stiffness.
 
 
-def squared_end_to_end_length(deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
+def squared_end_to_end_length(
+    deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
+) -> UflOrArray:
     """Return r^2 = sum_I l_I^2 n_I . C n_I, the squared end-to-end length of the chains (eq. 5).
 
     Parameters
@@ -199,7 +211,9 @@ def squared_end_to_end_length(deformation_gradient: UflOrArray, cells: Sequence[
     )
 
 
-def axes_sum(deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
+def axes_sum(
+    deformation_gradient: UflOrArray, cells: Sequence[UnitCell], end_to_end_length: UflOrArray
+) -> UflOrArray:
     """Return M = sum_I l_I^2 ln(n_I . C n_I) of the paper's repulsive energy (eq. 4c).
 
     Parameters
@@ -241,11 +255,19 @@ def length_sum(
     return end_to_end_length**2 * ln(squared / end_to_end_length**2)
 
 
-def log_sum(deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: UflOrArray) -> UflOrArray:
+def log_sum(
+    deformation_gradient: Array, cells: Sequence[UnitCell], end_to_end_length: UflOrArray
+) -> UflOrArray:
     """Return M = A : ln C of arrays; for complex F to first order in the imaginary part."""
-    C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, total_structure_tensor(cells)
+    C, A = np.swapaxes(deformation_gradient, -1, -2) @ deformation_gradient, total_structure_tensor(
+        cells
+    )
     M = (A * tensors.logarithm(C.real)).sum(axis=(-1, -2))
-    return M + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2)) if np.iscomplexobj(C) else M
+    return (
+        M + 1j * (log_derivatives(C.real, A, False)[0] * C.imag).sum(axis=(-1, -2))
+        if np.iscomplexobj(C)
+        else M
+    )
 
 
 def total_structure_tensor(cells: Sequence[UnitCell]) -> Array:
@@ -262,7 +284,9 @@ def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Arr
     if not second:
         return first, None
     rotation = tensors.congruence(vectors)
-    return first, rotation @ tensors.second_derivative(values, components) @ np.swapaxes(rotation, 1, 2)
+    return first, rotation @ tensors.second_derivative(values, components) @ np.swapaxes(
+        rotation, 1, 2
+    )
 
 
 @dataclass(frozen=True)
@@ -336,7 +360,9 @@ class Stresses(NamedTuple):
     second_piola_kirchhoff: UflOrArray
     cauchy: UflOrArray
 
-    def plus(self, deformation_gradient: UflOrArray, second_piola_kirchhoff: UflOrArray) -> Stresses:
+    def plus(
+        self, deformation_gradient: UflOrArray, second_piola_kirchhoff: UflOrArray
+    ) -> Stresses:
         """Add a second Piola-Kirchhoff stress that `Tissue.strain_energy` does not contain in UFL.
 
         Parameters
@@ -417,7 +443,11 @@ class Tissue:
         """Length at which a chain locks, rho L, in link lengths; None if no chain locks."""
         if self.chain is None or not self.chain.locks:
             return None
-        return self.contour_length if self.natural_length is None else self.natural_length * self.contour_length
+        return (
+            self.contour_length
+            if self.natural_length is None
+            else self.natural_length * self.contour_length
+        )
 
     @property
     def current_modulus(self) -> UflOrArray:
@@ -467,7 +497,10 @@ class Tissue:
     @property
     def _own_parameters(self) -> dict[str, Mapping[str, UflOrArray]]:
         """Additional parameters by component: chain, matrix or repulsion."""
-        values = {name: getattr(getattr(self, name), "values", None) for name in ("chain", "matrix", "repulsion")}
+        values = {
+            name: getattr(getattr(self, name), "values", None)
+            for name in ("chain", "matrix", "repulsion")
+        }
         return {name: bound for name, bound in values.items() if bound}
 
     def map(self, function: Callable[[str, UflOrArray], UflOrArray]) -> Tissue:
@@ -480,7 +513,9 @@ class Tissue:
         """
         values = {name: function(name, value) for name, value in self.parameters.items()}
         components = {
-            component: getattr(self, component).with_parameters({name: values[name] for name in names})
+            component: getattr(self, component).with_parameters(
+                {name: values[name] for name in names}
+            )
             for component, names in self._own_parameters.items()
         }
         own = {name: values[name] for name in values if name in PARAMETERS + TURNED_OVER}
@@ -490,10 +525,14 @@ class Tissue:
         """Return whether a rotation about z before the deformation keeps the matrix energy."""
         pulled, (c, s) = np.diag([1.1, 1.3, 1.2]), (0.8, 0.6)
         rotated = pulled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        energy, rotated_energy = (self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, rotated))
+        energy, rotated_energy = (
+            self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, rotated)
+        )
         return bool(np.isclose(energy, rotated_energy, rtol=1e-9))
 
-    def strain_energy(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
+    def strain_energy(
+        self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
+    ) -> UflOrArray:
         """Return W per reference volume (eqs. 3 and 4 with errata 1 and 2).
 
         Parameters
@@ -513,7 +552,9 @@ class Tissue:
         energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
 
-    def distortional_energy(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> UflOrArray:
+    def distortional_energy(
+        self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
+    ) -> UflOrArray:
         """Return W without the volumetric part of the matrix; see `strain_energy`."""
         energy = self._parts().distortional(deformation_gradient, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
@@ -531,7 +572,9 @@ class Tissue:
     def _parts(self) -> Matrix:
         if isinstance(self.matrix, Matrix):
             return self.matrix
-        raise TypeError("no separate volumetric part in this matrix energy; use remodel_fenicsx.extend.Matrix")
+        raise TypeError(
+            "no separate volumetric part in this matrix energy; use remodel_fenicsx.extend.Matrix"
+        )
 
     def _with_network(
         self, energy: UflOrArray, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
@@ -544,14 +587,18 @@ class Tissue:
         if not is_array(deformation_gradient) and self.repulsion.derivatives is not None:
             return energy + self.current_modulus * chains
         stiffness = self.chain.stiffness(self.end_to_end_length, self.contour_length)
-        repulsion = -stiffness / 2 * self.repulsion.sum(deformation_gradient, cells, self.end_to_end_length)
+        repulsion = (
+            -stiffness / 2 * self.repulsion.sum(deformation_gradient, cells, self.end_to_end_length)
+        )
         return energy + self.current_modulus * (chains + repulsion)
 
     @property
     def repulsion_modulus(self) -> UflOrArray:
         """Modulus of the repulsion, m c g(r0); W_rep = -m c g(r0) M / 2."""
         assert self.chain is not None
-        return self.current_modulus * self.chain.stiffness(self.end_to_end_length, self.contour_length)
+        return self.current_modulus * self.chain.stiffness(
+            self.end_to_end_length, self.contour_length
+        )
 
     def stresses(self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]) -> Stresses:
         """Return P = dW/dF, S = F^-1 P and sigma = P F^T / J (eqs. 6 and 7 with erratum 5); UFL.
@@ -572,9 +619,13 @@ class Tissue:
         """Return stresses with U at the given J: P = d(W - U)/dF + J U'(J) F^-T; UFL."""
         F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
         pressure = J * ufl.diff(self.volumetric_energy(J), J)
-        return _stresses(F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T)
+        return _stresses(
+            F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T
+        )
 
-    def energy_increment(self, deformation_gradient: UflOrArray, old: UnitCell, new: UnitCell) -> UflOrArray:
+    def energy_increment(
+        self, deformation_gradient: UflOrArray, old: UnitCell, new: UnitCell
+    ) -> UflOrArray:
         """Return the first-order change of W for new cells at frozen F (Remark 6).
 
         W per reference volume depends on the cells only through r^2 = A : C and M = sum_I l_I^2 ln
@@ -601,7 +652,11 @@ class Tissue:
         return chains - self.repulsion_modulus / 2 * repulsion
 
     def turnover_increment(
-        self, deformation_gradient: UflOrArray, cell: UnitCell, content: UflOrArray, natural_length: UflOrArray
+        self,
+        deformation_gradient: UflOrArray,
+        cell: UnitCell,
+        content: UflOrArray,
+        natural_length: UflOrArray,
     ) -> UflOrArray:
         """Return the first-order change of W at frozen F and cells for changes of ln m and ln rho.
 
@@ -617,7 +672,9 @@ class Tissue:
         assert self.chain is not None
         F, cells = deformation_gradient, [cell]
         length = self.normalised_length(sqrt(squared_end_to_end_length(F, cells)))
-        tension = self.current_modulus * self.chain.stiffness(length, self.contour_length) * length**2
+        tension = (
+            self.current_modulus * self.chain.stiffness(length, self.contour_length) * length**2
+        )
         return self._with_network(0.0, F, cells) * content - tension * natural_length
 
 

@@ -202,7 +202,9 @@ class Law:
     remodels: bool = True
     depends_on_absolute_time: bool = False
     target: Callable[[Drive], tensor_law.Target] | None = None
-    follow: Callable[[UnitCell, tensor_law.Target, Array | float, Array | float], UnitCell] | None = None
+    follow: (
+        Callable[[UnitCell, tensor_law.Target, Array | float, Array | float], UnitCell] | None
+    ) = None
     relax: Callable[[UnitCell, UnitCell, float], UnitCell] = relaxed
     is_ranked: bool = False
     keeps_symmetry: bool = False
@@ -214,7 +216,9 @@ class Law:
 
 
 @partial(with_old_arguments, "ranked")
-def ranked(function: RankedFunction, has_limit: bool = False, depends_on_absolute_time: bool = False) -> Law:
+def ranked(
+    function: RankedFunction, has_limit: bool = False, depends_on_absolute_time: bool = False
+) -> Law:
     """Make a law that sets axes to principal directions and changes dimensions (eqs. 8 to 11).
 
     Parameters
@@ -261,15 +265,21 @@ def ranked(function: RankedFunction, has_limit: bool = False, depends_on_absolut
     )
 
 
-def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
+def by_rank(
+    function: RankedFunction, cells: UnitCell, drive: Drive, time_old: float, time_new: float
+) -> UnitCell:
     """Set principal axes (eqs. 8 and 9), and move dimensions towards r0 e (eqs. 10 and 11)."""
     values, axes = principal_directions(drive, cells.axes, drive.pairing)
     direction, active = drive.kernels.positive_direction(values, threshold=drive.noise)
     target = np.reshape(drive.end_to_end_length, (-1, 1)) * direction
     if np.ndim(drive.kappa):
         active = active & (np.asarray(drive.kappa) > 0.0)
-    dimensions = function(cells.dimensions, drive.initial_dimensions, target, drive.kappas, time_old, time_new)
-    new = UnitCell(dimensions, framed(drive, axes, None if drive.pairing is spectral.principal else dimensions))
+    dimensions = function(
+        cells.dimensions, drive.initial_dimensions, target, drive.kappas, time_old, time_new
+    )
+    new = UnitCell(
+        dimensions, framed(drive, axes, None if drive.pairing is spectral.principal else dimensions)
+    )
     if not active.all():
         new = UnitCell(
             np.where(active[:, None], new.dimensions, cells.dimensions),
@@ -278,11 +288,15 @@ def by_rank(function: RankedFunction, cells: UnitCell, drive: Drive, time_old: f
     return new
 
 
-def principal_directions(drive: Drive, previous: Array, pairing: spectral.Pairing) -> tuple[Array, Array]:
+def principal_directions(
+    drive: Drive, previous: Array, pairing: spectral.Pairing
+) -> tuple[Array, Array]:
     """Return principal values and directions of the drive; `previous` are the cells' axes."""
     if not drive.driver.material and drive.frame.carries_axes:
         previous = convected_axes(drive.deformation_gradient, previous)
-    function: spectral.Pairing = drive.kernels.principal if pairing is spectral.principal else pairing
+    function: spectral.Pairing = (
+        drive.kernels.principal if pairing is spectral.principal else pairing
+    )
     return function(drive.tensor, previous, threshold=drive.noise)
 
 
@@ -301,17 +315,23 @@ def framed(drive: Drive, axes: Array, dimensions: Array | None = None) -> Array:
     return np.take_along_axis(framed, np.argsort(order, axis=1), axis=1)
 
 
-def explicit(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
+def explicit(
+    l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float
+) -> Array:
     """Return l = l0 + (r0 e - l0)(1 - exp(-kappa t)), t = time_new, for current e (eq. 11)."""
     return l0 - (target - l0) * np.expm1(-kappa * time_new)
 
 
-def rate(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
+def rate(
+    l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float
+) -> Array:
     """Integrate dl/dt = kappa (r0 e - l0) exp(-kappa t) exactly over a step, e frozen (eq. 10)."""
     return l - (target - l0) * np.exp(-kappa * time_old) * np.expm1(-kappa * (time_new - time_old))
 
 
-def relaxation(l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float) -> Array:
+def relaxation(
+    l: Array, l0: Array, target: Array, kappa: Array | float, time_old: float, time_new: float
+) -> Array:
     """Integrate the autonomous form dl/dt = kappa (r0 e - l) exactly over the step, e frozen."""
     return l - (target - l) * np.expm1(-kappa * (time_new - time_old))
 
@@ -390,16 +410,23 @@ def tensor_target(drive: Drive) -> tensor_law.Target:
     target = tensor_law.target(material_tensor(drive), drive.floor, drive.exponent)
     if not drive.least_tension:
         return target
-    return target._replace(switch=target.switch * tensor_law.activation(drive.tensor, drive.least_tension))
+    return target._replace(
+        switch=target.switch * tensor_law.activation(drive.tensor, drive.least_tension)
+    )
 
 
 def follow_tensor(
-    cells: UnitCell, target: tensor_law.Target, end_to_end_length: Array | float, kappa_dt: Array | float
+    cells: UnitCell,
+    target: tensor_law.Target,
+    end_to_end_length: Array | float,
+    kappa_dt: Array | float,
 ) -> UnitCell:
     """Return cells with A of `tensor_law.relax_exactly`; axes of equal eigenvalues stay."""
     # Dimensions are NaN if an extrapolated target makes the tensor indefinite by more than
     # rounding.
-    structure = tensor_law.relax_exactly(structure_tensor(*cells[:2]), target, end_to_end_length, kappa_dt)
+    structure = tensor_law.relax_exactly(
+        structure_tensor(*cells[:2]), target, end_to_end_length, kappa_dt
+    )
     squared, axes = spectral.principal_by_continuity(structure, cells.axes)
     rounding = spectral.ROUNDING * np.abs(squared).max(axis=-1, keepdims=True)
     return UnitCell(np.where(squared < -rounding, np.nan, np.sqrt(np.maximum(squared, 0.0))), axes)
@@ -407,7 +434,9 @@ def follow_tensor(
 
 def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
     """Integrate dA/dt = kappa s (r0^2 E - A) over a step, E and s frozen (docs/theory.md, Law)."""
-    return follow_tensor(cells, tensor_target(drive), drive.end_to_end_length, drive.kappa * (time_new - time_old))
+    return follow_tensor(
+        cells, tensor_target(drive), drive.end_to_end_length, drive.kappa * (time_new - time_old)
+    )
 
 
 LAWS: dict[str, Law] = {
@@ -459,7 +488,9 @@ def largest_tension(drives: Sequence[Drive], weights: Weights) -> Drive:
     chosen = np.linalg.eigvalsh(tensors)[..., -1].argmax(axis=0)
     shape, points = tensors.shape[:2], np.arange(tensors.shape[1])
     noise, rounding = (
-        np.array([np.broadcast_to(getattr(drive, name), shape[1]) for drive in drives])[chosen, points]
+        np.array([np.broadcast_to(getattr(drive, name), shape[1]) for drive in drives])[
+            chosen, points
+        ]
         for name in ("noise", "rounding")
     )
     return _with(drives[0], tensors[chosen, points], noise, rounding)
@@ -467,7 +498,9 @@ def largest_tension(drives: Sequence[Drive], weights: Weights) -> Drive:
 
 def mean_target(targets: Sequence[Target], weights: Weights) -> Target:
     """Return the weighted mean of sE; the rate of A is linear in sE (`Target.towards`)."""
-    pulled = _weighted([target.switch[:, None, None] * target.direction for target in targets], weights)
+    pulled = _weighted(
+        [target.switch[:, None, None] * target.direction for target in targets], weights
+    )
     switch = np.einsum("nii->n", pulled)
     return Target(pulled / np.where(switch > 0.0, switch, 1.0)[:, None, None], switch)
 
@@ -492,7 +525,9 @@ class CaseAverage:
 
 MEANS_OF_CASES: dict[str, CaseAverage] = {
     "tensor": CaseAverage("the weighted mean of the driving tensors"),
-    "target": CaseAverage("the weighted mean of the targets that each case has, for the law 'tensor'", of_targets=True),
+    "target": CaseAverage(
+        "the weighted mean of the targets that each case has, for the law 'tensor'", of_targets=True
+    ),
     "largest": CaseAverage(
         "at each point the load case with the largest tension, whatever its weight", largest_tension
     ),
@@ -563,8 +598,12 @@ class TurnoverRule(NamedTuple):
         secant = chain.stiffness(deposited * r0, contour)
         total_force = secant - chain.stiffness(r0, contour) / deposited**2
         stimulus = secant * deposited**self.followed.power
-        stimulus_slope, force_slope = (float(np.log(value).imag) / COMPLEX_STEP for value in (stimulus, total_force))
-        return self.gain * stimulus_slope, force_slope * self.time / (self.gain * stimulus_slope - 2)
+        stimulus_slope, force_slope = (
+            float(np.log(value).imag) / COMPLEX_STEP for value in (stimulus, total_force)
+        )
+        return self.gain * stimulus_slope, force_slope * self.time / (
+            self.gain * stimulus_slope - 2
+        )
 
 
 def by_stress(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
@@ -574,10 +613,14 @@ def by_stress(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverR
         return 1.0 + np.log(tension(lambda_e * (1.0 + 1j * COMPLEX_STEP))).imag / COMPLEX_STEP
 
     slope = steepness(stretch)
-    relative = tension(stretch) * stretch / (tension(rule.deposition_stretch) * rule.deposition_stretch)
+    relative = (
+        tension(stretch) * stretch / (tension(rule.deposition_stretch) * rule.deposition_stretch)
+    )
     produced = 1.0 + rule.gain * (relative - 1.0)
     produced = np.maximum(produced, 0.0)
-    return TurnoverRates((produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (slope * rule.time))
+    return TurnoverRates(
+        (produced - 1.0) / rule.time, produced * (1.0 - 1.0 / relative) / (slope * rule.time)
+    )
 
 
 def by_tension(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:
@@ -588,5 +631,8 @@ def by_tension(rule: TurnoverRule, tension: Tension, stretch: Array) -> Turnover
     return TurnoverRates(content, turned_over * (stretch / rule.deposition_stretch - 1.0))
 
 
-TURNOVER_RATES = {"cauchy": TurnoverStimulus(by_stress, 2), "tension": TurnoverStimulus(by_tension, 1)}
+TURNOVER_RATES = {
+    "cauchy": TurnoverStimulus(by_stress, 2),
+    "tension": TurnoverStimulus(by_tension, 1),
+}
 """Rates by the name in `remodeling.turnover.rates`."""

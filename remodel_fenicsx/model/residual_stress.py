@@ -59,9 +59,13 @@ class Panels:
         self.places[:, -1] = self.edges[1:]
         self._coefficients = np.linalg.inv(chebyshev.chebvander(points, degree))
         ones = np.eye(degree + 1)
-        slopes = np.stack([chebyshev.chebval(points, chebyshev.chebder(unit)) for unit in ones], axis=-1)
+        slopes = np.stack(
+            [chebyshev.chebval(points, chebyshev.chebder(unit)) for unit in ones], axis=-1
+        )
         self._slope: Array = slopes @ self._coefficients
-        areas = np.array([chebyshev.chebval(1.0, chebyshev.chebint(unit, lbnd=-1)) for unit in ones])
+        areas = np.array(
+            [chebyshev.chebval(1.0, chebyshev.chebint(unit, lbnd=-1)) for unit in ones]
+        )
         self._weights: Array = areas @ self._coefficients
 
     def derivative(self, values: Array) -> Array:
@@ -78,7 +82,9 @@ class Panels:
 
     def panel_index(self, radius: Array) -> NDArray[np.intp]:
         """Return the panel number of each radius (...,); outside the wall it is the nearest."""
-        return np.clip(np.searchsorted(self.edges, radius, side="right") - 1, 0, len(self.edges) - 2)
+        return np.clip(
+            np.searchsorted(self.edges, radius, side="right") - 1, 0, len(self.edges) - 2
+        )
 
     def truncation_error(self, values: Array) -> Array:
         """Return the relative truncation error of values (panels, points), (panels,)."""
@@ -137,13 +143,18 @@ class ClosedRing(NamedTuple):
     def stretches(self, radius: Array) -> Array:
         """Return circumferential, axial and radial stretch of G at r (...,), (..., 3)."""
         slope = self.panels.interpolate(radius, self.panels.derivative(self.radius))
-        prestretch = np.array([layer.prestretch for layer in self.layers])[self.panels.panel_index(radius)]
+        prestretch = np.array([layer.prestretch for layer in self.layers])[
+            self.panels.panel_index(radius)
+        ]
         return self._joined(radius, self.natural_radius(radius), slope) * prestretch
 
     def at_panels(self) -> Array:
         """Return the stretches of G at the panels' points, (panels, points, 3)."""
         prestretch = np.array([layer.prestretch for layer in self.layers])[:, None]
-        return self._joined(self.panels.places, self.radius, self.panels.derivative(self.radius)) * prestretch
+        return (
+            self._joined(self.panels.places, self.radius, self.panels.derivative(self.radius))
+            * prestretch
+        )
 
     def _joined(self, radius: Array, natural: Array, slope: Array) -> Array:
         """Return the stretches of G without the prestretch."""
@@ -155,19 +166,26 @@ def close_ring(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loa
     """Compute the sector that closes to a ring in equilibrium, with isotropic cells."""
     final_k = 360.0 / (360.0 - opening_angle)
     panels = Panels([layers[0].radii[0], *(layer.radii[1] for layer in layers)], DEGREE)
-    factors = np.linspace(1.0, final_k, 1 + max(1, int(np.ceil((final_k - 1.0) / MAX_CLOSING_INCREMENT))))[1:]
+    factors = np.linspace(
+        1.0, final_k, 1 + max(1, int(np.ceil((final_k - 1.0) / MAX_CLOSING_INCREMENT)))
+    )[1:]
     ring = ClosedRing(tuple(layers), panels, panels.places.copy(), 1.0, loads.axial)
     for k in factors:
         grown = np.mean(ring.radius + (k - 1.0) * panels.places * 0.5) / np.mean(ring.radius)
         ring = _balanced(ring._replace(radius=grown * ring.radius, circumferential=float(k)), loads)
-    while (rough := ring.panels.truncation_error(ring.panels.derivative(ring.radius)) > TRUNCATION_TOLERANCE).any():
+    while (
+        rough := ring.panels.truncation_error(ring.panels.derivative(ring.radius))
+        > TRUNCATION_TOLERANCE
+    ).any():
         pieces = [
             piece
             for layer, is_rough in zip(ring.layers, rough, strict=True)
             for piece in (_halves(layer) if is_rough else [layer])
         ]
         if len(pieces) > MOST_POLYNOMIALS * len(layers):
-            raise ArithmeticError(f"ring and sector vary too much through the wall for {len(pieces)} polynomials")
+            raise ArithmeticError(
+                f"ring and sector vary too much through the wall for {len(pieces)} polynomials"
+            )
         finer = Panels([pieces[0].radii[0], *(piece.radii[1] for piece in pieces)], DEGREE)
         radius = ring.natural_radius(finer.places)
         ring = _balanced(ring._replace(layers=tuple(pieces), panels=finer, radius=radius), loads)
@@ -199,8 +217,12 @@ def _balanced(start: ClosedRing, loads: Loads) -> ClosedRing:
             along = (force - loads.force / stiffness) / (np.pi * (edges[-1] ** 2 - edges[0] ** 2))
         return np.concatenate([through, along[..., None]], axis=-1)
 
-    solution = solve_newton(tissues, [None] * len(tissues), stretches, residual, np.append(start.radius, start.axial))
-    return start._replace(radius=solution[:-1].reshape(start.radius.shape), axial=float(solution[-1]))
+    solution = solve_newton(
+        tissues, [None] * len(tissues), stretches, residual, np.append(start.radius, start.axial)
+    )
+    return start._replace(
+        radius=solution[:-1].reshape(start.radius.shape), axial=float(solution[-1])
+    )
 
 
 def _stiffness(tissues: Sequence[Tissue]) -> float:
@@ -214,7 +236,9 @@ def _through(panels: Panels, unknown: Array, stresses: Array, pressure: float) -
     inside = balance[..., 1:-1] * (panels.edges[-1] - panels.edges[0]) / 2
     faces = np.stack([radial[..., 0, 0] + pressure, radial[..., -1, -1]], axis=-1)
     between = panels.jumps(unknown.reshape(radial.shape)) / panels.edges[0]
-    return np.concatenate([inside.reshape(*inside.shape[:-2], -1), faces, panels.jumps(radial), between], axis=-1)
+    return np.concatenate(
+        [inside.reshape(*inside.shape[:-2], -1), faces, panels.jumps(radial), between], axis=-1
+    )
 
 
 @np.errstate(all="ignore")
@@ -233,8 +257,13 @@ def solve_newton(
 
     def state(trial: Array) -> tuple[Array, Array, Array, Array]:
         stretch = stretches(trial)
-        by_layer = [principal_stresses(*layer) for layer in zip(tissues, [*stretch], dimensions, strict=True)]
-        stresses, tangents = (np.stack(arrays) / stiffness for arrays in zip(*by_layer, strict=True))
+        by_layer = [
+            principal_stresses(*layer)
+            for layer in zip(tissues, [*stretch], dimensions, strict=True)
+        ]
+        stresses, tangents = (
+            np.stack(arrays) / stiffness for arrays in zip(*by_layer, strict=True)
+        )
         return stretch, stresses, tangents, residual(trial, stresses)
 
     stretch, stresses, tangents, present = state(values)
@@ -243,7 +272,9 @@ def solve_newton(
         # exact by a complex step.
         moved = values + 1j * COMPLEX_STEP * np.eye(len(values))
         strains = np.log(stretches(moved) / stretch)
-        columns = residual(moved, stresses + (tangents @ strains[..., None])[..., 0]).imag / COMPLEX_STEP
+        columns = (
+            residual(moved, stresses + (tangents @ strains[..., None])[..., 0]).imag / COMPLEX_STEP
+        )
         if not np.isfinite(columns).all() or not np.isfinite(present).all():
             break
         try:
@@ -265,21 +296,30 @@ def solve_newton(
     raise ArithmeticError(f"no equilibrium of the ring: residual {np.abs(present).max():.2g}")
 
 
-def principal_stresses(tissue: Tissue, stretches: Array, dimensions: Array | None = None) -> tuple[Array, Array]:
+def principal_stresses(
+    tissue: Tissue, stretches: Array, dimensions: Array | None = None
+) -> tuple[Array, Array]:
     """Return principal Cauchy stresses (..., 3) and d sigma_i/d ln lambda_j at stretches."""
     # The stretches (..., 3) are along the axes of the cells.
     units = np.eye(3).reshape(3, *(1,) * (stretches.ndim - 1), 3)
-    perturbed = stretches * np.exp(TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(units[:1]), units]))
+    perturbed = stretches * np.exp(
+        TANGENT_DIFFERENCE * np.concatenate([np.zeros_like(units[:1]), units])
+    )
     complex_stretches = np.exp(1j * COMPLEX_STEP * units)
-    slopes = np.imag(_energy(tissue, perturbed * complex_stretches[:, None], dimensions)) / COMPLEX_STEP
+    slopes = (
+        np.imag(_energy(tissue, perturbed * complex_stretches[:, None], dimensions)) / COMPLEX_STEP
+    )
     stresses, *neighbours = np.moveaxis(slopes, 0, -1) / np.prod(perturbed, axis=-1)[..., None]
-    return stresses, np.stack([(neighbour - stresses) / TANGENT_DIFFERENCE for neighbour in neighbours], axis=-1)
+    return stresses, np.stack(
+        [(neighbour - stresses) / TANGENT_DIFFERENCE for neighbour in neighbours], axis=-1
+    )
 
 
 def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array:
     """Return W (...) at stretches (..., 3) along the axes of the cells."""
     length = np.broadcast_to(
-        tissue.end_to_end_length / np.sqrt(3.0) if dimensions is None else dimensions, stretches.shape
+        tissue.end_to_end_length / np.sqrt(3.0) if dimensions is None else dimensions,
+        stretches.shape,
     )
     cell = UnitCell(length[..., ON_THE_RADIUS], np.broadcast_to(np.eye(3), (*stretches.shape, 3)))
     return np.asarray(tissue.strain_energy(stretches[..., ON_THE_RADIUS, None] * np.eye(3), [cell]))
@@ -291,7 +331,9 @@ def _check_complex(tissue: Tissue, stretches: Array, dimensions: Array | None) -
     direction = CHECK_DIFFERENCE * np.array([1.0, 2.0, -3.0])
     complex_stretches = stretches * np.exp(1j * COMPLEX_STEP * direction)
     complex_slope = np.imag(_energy(tissue, complex_stretches, dimensions)) / COMPLEX_STEP
-    ahead, centre, behind = (_energy(tissue, stretches * np.exp(side * direction), dimensions) for side in (1, 0, -1))
+    ahead, centre, behind = (
+        _energy(tissue, stretches * np.exp(side * direction), dimensions) for side in (1, 0, -1)
+    )
     slope, bend = (ahead - behind) / 2, np.abs(ahead + behind - 2 * centre) + 1e-14 * np.abs(centre)
     if not (np.abs(complex_slope - slope) <= CHECKED * np.abs(slope).max() + bend).all():
         rule = "must accept complex numbers for its derivatives: np.maximum(x, 0), not |x|"
@@ -342,9 +384,14 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None = 
     # The unknowns are k rho at the lumen, rho minus rho at the lumen, e and k. In them a thin wall
     # with large bending is almost linear, and k may be zero or negative.
     def opened(values: Array) -> tuple[Array, Array, Array, Array]:
-        across, slope = depth + values[..., 1:-2] @ functions.T, steepness + values[..., 1:-2] @ slopes.T
+        across, slope = (
+            depth + values[..., 1:-2] @ functions.T,
+            steepness + values[..., 1:-2] @ slopes.T,
+        )
         around = values[..., :1] + values[..., -1:] * across
-        gradient = np.stack(np.broadcast_arrays(around / rings.radius, values[..., -2:-1], slope), axis=-1)
+        gradient = np.stack(
+            np.broadcast_arrays(around / rings.radius, values[..., -2:-1], slope), axis=-1
+        )
         return across, slope, around, gradient * rings.natural
 
     def residual(values: Array, stresses: Array) -> Array:  # derivatives of the energy
@@ -353,16 +400,23 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None = 
         hoop, axial, radial = np.moveaxis(work, -1, 0)
         hoop = edges[-1] * hoop / around
         nodes = (values[..., -1:] * hoop) @ functions + edges[-1] * (radial / slope) @ slopes
-        integrals = [density.sum(axis=-1, keepdims=True) for density in (hoop, axial, hoop * across / np.ptp(edges))]
+        integrals = [
+            density.sum(axis=-1, keepdims=True)
+            for density in (hoop, axial, hoop * across / np.ptp(edges))
+        ]
         return np.concatenate([integrals[0], nodes, *integrals[1:]], axis=-1)
 
     values = np.concatenate([[inner * k], np.zeros(functions.shape[1]), [axial, k / thinner]])
     dimensions = [np.sqrt(np.maximum(rings.squared, 0.0))]
-    solution = solve_newton([tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values)
+    solution = solve_newton(
+        [tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values
+    )
     return float(360.0 * (1.0 - solution[-1]))
 
 
-def means_through(radius: Array, volumes: Array, values: Array, edges: Array) -> tuple[Array, Array]:
+def means_through(
+    radius: Array, volumes: Array, values: Array, edges: Array
+) -> tuple[Array, Array]:
     """Return volumes (m,) of rings between edges, and volume means of values (n, ...)."""
     # Points are assigned to rings by their cumulated fraction of the volume. Facets of elements lie
     # inside the cylinders by more than a thin ring, so that an assignment by the radius would leave
@@ -372,5 +426,7 @@ def means_through(radius: Array, volumes: Array, values: Array, edges: Array) ->
     bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
     ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
     columns = (np.ones_like(radius), *values.T)
-    sums: list[Array] = [np.bincount(ring, volumes[order] * column[order]).astype(np.float64) for column in columns]
+    sums: list[Array] = [
+        np.bincount(ring, volumes[order] * column[order]).astype(np.float64) for column in columns
+    ]
     return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]

@@ -30,7 +30,10 @@ eps. Their axes have rounding errors of eps / AGREEMENT."""
 
 
 def principal(
-    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = AGREEMENT, threshold: npt.ArrayLike = 0.0
+    tensors: npt.ArrayLike,
+    previous: npt.ArrayLike,
+    tolerance: float = AGREEMENT,
+    threshold: npt.ArrayLike = 0.0,
 ) -> tuple[Array, Array]:
     """Return the principal values, descending, and the principal axes of symmetric tensors.
 
@@ -88,7 +91,10 @@ def principal(
 
 
 def principal_by_continuity(
-    tensors: npt.ArrayLike, previous: npt.ArrayLike, tolerance: float = AGREEMENT, threshold: npt.ArrayLike = 0.0
+    tensors: npt.ArrayLike,
+    previous: npt.ArrayLike,
+    tolerance: float = AGREEMENT,
+    threshold: npt.ArrayLike = 0.0,
 ) -> tuple[Array, Array]:
     """Return principal values and axes of symmetric tensors in the order of previous axes."""
     # Each principal axis takes the position of the previous axis that it continues. Of the six
@@ -100,9 +106,13 @@ def principal_by_continuity(
     values, axes, reference = _decomposed(tensors, previous)
     upper, lower = _agreeing(values, tolerance, threshold)
     positions = _places(axes, reference, upper, lower)
-    axes = _settled(axes, np.take_along_axis(reference, positions[:, :, None], axis=1), upper, lower)
+    axes = _settled(
+        axes, np.take_along_axis(reference, positions[:, :, None], axis=1), upper, lower
+    )
     order = np.argsort(positions, axis=1)
-    return np.take_along_axis(values, order, axis=1), np.take_along_axis(axes, order[:, :, None], axis=1)
+    return np.take_along_axis(values, order, axis=1), np.take_along_axis(
+        axes, order[:, :, None], axis=1
+    )
 
 
 Pairing = Formula[tuple[Array, Array]]
@@ -111,7 +121,9 @@ PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": principal_by_
 """Pairings of cell dimensions with principal values: by rank, or by continued axis."""
 
 
-def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) -> tuple[Array, npt.NDArray[np.bool_]]:
+def positive_direction(
+    values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0
+) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Return e = lambda^+ / |lambda^+| (eqs. 9 to 11), and the points with a positive value."""
     values = np.asarray(values, dtype=np.float64)
     _require_finite(values, "set of principal values")
@@ -119,7 +131,10 @@ def positive_direction(values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0) ->
     rounding = np.maximum(ROUNDING * largest, threshold)
     # Scaled by the largest value, because squares of very small or large values would underflow or
     # overflow.
-    positive = np.where(values > rounding[:, None], values, 0.0) / np.where(largest > 0.0, largest, 1.0)[:, None]
+    positive = (
+        np.where(values > rounding[:, None], values, 0.0)
+        / np.where(largest > 0.0, largest, 1.0)[:, None]
+    )
     norm = _length(positive)
     active = norm > 0.0
     return positive / np.where(active, norm, 1.0)[:, None], active
@@ -134,7 +149,9 @@ def drop_noise_shear(tensors: Array, axes: Array, noise: npt.ArrayLike) -> Array
     second = _normalised(axes[:, 1] - np.einsum("na,na->n", axes[:, 1], first)[:, None] * first)
     frame = np.stack([first, second, np.cross(first, second)], axis=1)
     components = frame @ tensors @ np.swapaxes(frame, 1, 2)
-    across = _largest(np.stack([components[:, 0, 1], components[:, 1, 2], components[:, 0, 2]], axis=1))
+    across = _largest(
+        np.stack([components[:, 0, 1], components[:, 1, 2], components[:, 0, 2]], axis=1)
+    )
     values = np.einsum("nii->ni", components)
     steady = np.swapaxes(frame, 1, 2) @ (values[:, :, None] * frame)
     return np.where((across <= np.asarray(noise, dtype=np.float64))[:, None, None], steady, tensors)
@@ -179,7 +196,11 @@ def _places(axes: Array, reference: Array, upper: Flags, lower: Flags) -> npt.ND
     """Return for each rank the number of the previous axis that it continues, (n, 3)."""
     overlap = np.einsum("nia,nja->nij", axes, reference) ** 2
     # For an eigenspace only the sum over a basis has a meaning.
-    for cluster, ranks in (upper & ~lower, [0, 1]), (lower & ~upper, [1, 2]), (upper & lower, [0, 1, 2]):
+    for cluster, ranks in (
+        (upper & ~lower, [0, 1]),
+        (lower & ~upper, [1, 2]),
+        (upper & lower, [0, 1, 2]),
+    ):
         points = np.flatnonzero(cluster)
         overlap[points[:, None], ranks] = overlap[points][:, ranks].mean(axis=1, keepdims=True)
     pairings = np.array(list(permutations(range(3))))
@@ -192,7 +213,8 @@ def _require_finite(values: Array, noun: str) -> None:
         invalid = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
         first = int(np.argmax(invalid))
         raise FloatingPointError(
-            f"{noun} {first} of {len(values)} is not finite ({int(invalid.sum())} in all): " f"{values[first].tolist()}"
+            f"{noun} {first} of {len(values)} is not finite ({int(invalid.sum())} in all): "
+            f"{values[first].tolist()}"
         )
 
 

@@ -43,7 +43,10 @@ class Target(NamedTuple):
         # The rate of A is kappa (r0^2 sE - sA). Therefore sE is interpolated; its trace is s, so
         # that E keeps trace one and a target with s = 0 has no influence. The result s is clipped
         # to [0, 1].
-        scaled = (self.switch[:, None, None] * self.direction, other.switch[:, None, None] * other.direction)
+        scaled = (
+            self.switch[:, None, None] * self.direction,
+            other.switch[:, None, None] * other.direction,
+        )
         changed = scaled[0] + np.reshape(weight, (-1, 1, 1)) * (scaled[1] - scaled[0])
         switch = np.einsum("nii->n", changed)
         active = switch > 0.0

@@ -153,7 +153,9 @@ def first_divided_difference(a: Array, b: Array) -> Array:
     return 2 / (a + b) * np.where(small, series, quotient)
 
 
-def second_divided_difference(smallest: Array, middle: Array, largest: Array, first: Array, last: Array) -> Array:
+def second_divided_difference(
+    smallest: Array, middle: Array, largest: Array, first: Array, last: Array
+) -> Array:
     """Return f[a, b, c] of ascending positive numbers from f[a, b] and f[b, c]."""
     # For equal numbers it is -1/(2 a^2).
     gap = largest - smallest
@@ -175,7 +177,9 @@ def first_divided_differences(values: Array) -> Array:
     """Return f[c_i, c_j], (n, 3, 3): three quotients, and 1/c_i on the diagonal."""
     result = np.empty((*values.shape, 3))
     for i, j in PAIRS:
-        result[..., i, j] = result[..., j, i] = first_divided_difference(values[..., j], values[..., i])
+        result[..., i, j] = result[..., j, i] = first_divided_difference(
+            values[..., j], values[..., i]
+        )
     result[..., range(3), range(3)] = 1 / values
     return result
 
@@ -184,7 +188,9 @@ def second_divided_differences(values: Array) -> Array:
     """Return f[c_i, c_j, c_k] of ascending values, (n, 3, 3, 3): ten different numbers."""
     result, pairs = np.empty((len(values), 3, 3, 3)), first_divided_differences(values)
     for i, j, k in itertools.combinations_with_replacement(range(3), 3):
-        number = second_divided_difference(values[:, i], values[:, j], values[:, k], pairs[:, i, j], pairs[:, j, k])
+        number = second_divided_difference(
+            values[:, i], values[:, j], values[:, k], pairs[:, i, j], pairs[:, j, k]
+        )
         for first, second, third in set(itertools.permutations((i, j, k))):
             result[:, first, second, third] = number
     return result
@@ -198,7 +204,9 @@ def second_derivative(values: Array, components: Array) -> Array:
         for column, (p, q) in enumerate(MANDEL[: row + 1]):  # H = (e_p e_q + e_q e_p) / 2
             terms = [f[:, i, k, j] * A[:, i, k] for k, partner in ((p, q), (q, p)) if partner == j]
             terms += [f[:, i, k, j] * A[:, k, j] for k, partner in ((p, q), (q, p)) if partner == i]
-            result[:, row, column] = result[:, column, row] = FACTORS[row] * FACTORS[column] / 2 * sum(terms)
+            result[:, row, column] = result[:, column, row] = (
+                FACTORS[row] * FACTORS[column] / 2 * sum(terms)
+            )
     return result
 
 
@@ -211,7 +219,9 @@ def determinant_changes_sign(before: Array, after: Array) -> Flags:
     # determinant is cubic in s.
     change = after - before
     determinants = [det(before + s * change) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
-    coefficients = np.linalg.solve(np.vander([0.0, 1 / 3, 2 / 3, 1.0], 4, increasing=True), np.stack(determinants))
+    coefficients = np.linalg.solve(
+        np.vander([0.0, 1 / 3, 2 / 3, 1.0], 4, increasing=True), np.stack(determinants)
+    )
     _, linear, quadratic, cubic = coefficients
     with np.errstate(invalid="ignore", divide="ignore"):
         # Extrema: 3 c s^2 + 2 b s + a = 0 by the stable formula. A parabola has one root at
@@ -220,7 +230,9 @@ def determinant_changes_sign(before: Array, after: Array) -> Flags:
         extrema = [np.where((s > 0) & (s < 1), s, 0.0) for s in (root / (3 * cubic), linear / root)]
     at_extrema = [np.polynomial.polynomial.polyval(s, coefficients, tensor=False) for s in extrema]
     lowest = np.min(at_extrema + determinants, axis=0)
-    return lowest <= 1e-12 * np.max(determinants, axis=0)  # a double root may be positive by rounding
+    return lowest <= 1e-12 * np.max(
+        determinants, axis=0
+    )  # a double root may be positive by rounding
 
 
 def cofactor(tensors: Array) -> Array:

@@ -75,7 +75,11 @@ def pack_arrays(arrays: Mapping[str, Array]) -> tuple[str, dict[str, dict[str, o
     for name, array in arrays.items():
         values = np.ascontiguousarray(array.values)
         # differences are modulo the range of the type
-        stored = np.diff(values, axis=0, prepend=np.zeros_like(values[:1])) if array.differences else values
+        stored = (
+            np.diff(values, axis=0, prepend=np.zeros_like(values[:1]))
+            if array.differences
+            else values
+        )
         table[name] = {
             "type": values.dtype.name,
             "shape": list(values.shape),
@@ -120,7 +124,9 @@ def collapsed_section(title: str, content: str) -> str:
 
 def table(rows: Iterable[tuple[str, str]]) -> str:
     """Names and values."""
-    cells = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
+    cells = "".join(
+        f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows
+    )
     return f"<table>{cells}</table>"
 
 
@@ -139,13 +145,18 @@ class ShownBody:
     whole: WholeBody
     times: Places
     volume: Places
-    series: dict[str, NDArray[np.float32]]  # position, and of `_of_elements` and `_of_layers` what was recorded
+    series: dict[
+        str, NDArray[np.float32]
+    ]  # position, and of `_of_elements` and `_of_layers` what was recorded
     is_deformed: bool
 
     @classmethod
     def from_run(cls, whole: WholeBody, times: Places) -> ShownBody:
         """What a run has recorded at these times."""
-        names = (*NAMES, *(WALL_FIELDS if isinstance(whole.recording.scene.geometry, Walled) else ()))
+        names = (
+            *NAMES,
+            *(WALL_FIELDS if isinstance(whole.recording.scene.geometry, Walled) else ()),
+        )
         rows = defaultdict[str, list[NDArray[np.float32]]](list)
         volume, is_deformed = _volumes(whole.points[whole.elements]), True
         for time in times:
@@ -155,7 +166,13 @@ class ShownBody:
             rows["position"].append((whole.points + moved).astype(np.float32))
             for name, values in (_of_elements(found) | _of_layers(whole, volume, found)).items():
                 rows[name].append(values.astype(np.float32))
-        return cls(whole, times, volume, {name: np.stack(values) for name, values in rows.items()}, is_deformed)
+        return cls(
+            whole,
+            times,
+            volume,
+            {name: np.stack(values) for name, values in rows.items()},
+            is_deformed,
+        )
 
     def arrays(self) -> tuple[dict[str, Array], dict[str, object]]:
         """The same in few bytes, and the numbers that lead back."""
@@ -173,7 +190,9 @@ class ShownBody:
         }
         scales: dict[str, Any] = {"origin": least.tolist(), "position_step": step}
         if "angle" in self.series:
-            levels = np.clip(np.floor(self.series["angle"] * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1)
+            levels = np.clip(
+                np.floor(self.series["angle"] * ANGLE_STEPS / 90.0), 0, ANGLE_STEPS - 1
+            )
             levels = np.where(np.isnan(levels), NO_ANGLE, levels).astype(np.uint8)
             arrays["angle"] = Array(levels, differences=True)
         if "extension" in self.series:
@@ -181,8 +200,12 @@ class ShownBody:
             arrays["extension"] = Array(extension, differences=True)
         if "edges" in self.series:
             edges = self.series["edges"].reshape(*moved.shape[:1], -1, 9)
-            scales["edge_step"] = float(np.abs(edges).max()) / 127 or 1.0  # components are 127ths of the largest
-            arrays["edges"] = Array(np.rint(edges / scales["edge_step"]).astype(np.int8), differences=True)
+            scales["edge_step"] = (
+                float(np.abs(edges).max()) / 127 or 1.0
+            )  # components are 127ths of the largest
+            arrays["edges"] = Array(
+                np.rint(edges / scales["edge_step"]).astype(np.int8), differences=True
+            )
         return arrays, scales
 
 
@@ -203,14 +226,19 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
 
     def means(values: list[Places]) -> Places:
         """(layers, values)."""
-        sums = [np.bincount(whole.layer, weights=volume * part) for part in (*values, np.ones_like(volume))]
+        sums = [
+            np.bincount(whole.layer, weights=volume * part)
+            for part in (*values, np.ones_like(volume))
+        ]
         return np.stack(sums[:-1], axis=1) / sums[-1][:, None]
 
     unknown = np.full(len(volume), np.nan)
     made = [fields.get(name, unknown) for name in TURNOVER_FIELDS]
     found = {"content": means(made)} if set(TURNOVER_FIELDS) & set(fields) else {}
     shape = whole.recording.scene.geometry
-    recorded = DIRECTION_FIELDS if shape.constant_fields else ()  # where axes are no function of the place
+    recorded = (
+        DIRECTION_FIELDS if shape.constant_fields else ()
+    )  # where axes are no function of the place
     if not set(fields) >= {*TENSOR_FIELDS, *recorded}:
         return found
     if recorded:
@@ -290,7 +318,9 @@ class ReportedRun:
         """Names of the history, those of the shape first; none without a number."""
         scene, history = self.recording.scene, self.recording.history
         own = {
-            column.name for one in (scene.geometry.columns, *map(columns_of_region, scene.regions)) for column in one
+            column.name
+            for one in (scene.geometry.columns, *map(columns_of_region, scene.regions))
+            for column in one
         }
         names = [name for name in history if name != "time" and np.isfinite(history[name]).any()]
         if "substeps" in names and np.nanmax(history["substeps"]) <= 1:
@@ -325,10 +355,16 @@ def tiles(run: ReportedRun) -> Card | None:
     own = [column.name for column in run.recording.scene.geometry.columns]
     for name in run.columns:
         values, unit = history[name][np.isfinite(history[name])], run.unit(name)
-        if name not in (*own, "max_chain_extension") or len(found) == MOST_TILES or not values.any():
+        if (
+            name not in (*own, "max_chain_extension")
+            or len(found) == MOST_TILES
+            or not values.any()
+        ):
             continue
         # body and profile are deformed
-        reference = " (reference)" if name.startswith("fibre_angle") and "deformed" not in name else ""
+        reference = (
+            " (reference)" if name.startswith("fibre_angle") and "deformed" not in name else ""
+        )
         last, first = (escape(with_unit(float(values[index]), unit)) for index in (-1, 0))
         found.append(
             f'<div class="tile" title="{escape(run.known[name].meaning)}"><b>{last}</b>'
@@ -349,7 +385,11 @@ def view(run: ReportedRun) -> Card:
     if body is None:
         return Card("no_view")
     arrays, scales = body.arrays()
-    notes, kept, all_times = body.whole.notes(body.is_deformed), len(body.times), len(run.recording.times)
+    notes, kept, all_times = (
+        body.whole.notes(body.is_deformed),
+        len(body.times),
+        len(run.recording.times),
+    )
     if kept < all_times:
         notes.append(f"{kept} of {all_times} recorded times are kept here, to save room.")
     data = {
@@ -370,7 +410,10 @@ def angles(run: ReportedRun) -> Card | None:
     if not np.isfinite(run.recording.history.get("lumen_volume", np.zeros(1))).any():
         through = "through the body"  # its inner face encloses nothing
     along, across = shape.angle_in_words
-    places = [{"name": words(name), "from": a, "to": b} for name, (a, b) in shape.region_depths(regions).items()]
+    places = [
+        {"name": words(name), "from": a, "to": b}
+        for name, (a, b) in shape.region_depths(regions).items()
+    ]
     data = {"title": f"Collagen angle {through}, deformed", "depth": body.whole.depth.tolist(), "along": along,
             "through": f"{through} (0 {start}, 1 {end})", "across": across, "colours": ANGLE_COLOURS,
             "regions": places}  # fmt: skip
@@ -386,7 +429,16 @@ def stress(run: ReportedRun) -> Card | None:
         level = history["pressure"] * inner / (outer - inner)
         legend += " Dashed: p r_i / h, by the law of Laplace the mean around."
     label = ", ".join(filter(None, (name, unit)))
-    return _by_layer(run, "stress", ("around", "along", "across"), label, level, title=name, unit=unit, legend=legend)
+    return _by_layer(
+        run,
+        "stress",
+        ("around", "along", "across"),
+        label,
+        level,
+        title=name,
+        unit=unit,
+        legend=legend,
+    )
 
 
 def content(run: ReportedRun) -> Card | None:
@@ -395,7 +447,12 @@ def content(run: ReportedRun) -> Card | None:
 
 
 def _by_layer(
-    run: ReportedRun, name: str, names: Sequence[str], label: str, level: Places | None = None, **said: str
+    run: ReportedRun,
+    name: str,
+    names: Sequence[str],
+    label: str,
+    level: Places | None = None,
+    **said: str,
 ) -> Card | None:
     """A series of `ShownBody` over the depth, and a dashed level of each row of the history."""
     body = run.body
@@ -455,8 +512,14 @@ def _finite(values: ArrayLike) -> object:
 # ---------------------------------------------------------------- in words
 def facts(run: ReportedRun) -> Card:
     """What was run: the tables of the scene, and what the run has made of them."""
-    scene, history, tables = run.recording.scene, run.recording.history, defaultdict[str, list[str]](list)
-    without = NO_PHYSICS if scene.remodeling.turnover.is_on else (*NO_PHYSICS, "remodeling.turnover")
+    scene, history, tables = (
+        run.recording.scene,
+        run.recording.history,
+        defaultdict[str, list[str]](list),
+    )
+    without = (
+        NO_PHYSICS if scene.remodeling.turnover.is_on else (*NO_PHYSICS, "remodeling.turnover")
+    )
     for key, value in leaves(scene.model_dump(exclude_none=True), without):
         place, _, name = key.rpartition(".")
         place = re.sub(r"^cases\[(\d+)\]", lambda number: f"load case {int(number[1]) + 1}", place)
@@ -470,10 +533,19 @@ def facts(run: ReportedRun) -> Card:
     tables["material"].append(scene.summary())
     steps = f"{max(0, len(history['time']) - 1)}{'' if scene.time.is_adaptive else ' of'} {scene.time.in_words()}"
     solving = f"{duration(float(np.nansum(history.get('seconds', 0.0))))} of solving"
-    ranks = [f"{found[1]} ranks" for text in said if (found := _RANKS.match(text)) and found[1] != "1"]
+    ranks = [
+        f"{found[1]} ranks" for text in said if (found := _RANKS.match(text)) and found[1] != "1"
+    ]
     tables["time"] += [steps, solving, *ranks[-1:]]
-    rows = {"changed": _changed(scene)} | {place.replace(".", " "): ", ".join(parts) for place, parts in tables.items()}
-    return Card("facts", section("What was run", table((words(n).capitalize(), row) for n, row in rows.items() if row)))
+    rows = {"changed": _changed(scene)} | {
+        place.replace(".", " "): ", ".join(parts) for place, parts in tables.items()
+    }
+    return Card(
+        "facts",
+        section(
+            "What was run", table((words(n).capitalize(), row) for n, row in rows.items() if row)
+        ),
+    )
 
 
 def _changed(scene: Scene) -> str:
@@ -481,15 +553,24 @@ def _changed(scene: Scene) -> str:
     if scene.preset is None:
         return ""
     preset = preset_scene(scene.preset, scene.geometry.name)
-    before, now = (dict(leaves(one.model_dump(exclude_none=True), NO_PHYSICS)) for one in (preset, scene))
+    before, now = (
+        dict(leaves(one.model_dump(exclude_none=True), NO_PHYSICS)) for one in (preset, scene)
+    )
     new = {key: value for key, value in now.items() if before.get(key) != value}
-    return ", ".join(f"{key} = {_as_text(value)} for {_as_text(before.get(key, '-'))}" for key, value in new.items())
+    return ", ".join(
+        f"{key} = {_as_text(value)} for {_as_text(before.get(key, '-'))}"
+        for key, value in new.items()
+    )
 
 
 def _as_text(value: object) -> str:
     """A value of a scene."""
     if isinstance(value, dict):
-        return ", ".join(f"{words(str(name))} {_as_text(one)}" for name, one in value.items() if one not in ({}, ()))
+        return ", ".join(
+            f"{words(str(name))} {_as_text(one)}"
+            for name, one in value.items()
+            if one not in ({}, ())
+        )
     if isinstance(value, (list, tuple)):
         return f"({', '.join(map(_as_text, value))})"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -499,13 +580,21 @@ def warnings(run: ReportedRun) -> Card:
     """What the run warned of, and its files."""
     found = run.warnings
     numbers = {text: "once" if count == 1 else f"{count} times" for text, count in found.items()}
-    items = "".join(f'<li>{escape(text)} <span class="note">({n})</span></li>' for text, n in numbers.items())
+    items = "".join(
+        f'<li>{escape(text)} <span class="note">({n})</span></li>' for text, n in numbers.items()
+    )
     said = f"<ul>{items}</ul>" if found else '<p class="note">None: the run raised no warnings.</p>'
-    files = {name: read_regular(run.recording.path / name, LARGEST_HISTORY) for name in (SCENE, HISTORY)}
+    files = {
+        name: read_regular(run.recording.path / name, LARGEST_HISTORY) for name in (SCENE, HISTORY)
+    }
     # a history that is larger than a page may be stays where it is
     files = {name: data for name, data in files.items() if len(data) <= LARGEST_DOWNLOAD}
-    buttons = "".join(f'<a class="download" data-file="{file}" href="#">{file}</a> ' for file in files)
-    html = section(f"Warnings ({sum(found.values())})", f"{said}<h2>Files of the run</h2><p>{buttons}</p>")
+    buttons = "".join(
+        f'<a class="download" data-file="{file}" href="#">{file}</a> ' for file in files
+    )
+    html = section(
+        f"Warnings ({sum(found.values())})", f"{said}<h2>Files of the run</h2><p>{buttons}</p>"
+    )
     arrays = {file: Array(np.frombuffer(data, dtype=np.uint8)) for file, data in files.items()}
     return Card("warnings", html, {"files": list(arrays)}, arrays)
 
@@ -524,10 +613,25 @@ def versions(run: ReportedRun) -> Card:
         for name, file in (("three.js", "three"), ("uPlot", "uplot"))
     )
     note = "<p>This page has the code of three.js and uPlot in it.</p>"
-    return Card("versions", collapsed_section("Versions and licences", table(rows) + note + licences))
+    return Card(
+        "versions", collapsed_section("Versions and licences", table(rows) + note + licences)
+    )
 
 
-PAGE_PARTS: list[Part] = [head, tiles, drawn, view, angles, curves, stress, content, facts, warnings, scene, versions]
+PAGE_PARTS: list[Part] = [
+    head,
+    tiles,
+    drawn,
+    view,
+    angles,
+    curves,
+    stress,
+    content,
+    facts,
+    warnings,
+    scene,
+    versions,
+]
 """In the order of the page."""
 
 
@@ -561,7 +665,9 @@ def write_report(folder: str | os.PathLike[str], path: Path | None = None) -> Pa
         return path
     path = recording.path / REPORT
     if path.exists() and GENERATOR_TAG not in read_regular(path, LARGEST_PAGE)[:4096]:
-        raise ReportError(f"{path}: is no report of this command and is not overwritten; choose another file")
+        raise ReportError(
+            f"{path}: is no report of this command and is not overwritten; choose another file"
+        )
     write_whole(path, page_of(recording).encode("utf-8"))
     return path
 
@@ -570,7 +676,9 @@ def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     """The page as text, of about so many MB at most."""
     if not has_a_body(recording):
         return render_page(cards(ReportedRun(recording)))
-    of_a_time = 4 / 3 * RATIO * (6 * len(recording.points) + 11 * len(recording.elements))  # bytes, in base64
+    of_a_time = (
+        4 / 3 * RATIO * (6 * len(recording.points) + 11 * len(recording.elements))
+    )  # bytes, in base64
     whole, most = WholeBody(recording), max(FEWEST_TIMES, int(1e6 * size / of_a_time))
     body = ShownBody.from_run(whole, kept_times(recording.times, most))
     return render_page(cards(ReportedRun(recording, body)))
@@ -595,7 +703,9 @@ def render_page(found: list[Card]) -> str:
         "BUNDLE": bundle,
         "SCRIPT": script,
     }
-    return Template(_asset("template.html")).substitute(parts)  # what is put in is not looked at again
+    return Template(_asset("template.html")).substitute(
+        parts
+    )  # what is put in is not looked at again
 
 
 def policy(scripts: list[str], style: str) -> str:

@@ -12,7 +12,12 @@ import numpy as np
 
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.evolution.stepper import Step, Watcher
-from remodel_fenicsx.results.checkpoint_file import Array, Checkpoint, CheckpointError, write_checkpoint
+from remodel_fenicsx.results.checkpoint_file import (
+    Array,
+    Checkpoint,
+    CheckpointError,
+    write_checkpoint,
+)
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.state import State
 from remodel_fenicsx.system.environment import versions
@@ -21,7 +26,9 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 MAX_LOSS_SECONDS = 600.0  # seconds
-SHORTEST_PAUSE = 10.0  # seconds between two that are chosen by time: below it nothing worth a write is lost
+SHORTEST_PAUSE = (
+    10.0  # seconds between two that are chosen by time: below it nothing worth a write is lost
+)
 MAX_TIME_FRACTION = 0.04  # of the time of a run, that checkpoints chosen by time may cost
 
 
@@ -95,7 +102,9 @@ def mesh_arrays(domain: Domain) -> dict[str, Array] | None:
 def gather_state(state: State) -> dict[str, Array] | None:
     """Every function of a state by name, (elements, values of one) in input order, on rank 0. Collective."""
     domain, functions = state.loading.domain, state.functions()
-    gathered = {name: domain.gather_elements(one.x.array[_places(one)]) for name, one in functions.items()}
+    gathered = {
+        name: domain.gather_elements(one.x.array[_places(one)]) for name, one in functions.items()
+    }
     return gathered if domain.comm.rank == 0 else None  # type: ignore[return-value]
 
 
@@ -103,9 +112,16 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
     """Bring a state to a checkpoint. Collective."""
     domain, comm = state.loading.domain, state.comm
     mesh, first = mesh_arrays(domain), comm.rank == 0
-    raise_on_all_ranks(comm, lambda: _check(state, domain, cast(Checkpoint, checkpoint), mesh or {}) if first else None)
-    header = comm.bcast(checkpoint.model_copy(update={"arrays": {}}) if first and checkpoint else None)
-    missing, counts = [name for name in state.functions() if name not in header.functions], _counts(state)
+    raise_on_all_ranks(
+        comm,
+        lambda: _check(state, domain, cast(Checkpoint, checkpoint), mesh or {}) if first else None,
+    )
+    header = comm.bcast(
+        checkpoint.model_copy(update={"arrays": {}}) if first and checkpoint else None
+    )
+    missing, counts = [name for name in state.functions() if name not in header.functions], _counts(
+        state
+    )
     for name, function in state.functions().items():
         if name not in missing:
             values = checkpoint.arrays[f"function/{name}"] if first and checkpoint else None
@@ -123,13 +139,20 @@ def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
 def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str, Array]) -> None:
     """Raise CheckpointError unless the checkpoint is one of this state."""
     arrays, counts = checkpoint.arrays, _counts(state)
-    wanted = {n: (domain.number_of_elements, _places(one).shape[1]) for n, one in state.functions().items()}
+    wanted = {
+        n: (domain.number_of_elements, _places(one).shape[1])
+        for n, one in state.functions().items()
+    }
     begins_anew = {name: shape for name, shape in wanted.items() if name in counts}
     found = {name: arrays[f"function/{name}"].shape for name in checkpoint.functions}
     own = marked(state, lambda case: case.loading.values)
-    loads = {name for name, value in checkpoint.loads.items() if value}  # earlier versions kept all, zero or not
+    loads = {
+        name for name, value in checkpoint.loads.items() if value
+    }  # earlier versions kept all, zero or not
     if not wanted.items() <= (begins_anew | found).items() or not loads <= own.keys():
-        there, here = (f"functions {a} and loads {sorted(b)}" for a, b in ((found, loads), (wanted, own)))
+        there, here = (
+            f"functions {a} and loads {sorted(b)}" for a, b in ((found, loads), (wanted, own))
+        )
         raise CheckpointError(f"the checkpoint has the {there}; this run has the {here}")
     points, elements = arrays["points"], arrays["elements"]
     same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
@@ -147,13 +170,19 @@ def marked(state: State, values: Callable[[State], Mapping[str, T]]) -> dict[str
 def values_of_case(values: Mapping[str, T], mark: str) -> dict[str, T]:
     """Those of one load case, by their names without its mark."""
     parts = {name: name.partition("@") for name in values}
-    return {parts[name][0]: value for name, value in values.items() if "".join(parts[name][1:]) == mark}
+    return {
+        parts[name][0]: value for name, value in values.items() if "".join(parts[name][1:]) == mark
+    }
 
 
 def _counts(state: State) -> dict[str, str]:
     """`State.counts` of all load cases."""
     cases = state.each_case().items()
-    return {f"{name}{mark}": f"{count}{mark}" for mark, case in cases for name, count in case.counts.items()}
+    return {
+        f"{name}{mark}": f"{count}{mark}"
+        for mark, case in cases
+        for name, count in case.counts.items()
+    }
 
 
 def _places(function: object) -> Array:

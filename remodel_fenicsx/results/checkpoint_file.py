@@ -42,7 +42,9 @@ class CheckpointError(RemodelError, ValueError):
 class Checkpoint(BaseModel):
     """A state by the input mesh's numbering."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
+    )
 
     format: int = Field(default=CHECKPOINT_FORMAT, ge=1, le=CHECKPOINT_FORMAT)
     time: float = Field(ge=0)
@@ -61,7 +63,10 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     whole = io.BytesIO()
     np.savez(whole, **{_HEADER: text}, **checkpoint.arrays)  # type: ignore[arg-type]
     # over the one that was written earlier
-    older = min((folder / name for name in FILES), key=lambda path: path.stat().st_mtime_ns if path.exists() else 0)
+    older = min(
+        (folder / name for name in FILES),
+        key=lambda path: path.stat().st_mtime_ns if path.exists() else 0,
+    )
     write_whole(older, whole.getvalue())
 
 
@@ -82,7 +87,9 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
             faults.append(str(error))
     if faults and not found:
         remedy = "without its files checkpoint* the run starts again at t = 0"
-        raise CheckpointError(f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}")
+        raise CheckpointError(
+            f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}"
+        )
     for fault in faults:
         log.warning("%s", fault)
     return max(found, key=lambda one: one.number) if found else None
@@ -101,12 +108,18 @@ def read_file(path: Path) -> Checkpoint:
                 raise CheckpointError(f"{path}: was written by a newer version")
             checkpoint = Checkpoint.model_validate_json(header)
             checkpoint.arrays |= {name: file[name] for name in file.files if name != _HEADER}
-            for name in ("points", "elements", *(f"function/{function}" for function in checkpoint.functions)):
+            for name in (
+                "points",
+                "elements",
+                *(f"function/{function}" for function in checkpoint.functions),
+            ):
                 _check_table(checkpoint.arrays[name])
     except CheckpointError:
         raise
     except _FAULTS as error:
-        raise CheckpointError(f"{path}: is damaged or of another kind than the checkpoints of this version") from error
+        raise CheckpointError(
+            f"{path}: is damaged or of another kind than the checkpoints of this version"
+        ) from error
     return checkpoint
 
 

@@ -139,7 +139,11 @@ class Measurement:
     def __init__(self, observer: Observer, step: Step):
         self.step, self.observer = step, observer
         self._of_step: dict[object, Any] = {}
-        self.domain, self.quadrature, self.state = observer.domain, observer.quadrature, observer.state
+        self.domain, self.quadrature, self.state = (
+            observer.domain,
+            observer.quadrature,
+            observer.state,
+        )
 
     @property
     def equilibrium(self) -> Equilibrium:
@@ -154,7 +158,9 @@ class Measurement:
     @cached_property
     def position(self) -> Array:
         """Deformed place of the local nodes, (nodes, 3)."""
-        nodes: Array = self.state.kinematics.nodal_space(self.state.unknown).tabulate_dof_coordinates()
+        nodes: Array = self.state.kinematics.nodal_space(
+            self.state.unknown
+        ).tabulate_dof_coordinates()
         return nodes + self.displacement
 
     @cached_property
@@ -209,7 +215,9 @@ class Measurement:
     def radial_share(self) -> Array:
         """Of the chains at all points (elements, points)."""
         cells = self.state.cells
-        share = self.observer.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+        share = self.observer.shape.radial_share(
+            cells.dimension_values, cells.axis_values, cells.local_axes.axes
+        )
         return self.equilibrium.parameters.nan_without_chains(share)
 
     def _angle(self, axes: Array, local: Array) -> Array:
@@ -221,7 +229,10 @@ class Measurement:
         """r/L at all points (elements, points); 0 where no chain locks."""
         cells, F = self.state.cells, self.state.elastic_gradient()
         length = self.equilibrium.parameters.locking_length()
-        return np.asarray(np.sqrt(cells.kernels.squared_length(F, cells.point_cells)).reshape(length.shape) / length)
+        return np.asarray(
+            np.sqrt(cells.kernels.squared_length(F, cells.point_cells)).reshape(length.shape)
+            / length
+        )
 
     def elements_of_region(self, name: str) -> NDArray[np.bool_]:
         """Mask of the local elements of a region, (elements,)."""
@@ -253,7 +264,10 @@ class Measurement:
 
     def _over_face(self, face: str, deformed: bool, *nodal_values: Array | float) -> list[float]:
         field, form = self.cached((face, deformed), lambda: _face_form(self, face, deformed))
-        at_nodes, found = field.x.array.reshape(-1, field.function_space.dofmap.index_map_bs)[:, 0], []
+        at_nodes, found = (
+            field.x.array.reshape(-1, field.function_space.dofmap.index_map_bs)[:, 0],
+            [],
+        )
         for values in nodal_values:
             at_nodes[:] = values
             found.append(integral(form))
@@ -310,7 +324,9 @@ class Measurement:
         def touch() -> NDArray[np.bool_]:
             nodes = self.domain.mesh.geometry.x[compat.geometry_dofmap(self.domain.mesh)]
             radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size
-            return (radii.min(axis=1) <= radius + tolerance) & (radii.max(axis=1) >= radius - tolerance)
+            return (radii.min(axis=1) <= radius + tolerance) & (
+                radii.max(axis=1) >= radius - tolerance
+            )
 
         return self.cached(("elements touching", radius), touch)  # type: ignore[no-any-return]
 
@@ -342,7 +358,9 @@ class Measurement:
         return self._of_step[key]
 
 
-def _face_form(measured: Measurement, face: str, deformed: bool) -> tuple[dolfinx.fem.Function, dolfinx.fem.Form]:
+def _face_form(
+    measured: Measurement, face: str, deformed: bool
+) -> tuple[dolfinx.fem.Function, dolfinx.fem.Form]:
     """A nodal field, and its integral over the reference or the deformed area of a face."""
     state, mesh = measured.state, measured.domain.mesh
     # first component of a function of the displacement's space: surely the same order of nodes
@@ -386,7 +404,9 @@ def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
             f"output.columns = 'support_force_{face}': the face goes around the body, so that there is no direction"
         )
     if (potential := state.loading.supports[face]) is not None:
-        form = jit.form(-ufl.derivative(potential(unknown), unknown, domain.of_parts(face, "normal")))
+        form = jit.form(
+            -ufl.derivative(potential(unknown), unknown, domain.of_parts(face, "normal"))
+        )
         return lambda: integral(form)
     held: list[tuple[NDArray[np.int32], Array]] = []
     for part, facets in domain.facets_of_parts(face):
@@ -400,7 +420,11 @@ def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
         forces = (vectors[0].array + vectors[1].array).reshape(-1, 3)
         for vector in vectors:
             vector.destroy()
-        return float(allreduce(domain.comm, sum(float((forces[n] @ normal).sum()) for n, normal in held), MPI.SUM))
+        return float(
+            allreduce(
+                domain.comm, sum(float((forces[n] @ normal).sum()) for n, normal in held), MPI.SUM
+            )
+        )
 
     return out_of_balance
 
@@ -428,10 +452,17 @@ def _end_forms(measured: Measurement, face: str) -> list[list[dolfinx.fem.Form]]
     tissue, elastic = state.kinematics.stress_free_weight(mesh), state.kinematics.elastic
     # a function where a number would do: UFL differentiates by functions only, and some kinematics prescribe F_zz
     change: dolfinx.fem.Function = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, ("DG", 0)))
-    one, size = (dolfinx.fem.Constant(mesh, np.float64(v)) for v in (1.0, measured.domain.dimensions["length"]))
-    along = ufl.as_tensor([[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)])
+    one, size = (
+        dolfinx.fem.Constant(mesh, np.float64(v))
+        for v in (1.0, measured.domain.dimensions["length"])
+    )
+    along = ufl.as_tensor(
+        [[1.0 / size if i == j == 2 else 0.0 for j in range(3)] for i in range(3)]
+    )
     longer = F + change * along
-    energies = state.dilatation.energies(equilibrium.tissue, elastic(longer), [state.cells.symbolic_cell], tissue)
+    energies = state.dilatation.energies(
+        equilibrium.tissue, elastic(longer), [state.cells.symbolic_cell], tissue
+    )
     internal = [ufl.derivative(energy, change, one) for energy in energies]
     if equilibrium.pointwise is not None:
         work = ufl.inner(ufl.dot(elastic(F), equilibrium.pointwise.stress), elastic(along))

@@ -39,7 +39,9 @@ def write_vtu(
     from meshio._vtk_common import vtk_to_meshio_type
 
     of_elements = {name: [np.asarray(values)] for name, values in cell_data.items()}
-    mesh = meshio.Mesh(points, [(vtk_to_meshio_type[cell_type], cells)], dict(point_data), of_elements)
+    mesh = meshio.Mesh(
+        points, [(vtk_to_meshio_type[cell_type], cells)], dict(point_data), of_elements
+    )
     with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
         file = Path(folder) / "grid.vtu"
         meshio.write(file, mesh)
@@ -88,7 +90,9 @@ class Fibres:
     dimensions: Array
     axes: Array
     displacement: Array | None
-    others: Mapping[str, Array] = MappingProxyType({})  # prestretch, content, natural length, where there are any
+    others: Mapping[str, Array] = MappingProxyType(
+        {}
+    )  # prestretch, content, natural length, where there are any
 
     @property
     def tensors(self) -> Array:
@@ -106,13 +110,17 @@ class Fibres:
         return self.elements[:, : self.names.nodes]
 
 
-def export(folder: Path | str, kind: str, path: Path | None = None, time: float | None = None) -> Path:
+def export(
+    folder: Path | str, kind: str, path: Path | None = None, time: float | None = None
+) -> Path:
     """Write the mean structure tensor of each element with its axes and dimensions into a new file."""
     ending, write = FIBRE_FORMATS[kind]
     fibres = recorded_fibres(RecordedRun(folder), time)
     if fibres.others and kind not in WITH_OTHERS:
         kinds = " and ".join(WITH_OTHERS)
-        log.warning("%s has no place for %s; %s files have them", kind, ", ".join(fibres.others), kinds)
+        log.warning(
+            "%s has no place for %s; %s files have them", kind, ", ".join(fibres.others), kinds
+        )
     share = unevenness(fibres.elements, fibres.tensors)
     if fibres.elements.shape[1] > 4 and share > LEAST_SAID:
         log.warning(
@@ -139,7 +147,9 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
     kinematics = recording.scene.model.kinematics
     if KINEMATICS[kinematics].reduced:
         remedy = "revolve writes the fields of the whole body, model.kinematics = 'full' runs it"
-        raise RecordingError(f"{recording.path}: its kinematics are {kinematics!r}, a part of the body; {remedy}")
+        raise RecordingError(
+            f"{recording.path}: its kinematics are {kinematics!r}, a part of the body; {remedy}"
+        )
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
     time = float(recording.times[-1]) if time is None else time
@@ -151,7 +161,11 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
         raise RecordingError(f"{recording.path}: output.fields was without {', '.join(missing)}")
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     if NATURAL_GRADIENT not in {*fields, *recording.scene.lacking_fields}:
-        log.warning("%s: output.fields was without %s: the prestretch is not written", recording.path, NATURAL_GRADIENT)
+        log.warning(
+            "%s: output.fields was without %s: the prestretch is not written",
+            recording.path,
+            NATURAL_GRADIENT,
+        )
     others = {name: fields[name] for name in kept if name in fields}
     mesh = recording.points, recording.elements
     return Fibres(*mesh, fields["cell_dimensions"], axes, fields.get("displacement"), others)
@@ -159,8 +173,13 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
 
 # ---------------------------------------------------------------- formats
 def _vtu(path: Path, fibres: Fibres) -> None:
-    of_elements = {"structure_tensor": fibres.tensors.reshape(-1, 9), "cell_dimensions": fibres.dimensions}
-    of_elements |= {name: fibres.axes[:, i] for i, name in enumerate(AXIS_FIELDS)} | dict(fibres.others)
+    of_elements = {
+        "structure_tensor": fibres.tensors.reshape(-1, 9),
+        "cell_dimensions": fibres.dimensions,
+    }
+    of_elements |= {name: fibres.axes[:, i] for i, name in enumerate(AXIS_FIELDS)} | dict(
+        fibres.others
+    )
     of_nodes = {} if fibres.displacement is None else {"displacement": fibres.displacement}
     write_vtu(path, fibres.points, fibres.elements, fibres.names.vtk, of_elements, of_nodes)
 
@@ -199,10 +218,16 @@ FEBIO_MAP = """<ElementData name="{name}" data_type="{kind}" elem_set="body">
 
 def _febio(path: Path, fibres: Fibres) -> None:
     nodes, axes = np.unique(fibres.reduced), fibres.axes
-    maps = {f"cell_dimension_{i + 1}": fibres.dimensions[:, i] for i in range(3)} | dict(fibres.others)
+    maps = {f"cell_dimension_{i + 1}": fibres.dimensions[:, i] for i in range(3)} | dict(
+        fibres.others
+    )
     kinds = {NATURAL_GRADIENT: "mat3"}
     shown = [
-        FEBIO_MAP.format(name=name, kind=kinds.get(name, "scalar"), values=_rows('<elem lid="{0}">{1}</elem>', values))
+        FEBIO_MAP.format(
+            name=name,
+            kind=kinds.get(name, "scalar"),
+            values=_rows('<elem lid="{0}">{1}</elem>', values),
+        )
         for name, values in maps.items()
     ]
     text = FEBIO.format(
@@ -258,7 +283,9 @@ FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
 def _rows(pattern: str, *parts: NDArray[np.generic]) -> str:
     """A line for each row of the parts (n, ...); numbers have commas between and are read back to the last bit."""
     texts = [[",".join(map(repr, row.ravel().tolist())) for row in part] for part in parts]
-    return "\n".join(pattern.format(n, *row) for n, row in enumerate(zip(*texts, strict=True), start=1))
+    return "\n".join(
+        pattern.format(n, *row) for n, row in enumerate(zip(*texts, strict=True), start=1)
+    )
 
 
 def _write(path: Path, text: str) -> None:

@@ -20,7 +20,13 @@ from remodel_fenicsx.results.columns import Measurement, Observer
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, OF_CHAINS, append_chains
 from remodel_fenicsx.results.recording import CHAIN_LINES, FIELDS
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
-from remodel_fenicsx.schema.settings import CONSTANT_FIELDS, FIELDS_BY_NAME, NO_PRESTRETCH, REGION, UNLOADED
+from remodel_fenicsx.schema.settings import (
+    CONSTANT_FIELDS,
+    FIELDS_BY_NAME,
+    NO_PRESTRETCH,
+    REGION,
+    UNLOADED,
+)
 from remodel_fenicsx.system.files import ClosedAtEnd
 
 log = logging.getLogger(__name__)
@@ -35,7 +41,9 @@ def field_names(
 ) -> tuple[str, ...]:
     """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks."""
     if isinstance(asked, bool):
-        return (*(name for name in FIELDS_BY_NAME if name not in lacking), *constant) if asked else ()
+        return (
+            (*(name for name in FIELDS_BY_NAME if name not in lacking), *constant) if asked else ()
+        )
     return tuple(asked)
 
 
@@ -51,7 +59,11 @@ class ElementFields:
     """Element means for pictures."""
 
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
-        self.observer, self.turnover, self.names = Observer(shape, stepper, ()), stepper.part("turnover"), tuple(names)
+        self.observer, self.turnover, self.names = (
+            Observer(shape, stepper, ()),
+            stepper.part("turnover"),
+            tuple(names),
+        )
         self.tissue, self._parameters = stepper.tissue, stepper.coupling.equilibrium.parameters
 
     def __call__(self) -> dict[str, Array]:
@@ -69,7 +81,9 @@ class ElementFields:
             "chain_extension": lambda: measured.chain_extension.max(axis=1),
             REGION: lambda: measured.domain.element_region.astype(np.float64),
         }
-        makers |= {name: partial(lambda i: mean_cells()[1][:, i], i) for i, name in enumerate(AXIS_FIELDS)}
+        makers |= {
+            name: partial(lambda i: mean_cells()[1][:, i], i) for i, name in enumerate(AXIS_FIELDS)
+        }
         G = state.natural_gradient
         if G is not None:
             makers[NATURAL_GRADIENT] = lambda: mean(G).reshape(-1, 9)
@@ -78,14 +92,18 @@ class ElementFields:
         for name in TURNED_OVER:
             if (number := getattr(self.tissue, name)) is not None:
                 makers[name] = partial(lambda one: mean(quadrature.values(one, ())), number)
-        return {name: makers[name]() for name in OF_ELEMENTS if name in self.names and name in makers}
+        return {
+            name: makers[name]() for name in OF_ELEMENTS if name in self.names and name in makers
+        }
 
     def mean_cells(self) -> tuple[Array, Array]:
         """Lengths (elements, 3) and axes as rows (elements, 3, 3) of the mean structure tensor, longest first."""
         cells = self.observer.state.cells
         means = cells.quadrature.element_mean(cells.structure_tensor())
         squared, axes = cells.kernels.principal(means, cells.axis_values[:, 0])
-        chains = self._parameters.has_chains()[:, :1]  # of regions: all points of an element, or none
+        chains = self._parameters.has_chains()[
+            :, :1
+        ]  # of regions: all points of an element, or none
         return np.sqrt(np.maximum(squared, 0.0)) * chains, axes
 
 
@@ -147,11 +165,17 @@ class Fields(Watcher, ClosedAtEnd):
         self.state, self.every, self.names = stepper.state, every, tuple(names)
         self.domain = domain = self.state.loading.domain
         needed = {*self.names, *(OF_CHAINS if "chains" in self.names else ())}
-        self._element_fields = ElementFields(shape, stepper, [name for name in OF_ELEMENTS if name in needed])
+        self._element_fields = ElementFields(
+            shape, stepper, [name for name in OF_ELEMENTS if name in needed]
+        )
         quadrature, local_axes = self.state.cells.quadrature, self.state.cells.local_axes
-        constant = local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
+        constant = (
+            local_fields(local_axes, quadrature) if {*CONSTANT_FIELDS} & {*self.names} else {}
+        )
         self._constant = {
-            name: domain.gather_elements(values) for name, values in constant.items() if name in self.names
+            name: domain.gather_elements(values)
+            for name, values in constant.items()
+            if name in self.names
         }
         points, elements = domain.gather_mesh()
         self._grid: TransientGrid | None = None
@@ -159,9 +183,15 @@ class Fields(Watcher, ClosedAtEnd):
         self._solved: dict[str, Array] | None = None  # fields of a step that is not committed yet
         if points is not None and elements is not None:
             geometry = domain.mesh.geometry.cmap
-            cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), geometry.degree, elements)
-            self._grid = _continued(folder / FIELDS, after) or TransientGrid(folder / FIELDS, points, cells, cell_type)
-            self._chains = _continued(folder / CHAIN_LINES, after) if "chains" in self.names else None
+            cell_type, cells = vtk_cells(
+                domain.mesh.topology.cell_name(), geometry.degree, elements
+            )
+            self._grid = _continued(folder / FIELDS, after) or TransientGrid(
+                folder / FIELDS, points, cells, cell_type
+            )
+            self._chains = (
+                _continued(folder / CHAIN_LINES, after) if "chains" in self.names else None
+            )
             self._mesh = points, elements
             # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
             self._scale = 0.4 * quadrature.extent
@@ -190,7 +220,10 @@ class Fields(Watcher, ClosedAtEnd):
 
     def _gathered(self) -> dict[str, Array]:
         """The fields of the present state on rank 0, nothing on others. Collective."""
-        local = {name: self.domain.gather_elements(values) for name, values in self._element_fields().items()}
+        local = {
+            name: self.domain.gather_elements(values)
+            for name, values in self._element_fields().items()
+        }
         found = local | {"displacement": self.state.gathered_displacement()}
         return {name: values for name, values in found.items() if values is not None}
 
@@ -199,7 +232,9 @@ class Fields(Watcher, ClosedAtEnd):
             return
         displacement = fields["displacement"]
         at_nodes = {"displacement": displacement} if "displacement" in self.names else {}
-        changing = {name: fields[name] for name in fields if name in self.names and name != "displacement"}
+        changing = {
+            name: fields[name] for name in fields if name in self.names and name != "displacement"
+        }
         constant = {name: values for name, values in self._constant.items() if values is not None}
         self._grid.append(time, at_nodes, changing, constant=constant)
         if "chains" in self.names:
@@ -222,4 +257,6 @@ def _continued(path: Path, after: float | None) -> TransientGrid | None:
     if not path.exists():
         log.warning("%s is missing: a new one begins with the next step", path.name)
         return None
-    return TransientGrid.continued(path, after * (1 + 1e-9))  # as far as `math.isclose` takes times as the same
+    return TransientGrid.continued(
+        path, after * (1 + 1e-9)
+    )  # as far as `math.isclose` takes times as the same

@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.environment import check_extensions
-from remodel_fenicsx.system.files import ClosedAtEnd, check_regular, open_own, partial_path, read_regular
+from remodel_fenicsx.system.files import (
+    ClosedAtEnd,
+    check_regular,
+    open_own,
+    partial_path,
+    read_regular,
+)
 
 if TYPE_CHECKING:
     import h5py
@@ -46,7 +52,10 @@ CHAIN_LOOK: dict[str, Any] = {  # as the page takes it
     "lift": 0.2,  # towards the eye, over the same: faces need not be plane
 }
 AMBIENT = 0.8  # share of a colour that does not depend on where its face looks: it must mean the same everywhere
-VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}  # where the eye is, from the middle of the body
+VIEWS = {
+    "front": (0.3, -1.0, 0.42),
+    "above": (0.0, -0.02, 1.0),
+}  # where the eye is, from the middle of the body
 
 
 # ---------------------------------------------------------------- which of the recorded times are shown
@@ -62,9 +71,16 @@ def kept_times(times: Numbers, most: int) -> Numbers:
 
 Array = NDArray[np.float64]
 
-HISTORY, FIELDS, CHAIN_LINES, SCENE = "history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml"
+HISTORY, FIELDS, CHAIN_LINES, SCENE = (
+    "history.csv",
+    "fields.vtkhdf",
+    "fields_chains.vtkhdf",
+    "scene.toml",
+)
 LOG = "run.log"
-LARGEST_HISTORY = 10**9  # bytes: the million steps that a scene may have, of a thousand characters each
+LARGEST_HISTORY = (
+    10**9
+)  # bytes: the million steps that a scene may have, of a thousand characters each
 
 
 class RecordingError(RemodelError, ValueError):
@@ -88,7 +104,9 @@ class HistoryColumns(dict[str, Array]):
         try:
             import pandas
         except ImportError as error:
-            raise ImportError("history.frame() needs pandas, which is not installed; the columns need not") from error
+            raise ImportError(
+                "history.frame() needs pandas, which is not installed; the columns need not"
+            ) from error
         return pandas.DataFrame(dict(self))
 
 
@@ -116,7 +134,9 @@ class RecordedRun:
     def __init__(self, folder: str | os.PathLike[str]):
         self.path = Path(folder)
         if not self.path.is_dir():
-            raise RecordingError(f"{self.path}: {'is a file' if self.path.exists() else 'there is no such folder'}")
+            raise RecordingError(
+                f"{self.path}: {'is a file' if self.path.exists() else 'there is no such folder'}"
+            )
         for name in (SCENE, HISTORY):
             if not (self.path / name).is_file():
                 raise RecordingError(f"{self.path}: is not the folder of a run, it has no {name}")
@@ -162,7 +182,9 @@ class RecordedRun:
             If there is no such column, or no row at this time.
         """
         if column not in self.history:
-            raise RecordingError(f"{self.path}: no column {column!r}; there are {', '.join(self.history)}")
+            raise RecordingError(
+                f"{self.path}: no column {column!r}; there are {', '.join(self.history)}"
+            )
         return float(self.history[column][self._number_of(time, self.history["time"], "row")])
 
     # ------------------------------------------------------------ fields
@@ -240,7 +262,9 @@ class RecordedRun:
         """Which of the times this one is."""
         found = [number for number, recorded in enumerate(times) if math.isclose(recorded, time)]
         if not found:
-            raise RecordingError(f"{self.path}: no {what} at time {time:g}; recorded are {_in_words(times)}")
+            raise RecordingError(
+                f"{self.path}: no {what} at time {time:g}; recorded are {_in_words(times)}"
+            )
         return found[0]
 
     @contextmanager
@@ -262,7 +286,9 @@ def series_file(path: Path, remedy: str = "") -> Iterator[h5py.Group]:
         with h5py.File(path, "r") as file:
             yield file["VTKHDF"]
     except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
-        if isinstance(error, OSError) and error.errno is not None:  # the disk's have a number, HDF5's none
+        if (
+            isinstance(error, OSError) and error.errno is not None
+        ):  # the disk's have a number, HDF5's none
             raise
         # h5py's own words can be several lines
         words = f"{' '.join(str(error).split())}{remedy}"
@@ -311,8 +337,12 @@ def _columns(text: str) -> HistoryColumns:
         raise ValueError("is not the history of a run, it has no column 'time'")
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):
-            raise ValueError(f"line {number} has {len(row)} values, but there are {len(names)} columns")
-    values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, len(names))
+            raise ValueError(
+                f"line {number} has {len(row)} values, but there are {len(names)} columns"
+            )
+    values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(
+        -1, len(names)
+    )
     if np.isinf(values).any() or np.isnan(values[:, names.index("time")]).any():
         raise ValueError("has numbers that are not finite")  # what was not computed is not there
     return HistoryColumns(zip(names, values.T, strict=True))
@@ -328,7 +358,11 @@ def _block(dataset: h5py.Dataset, start: int, length: int) -> Array:
 
 # ---------------------------------------------------------------- columns, numbers and units as people read them
 
-WORDS = {"max_chain_extension": "largest r/L", "min_jacobian": "smallest J", "seconds": "seconds a step"}
+WORDS = {
+    "max_chain_extension": "largest r/L",
+    "min_jacobian": "smallest J",
+    "seconds": "seconds a step",
+}
 
 
 def words(name: str) -> str:
@@ -360,7 +394,11 @@ FORCES = {
 
 def unit_of(scene: Scene, dimension: str) -> str:
     """The unit of a `Column` by what it measures, where the scene says what it is, else nothing."""
-    names = {"stress": scene.material.stress_unit, "length": scene.geometry.length_unit, "degrees": "°"}
+    names = {
+        "stress": scene.material.stress_unit,
+        "length": scene.geometry.length_unit,
+        "degrees": "°",
+    }
     if dimension == "force" and (name := FORCES.get(f"{names['stress']} {names['length']}")):
         return name
     parts = re.split(r"(\w+)", dimension.replace("force", "stress length^2"))
@@ -412,13 +450,19 @@ class RunLock(ClosedAtEnd):
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 os.close(self._descriptor)
-                raise FolderTaken(f"{folder}: {lock_holder(folder)[0] or 'another process'} writes in it") from None
-            if self._path.exists() and os.path.samestat(os.fstat(self._descriptor), os.stat(self._path)):
+                raise FolderTaken(
+                    f"{folder}: {lock_holder(folder)[0] or 'another process'} writes in it"
+                ) from None
+            if self._path.exists() and os.path.samestat(
+                os.fstat(self._descriptor), os.stat(self._path)
+            ):
                 break
             os.close(self._descriptor)  # the writer before has taken the file away meanwhile
         others = f" ({ranks} ranks)" if ranks > 1 else ""
         os.ftruncate(self._descriptor, 0)
-        os.write(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}{others}\n".encode())
+        os.write(
+            self._descriptor, f"process {os.getpid()} on {socket.gethostname()}{others}\n".encode()
+        )
 
     def close(self) -> None:
         """Let others in."""

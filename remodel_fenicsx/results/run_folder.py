@@ -40,7 +40,9 @@ def choose_folder(requested: Path | None, name: str) -> Path:
         if requested.exists() and not requested.is_dir():
             raise FolderTaken(f"folder {requested}: is a file; allowed is a new or an empty folder")
         if requested.is_dir() and not is_unused(requested):
-            raise FolderTaken(f"folder {requested}: is not empty; allowed is a new or an empty folder")
+            raise FolderTaken(
+                f"folder {requested}: is not empty; allowed is a new or an empty folder"
+            )
         return requested
     Path("results").mkdir(exist_ok=True)
     for folder in numbered(Path("results") / name):
@@ -82,14 +84,18 @@ def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) 
     'results/my-cube'
     """
     wanted = None if requested is None else Path(requested)
-    chosen = raise_on_all_ranks(comm, lambda: choose_folder(wanted, name) if comm.rank == 0 else None)
+    chosen = raise_on_all_ranks(
+        comm, lambda: choose_folder(wanted, name) if comm.rank == 0 else None
+    )
     return cast(Path, comm.bcast(chosen))
 
 
 @contextmanager
 def locked(folder: Path, comm: MPI.Intracomm, new: bool) -> Iterator[None]:
     """Within, this run alone writes in the folder. Collective."""
-    lock = raise_on_all_ranks(comm, lambda: _lock(folder, comm.size, new) if comm.rank == 0 else nullcontext())
+    lock = raise_on_all_ranks(
+        comm, lambda: _lock(folder, comm.size, new) if comm.rank == 0 else nullcontext()
+    )
     with lock:
         yield
 
@@ -112,7 +118,9 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
     if after is None:
         return
     if not (folder / HISTORY).exists():
-        raise RecordingError(f"{folder}: has a checkpoint, but no {HISTORY}: rows that are gone are not computed again")
+        raise RecordingError(
+            f"{folder}: has a checkpoint, but no {HISTORY}: rows that are gone are not computed again"
+        )
     size_of_rows(folder / HISTORY, after)
     for name in (FIELDS, CHAIN_LINES) if fields else ():
         if os.path.lexists(folder / name):
@@ -146,8 +154,12 @@ class History:
         size = 0 if after is None else size_of_rows(path, after)
         flags = os.O_RDWR | (os.O_CREAT | os.O_EXCL if after is None else 0)
         self._path, self._file = path, open(open_own(path, flags), "r+b", buffering=0)
-        self._columns = None if after is None else next(csv.reader([self._file.readline().decode()]))
-        self._sizes = [size]  # bytes up to the end of the last whole row, and before of the one before it
+        self._columns = (
+            None if after is None else next(csv.reader([self._file.readline().decode()]))
+        )
+        self._sizes = [
+            size
+        ]  # bytes up to the end of the last whole row, and before of the one before it
         self._flushed_at = -math.inf
         self._cut()
 
@@ -179,7 +191,9 @@ class History:
         os.fsync(self._file.fileno())
         if os.fstat(self._file.fileno()).st_nlink == 0:
             lost = "the rows of this run, and what else was in its folder"
-            raise FileNotFoundError(errno.ENOENT, f"the file was deleted during the run; lost: {lost}", self._path)
+            raise FileNotFoundError(
+                errno.ENOENT, f"the file was deleted during the run; lost: {lost}", self._path
+            )
         self._flushed_at = clock.monotonic()
 
     def drop_last(self) -> None:
@@ -212,9 +226,13 @@ def size_of_rows(path: Path, after: LastStep) -> int:
     except (ValueError, IndexError, csv.Error):
         right = False
     if not right:
-        raise RecordingError(f"{path}: lacks rows: the checkpoint belongs to {rows} rows up to time {after.time:g}")
+        raise RecordingError(
+            f"{path}: lacks rows: the checkpoint belongs to {rows} rows up to time {after.time:g}"
+        )
     if found != list(after.columns):
-        raise RecordingError(f"{path}: has other columns than this run; output.columns must stay as it was")
+        raise RecordingError(
+            f"{path}: has other columns than this run; output.columns must stay as it was"
+        )
     return sum(map(len, lines))
 
 

@@ -26,13 +26,23 @@ from remodel_fenicsx.system.files import read_regular, command_name
 from remodel_fenicsx.system.terminal import duration
 
 RECENT = 20  # steps whose mean is the rate
-BEGUN, FAILED, STOPPED = "scene ", "failed: ", "ended: "  # how lines of run.log on a run's beginning and end begin
-_LOG_ENTRY = re.compile(r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*?)\n?(?=^\d{4}-\d\d-|\Z)", re.M | re.S)
+BEGUN, FAILED, STOPPED = (
+    "scene ",
+    "failed: ",
+    "ended: ",
+)  # how lines of run.log on a run's beginning and end begin
+_LOG_ENTRY = re.compile(
+    r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*?)\n?(?=^\d{4}-\d\d-|\Z)", re.M | re.S
+)
 
 
 def status(folder: Path) -> list[str]:
     """Lines for people: where the run is, whether it is alive, its rate, its checkpoint; or what a study's runs do."""
-    if runs := [] if (folder / SCENE).exists() else sorted(path.parent for path in folder.glob(f"*/{SCENE}")):
+    if runs := (
+        []
+        if (folder / SCENE).exists()
+        else sorted(path.parent for path in folder.glob(f"*/{SCENE}"))
+    ):
         return _of_study(folder, runs)
     holder, lives = lock_holder(folder)
     if not lives or (folder / HISTORY).exists():
@@ -51,16 +61,22 @@ def status(folder: Path) -> list[str]:
     rate = float(np.mean(seconds)) if len(seconds) else 0.0
     if lives:
         age = clock.time() - os.stat(folder / HISTORY).st_mtime
-        per_step = number / behind if behind else 1.0  # those of a tolerance are longer or shorter than the first
+        per_step = (
+            number / behind if behind else 1.0
+        )  # those of a tolerance are longer or shorter than the first
         left = f", {duration(rate * per_step * (steps - behind))} left" if rate else ""
-        lines.append(f"running: {holder or 'a process'}{left}; the last step was done {duration(max(0.0, age))} ago")
+        lines.append(
+            f"running: {holder or 'a process'}{left}; the last step was done {duration(max(0.0, age))} ago"
+        )
     elif state == "finished":
         lines.append(state)
     else:
         if state == "failed":
             lines.append(f"{FAILED}{reason}")
         when = f"{datetime.fromtimestamp(os.stat(folder / HISTORY).st_mtime):%Y-%m-%d %H:%M:%S}"
-        lines.append(f"not running, the last step was done at {when}{f'; {holder} was killed' if holder else ''}")
+        lines.append(
+            f"not running, the last step was done at {when}{f'; {holder} was killed' if holder else ''}"
+        )
         if state == "stopped" and reason:  # a signal, or the whole sentence of a stop on purpose
             lines[-1] += f"; {reason if reason.startswith('stopped') else f'stopped by {reason}'}"
     if rate:
@@ -68,14 +84,20 @@ def status(folder: Path) -> list[str]:
     time_kept = time_of_checkpoint(folder)
     kept = "no checkpoint yet" if time_kept is None else f"checkpoint at time {time_kept:g}"
     lines.append(
-        kept if lives or state == "finished" else f"{kept}; it goes on with: {command_name()} run --resume {folder}"
+        kept
+        if lives or state == "finished"
+        else f"{kept}; it goes on with: {command_name()} run --resume {folder}"
     )
     return lines
 
 
 def log_entries(folder: Path) -> list[tuple[str, str, str]]:
     """Stamp, level and text of each entry of run.log, which may have several lines."""
-    text = read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace") if (folder / LOG).exists() else ""
+    text = (
+        read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace")
+        if (folder / LOG).exists()
+        else ""
+    )
     return _LOG_ENTRY.findall(text)
 
 
@@ -91,7 +113,9 @@ def state_of(recording: RecordedRun) -> tuple[str, str]:
 def _outcome_from_log(folder: Path) -> tuple[str, str]:
     """What run.log says since the run last began: "failed" or "stopped", and why; no reason where it was killed."""
     said = [text.partition("\n")[0] for _, _, text in log_entries(folder)]
-    last = next((text for text in reversed(said) if text.startswith((BEGUN, FAILED, STOPPED))), BEGUN)
+    last = next(
+        (text for text in reversed(said) if text.startswith((BEGUN, FAILED, STOPPED))), BEGUN
+    )
     if last.startswith(FAILED):
         return "failed", last.removeprefix(FAILED)
     return "stopped", last.removeprefix(STOPPED) if last.startswith(STOPPED) else ""
@@ -101,8 +125,12 @@ def _of_study(folder: Path, runs: list[Path]) -> list[str]:
     """How many of its runs are where, and which have failed and why."""
     states = {run.name: _state(run) for run in runs}
     counted = Counter(state for state, _ in states.values())
-    lines = [f"{folder}: {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"]
-    return lines + [f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"]
+    lines = [
+        f"{folder}: {len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counted.items())}"
+    ]
+    return lines + [
+        f"{run} has {FAILED}{words}" for run, (state, words) in states.items() if state == "failed"
+    ]
 
 
 def _state(folder: Path) -> tuple[str, str]:

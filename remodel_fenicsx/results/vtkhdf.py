@@ -45,7 +45,12 @@ _OF_TOPOLOGY = ("Steps/CellOffsets", "Steps/ConnectivityIdOffsets")
 _ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
 # of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
 # floats become smaller by a fifth only, and a step would take twice as long
-_COMPRESSION: dict[str, object] = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+_COMPRESSION: dict[str, object] = {
+    "compression": "gzip",
+    "compression_opts": 1,
+    "shuffle": True,
+    "fletcher32": True,
+}
 
 
 class DeferredErrorFile(io.FileIO):
@@ -94,7 +99,12 @@ class TransientGrid(ClosedAtEnd):
         self.number_of_steps = 0
         self._open("x+")
         with self._written() as file:
-            _begin(file.create_group("VTKHDF"), np.asarray(points, point_dtype), np.asarray(cells), cell_type)
+            _begin(
+                file.create_group("VTKHDF"),
+                np.asarray(points, point_dtype),
+                np.asarray(cells),
+                cell_type,
+            )
 
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
@@ -140,14 +150,21 @@ class TransientGrid(ClosedAtEnd):
         if self._disk.closed:
             self._reopen()
         step = self.number_of_steps
-        kinds = (("PointData", point_data, step), ("CellData", cell_data, step), ("CellData", constant, 0))
+        kinds = (
+            ("PointData", point_data, step),
+            ("CellData", cell_data, step),
+            ("CellData", constant, 0),
+        )
         # offsets that stay 0 say that the mesh is the one of the first step
         numbers: dict[str, float] = dict.fromkeys(_ALWAYS_0, 0)
         numbers |= {"Steps/NumberOfParts": 1, "Steps/PointOffsets": 0, "Steps/Values": time}
         with self._written() as file:
             root = file["VTKHDF"]
             for kind, fields, place in kinds:
-                for name, block in ((f"{kind}/{name}", np.asarray(values)) for name, values in (fields or {}).items()):
+                for name, block in (
+                    (f"{kind}/{name}", np.asarray(values))
+                    for name, values in (fields or {}).items()
+                ):
                     if name not in root:  # a chunk is a step, which readers take as a whole
                         _create(root, name, np.float32, block.shape)
                         _create(root, _offsets(name), np.int64, (_STEPS_PER_CHUNK,))
@@ -187,7 +204,11 @@ def _begin(root: h5py.Group, points: Array, cells: Array, cell_type: int) -> Non
     """Write the mesh, and no steps."""
     root.attrs["Version"] = np.array(VERSION, dtype=np.int64)
     root.attrs["Type"] = np.bytes_("UnstructuredGrid")  # VTK takes fixed-length ASCII only
-    for name, number in {"Points": len(points), "Cells": len(cells), "ConnectivityIds": cells.size}.items():
+    for name, number in {
+        "Points": len(points),
+        "Cells": len(cells),
+        "ConnectivityIds": cells.size,
+    }.items():
         root[f"NumberOf{name}"] = np.array([number], dtype=np.int64)
     _create(root, "Points", points.dtype, points.shape)
     _write(root["Points"], 0, points)
@@ -222,7 +243,9 @@ def _write(dataset: h5py.Dataset, number: int, block: ArrayLike) -> None:
     dataset[start:] = block
 
 
-def vtk_cells(cell_name: str, degree: int, elements: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
+def vtk_cells(
+    cell_name: str, degree: int, elements: NDArray[np.int64]
+) -> tuple[int, NDArray[np.int64]]:
     """VTK's cell type, and the elements with their nodes in VTK's order."""
     # here and not above: whoever reads or writes lines alone need not wait for dolfinx
     from dolfinx import cpp

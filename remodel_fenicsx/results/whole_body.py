@@ -35,22 +35,30 @@ TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
 class RotatedFields:
     """Which node and element of a reduction stands for each of a body's own, and its fields there."""
 
-    def __init__(self, points: Array, elements: Numbers, own_points: Array, own_elements: Numbers, turn: Turn):
+    def __init__(
+        self, points: Array, elements: Numbers, own_points: Array, own_elements: Numbers, turn: Turn
+    ):
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
         self.nodes = spatial.cKDTree(own_points).query(back)[1]
         self.offsets = back - own_points[self.nodes]
         owner = np.zeros(len(own_points), dtype=np.int64)
-        owner[own_elements.reshape(-1)] = np.repeat(np.arange(len(own_elements)), own_elements.shape[1])
+        owner[own_elements.reshape(-1)] = np.repeat(
+            np.arange(len(own_elements)), own_elements.shape[1]
+        )
         self.owners = owner[self.nodes]
         self.centres = points[elements].mean(axis=1)
         self.element_turns = turn(self.centres)
         # the mean of nodes that were turned back each by itself: chords of a coarse mesh lie inside of their circles
-        self.sources = spatial.cKDTree(own_points[own_elements].mean(axis=1)).query(back[elements].mean(axis=1))[1]
+        self.sources = spatial.cKDTree(own_points[own_elements].mean(axis=1)).query(
+            back[elements].mean(axis=1)
+        )[1]
 
     def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
         """Displacement of the body's nodes, where it was recorded, and fields of its elements."""
-        found = {name: values[self.sources] for name, values in fields.items() if name != "displacement"}
+        found = {
+            name: values[self.sources] for name, values in fields.items() if name != "displacement"
+        }
         for name in set(found) & {*AXIS_FIELDS, *DIRECTION_FIELDS}:
             found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
         for name in set(found) & {*TENSOR_FIELDS, NATURAL_GRADIENT}:
@@ -79,7 +87,9 @@ def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tu
     return ends.reshape(-1, 3), np.arange(8 * len(centres)).reshape(-1, 2)
 
 
-def chain_displacement(points: Array, centres: Array, displacement: Array, deformation_gradient: Array) -> Array:
+def chain_displacement(
+    points: Array, centres: Array, displacement: Array, deformation_gradient: Array
+) -> Array:
     """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre)."""
     ends = points.reshape(-1, 8, 3) - centres[:, None, :]
     gradient = deformation_gradient - np.eye(3)
@@ -99,7 +109,9 @@ def append_chains(
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     centres, middle = (values[elements].mean(axis=1) for values in (points, displacement))
     ends, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
-    moved = chain_displacement(ends, centres, middle, fields["deformation_gradient"].reshape(-1, 3, 3))
+    moved = chain_displacement(
+        ends, centres, middle, fields["deformation_gradient"].reshape(-1, 3, 3)
+    )
     if isinstance(grid, Path):
         grid = TransientGrid(grid, ends, lines, LINE, point_dtype=np.float32)
     angle = np.repeat(fields["fibre_angle"], 4)
@@ -115,7 +127,9 @@ class WholeBody:
 
     def __init__(self, recording: RecordedRun):
         if not has_a_body(recording):
-            raise RecordingError(f"{recording.path}: the run recorded no fields of a body (output.fields)")
+            raise RecordingError(
+                f"{recording.path}: the run recorded no fields of a body (output.fields)"
+            )
         scene = recording.scene
         shape, kinematics = scene.geometry, KINEMATICS[scene.model.kinematics]
         self.recording, self.is_turned = recording, kinematics.reduced
@@ -144,7 +158,9 @@ class WholeBody:
     def fields(self, time: float, names: Collection[str] | None = None) -> Fields:
         """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time."""
         fields = self.recording.fields(time, names)
-        displacement, found = self._turned(fields) if self._turned else (fields.pop("displacement", None), fields)
+        displacement, found = (
+            self._turned(fields) if self._turned else (fields.pop("displacement", None), fields)
+        )
         return None if displacement is None else displacement[self._used], found
 
 
@@ -157,7 +173,9 @@ def has_a_body(recording: RecordedRun) -> bool:
 
 def _layers(depth: Array, elements: Numbers) -> tuple[Numbers, Array]:
     """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
-    nodes = np.bincount(elements.ravel(), weights=np.repeat(depth, elements.shape[1])) / np.bincount(elements.ravel())
+    nodes = np.bincount(
+        elements.ravel(), weights=np.repeat(depth, elements.shape[1])
+    ) / np.bincount(elements.ravel())
     extent = np.ptp(nodes[elements], axis=1).mean()
     number = max(1, round(float(np.ptp(nodes) / extent))) if extent > 0 else 1
     layer = np.unique(depth.round(6), return_inverse=True)[1]
@@ -178,7 +196,9 @@ def revolve(folder: Path | str) -> list[Path]:
     recording = RecordedRun(folder)
     name = recording.scene.model.kinematics
     if not KINEMATICS[name].reduced:
-        raise RecordingError(f"{recording.path}: its kinematics are {name!r}: the fields are those of the body already")
+        raise RecordingError(
+            f"{recording.path}: its kinematics are {name!r}: the fields are those of the body already"
+        )
     paths = [recording.path / file for file in (BODY, BODY_CHAINS)]
     for path in paths:
         if path.exists():
@@ -191,7 +211,9 @@ def revolve(folder: Path | str) -> list[Path]:
         chains: TransientGrid | None = None
         for time in recording.times:
             displacement, fields = whole.fields(float(time))
-            grid.append(float(time), {} if displacement is None else {"displacement": displacement}, fields)
+            grid.append(
+                float(time), {} if displacement is None else {"displacement": displacement}, fields
+            )
             if displacement is not None and set(OF_CHAINS) <= set(fields):
                 place, body = chains or paths[1], (whole.points, whole.elements)
                 new = append_chains(place, float(time), *body, scale, displacement, fields)

@@ -69,7 +69,9 @@ class Profile:
         """Describe the keys that the profile sets."""
         settings = ", ".join(f"{key} = {value}" for key, value in self.values.items())
         if self.is_for_means:
-            settings += " or, for a tube, sector with cells.antithetic (nearly the same means over seeds)"
+            settings += (
+                " or, for a tube, sector with cells.antithetic (nearly the same means over seeds)"
+            )
         return settings
 
     def settings(self, scene: Any) -> dict[str, object]:
@@ -82,7 +84,8 @@ class Profile:
 
 
 PROFILES, RANDOM_CELLS = (
-    {name: Profile(**one) for name, one in _DATA[table].items()} for table in ("profiles", "random_cells")
+    {name: Profile(**one) for name, one in _DATA[table].items()}
+    for table in ("profiles", "random_cells")
 )
 """Profiles for isotropic or prescribed cells, and for random cells."""
 
@@ -134,7 +137,12 @@ class MeasuredParameter(NamedTuple):
 
 
 EXPERIMENTS = (  # The order matters: the density needs the contour length.
-    MeasuredParameter("material", "locking_stretch", "contour_length", lambda one, v: v * one.cells.end_to_end_length),
+    MeasuredParameter(
+        "material",
+        "locking_stretch",
+        "contour_length",
+        lambda one, v: v * one.cells.end_to_end_length,
+    ),
     MeasuredParameter("material", "initial_stiffness", "chain_density", _chain_density),
     MeasuredParameter("remodeling", "half_life", "kappa", lambda one, value: math.log(2) / value),
 )
@@ -158,7 +166,10 @@ def check_exclusive(own: Values) -> None:
     """Check that no experimental parameter is set together with the parameter that it replaces."""
     for name, part in parts_of(own):
         for experiment in EXPERIMENTS:
-            value, key = said(part, experiment.table, experiment.key), f"{region_prefix(name)}{experiment.table}"
+            value, key = (
+                said(part, experiment.table, experiment.key),
+                f"{region_prefix(name)}{experiment.table}",
+            )
             if value is not None and said(part, experiment.table, experiment.replaces) is not None:
                 rule = f"{key}.{experiment.replaces} is also set; set only one of them"
                 raise validation_error(rule, f"{key}.{experiment.key}", value)
@@ -177,8 +188,15 @@ def with_own_numbers(part: S, properties: Callable[[S], Properties]) -> S:
 def without_coupling(base: dict[str, Any], over: Mapping[str, object]) -> None:
     """Remove an extrapolating coupling from `base` if the law in `over` has no target."""
     law, coupling = str(said(over, "remodeling", "law")), str(said(base, "remodeling", "coupling"))
-    if law in LAWS and LAWS[law].target is None and coupling in COUPLINGS and COUPLINGS[coupling].needs_a_target:
-        base["remodeling"] = {key: value for key, value in base["remodeling"].items() if key != "coupling"}
+    if (
+        law in LAWS
+        and LAWS[law].target is None
+        and coupling in COUPLINGS
+        and COUPLINGS[coupling].needs_a_target
+    ):
+        base["remodeling"] = {
+            key: value for key, value in base["remodeling"].items() if key != "coupling"
+        }
 
 
 def without_replaced(values: dict[str, Any], changed: Collection[str]) -> None:

@@ -44,7 +44,9 @@ def json_schema() -> Schema:
     load = schema["$defs"]["Load"]["properties"]["value"]
     load["anyOf"] = [{"type": load.pop("type")}, schema_with_unit(STRESS)]
     loads = {name: kind.meaning for shape in SHAPES.values() for name, kind in shape.loads.items()}
-    known = {name: {"$ref": "#/$defs/Load", "description": meaning} for name, meaning in loads.items()}
+    known = {
+        name: {"$ref": "#/$defs/Load", "description": meaning} for name, meaning in loads.items()
+    }
     further = {"$ref": "#/$defs/Load", "required": ["kind", "face"]}
     properties["loads"] |= {"properties": known, "additionalProperties": further}
     head = {

@@ -71,7 +71,11 @@ def tissue_of_regions(scene: Scene) -> Faults:
             yield rule, f"{region}material.matrix", material.matrix
         plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
         if kappa != plain and law.remodels and not law.stops_at_zero_kappa:
-            key, value = ("remodeling.kappa", kappa) if material.chain_density else ("material.chain_density", 0.0)
+            key, value = (
+                ("remodeling.kappa", kappa)
+                if material.chain_density
+                else ("material.chain_density", 0.0)
+            )
             yield f"the law {scene.remodeling.law!r} has no kappa", f"{region}{key}", value
         if not turnover.is_on:
             continue
@@ -129,7 +133,10 @@ def same_strain(scene: Scene) -> Faults:
 
 def directions_of_matrices(scene: Scene) -> Faults:
     """Check that the directions of a matrix follow a round wall."""
-    if not isinstance(scene.geometry, RoundWall) or not KINEMATICS[choice(scene).name].three_dimensional:
+    if (
+        not isinstance(scene.geometry, RoundWall)
+        or not KINEMATICS[choice(scene).name].three_dimensional
+    ):
         return
     for name, properties in scene.properties().items():
         if not properties.tissue.is_round():
@@ -143,7 +150,11 @@ def directions_of_matrices(scene: Scene) -> Faults:
 def parts_of_the_energy(scene: Scene) -> Faults:
     """Check that a split formulation has a matrix with a volumetric part."""
     name, matrix = scene.mesh.formulation, scene.material.matrix
-    if name != AUTO and FORMULATIONS[name].splits_energy and not scene.material.has_volumetric_split:
+    if (
+        name != AUTO
+        and FORMULATIONS[name].splits_energy
+        and not scene.material.has_volumetric_split
+    ):
         rule = f"needs a material.matrix with a volumetric part (Matrix); {matrix!r} has none"
         yield rule, "mesh.formulation", name
 
@@ -212,7 +223,13 @@ def natural_state(scene: Scene) -> Faults:
     if isinstance(shape, RoundWall):
         needs.append(("cells.axes", scene.cells.axes == "cylindrical", "'cylindrical'"))
         for name, properties in scene.properties().items():
-            needs.append((f"{in_region(name)}cells.initial", properties.cells.initial == "isotropic", "'isotropic'"))
+            needs.append(
+                (
+                    f"{in_region(name)}cells.initial",
+                    properties.cells.initial == "isotropic",
+                    "'isotropic'",
+                )
+            )
     for other, has, possible in needs:
         if not has:
             yield f"must be {none} unless {other} is {possible}", key, value
@@ -223,7 +240,11 @@ def loads_of_the_body(scene: Scene) -> Faults:
     time = scene.time
     for name, load in scene.loads.items():
         key, least = f"loads.{quoted(name)}", scene.load_kinds[name].above
-        if name == "elongation" and scene.has_free_length and any(load.value * factor for _, factor in load.ramp):
+        if (
+            name == "elongation"
+            and scene.has_free_length
+            and any(load.value * factor for _, factor in load.ramp)
+        ):
             rule = "must be 0 if the length is an unknown (loads.axial_force or closed ends)"
             yield rule, f"{key}.value", load.value
         for index, (moment, factor) in enumerate(load.ramp):
@@ -232,9 +253,7 @@ def loads_of_the_body(scene: Scene) -> Faults:
             for case in scene.each_case():
                 full = case.loads[name].value * factor
                 if full <= least:
-                    words = (
-                        f"with the factor {format_value(full / load.value if load.value else factor)} it is {full:.6g}"
-                    )
+                    words = f"with the factor {format_value(full / load.value if load.value else factor)} it is {full:.6g}"
                     yield f"must be greater than {least:g} at every time; {words}", f"{key}.value", load.value
 
 
@@ -292,14 +311,23 @@ def growth(scene: Scene) -> Faults:
 
 def equilibrium(scene: Scene) -> Faults:
     """Check that the cells have a steady state that is independent of the load path."""
-    law, parts, key, end = scene.remodeling.law, scene.properties().items(), "time.end", scene.time.end
+    law, parts, key, end = (
+        scene.remodeling.law,
+        scene.properties().items(),
+        "time.end",
+        scene.time.end,
+    )
     if not scene.time.is_equilibrium:
         return
     if not LAWS[law].has_limit:
         laws = join_names(LAWS, lambda law: law.has_limit)
         rule = f"remodeling.law = {law!r} has no unique steady state; laws with one: {laws}"
         yield rule, key, end
-    bare = [f"{in_region(name)}material.chain_density" for name, one in parts if not one.material.chain_density]
+    bare = [
+        f"{in_region(name)}material.chain_density"
+        for name, one in parts
+        if not one.material.chain_density
+    ]
     if bare:
         yield f"needs chains: {', '.join(bare)} above 0", key, end
     if still := [f"{in_region(name)}remodeling.kappa" for name, one in parts if one.kappa == 0]:
@@ -311,7 +339,9 @@ def unknown_length(scene: Scene) -> Faults:
     method = scene.solver.method
     if scene.has_free_length and method == "iterative":
         names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != method)
-        rule = f"must be one of {names} if the length is an unknown (loads.axial_force or closed ends)"
+        rule = (
+            f"must be one of {names} if the length is an unknown (loads.axial_force or closed ends)"
+        )
         yield rule, "solver.method", method
 
 

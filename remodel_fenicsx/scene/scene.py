@@ -70,7 +70,13 @@ from remodel_fenicsx.schema.tables import (
     quoted,
     format_value,
 )
-from remodel_fenicsx.schema.text import merge_nested, parse_override, set_nested, read_toml, toml_text
+from remodel_fenicsx.schema.text import (
+    merge_nested,
+    parse_override,
+    set_nested,
+    read_toml,
+    toml_text,
+)
 from remodel_fenicsx.schema.units import (
     FORCE,
     LENGTH_UNIT,
@@ -98,15 +104,25 @@ LOAD = (-4, 2)
 
 
 def doubts(
-    material: Material, geometry: Shape, loads: Mapping[str, Load], end_to_end_length: float, end: float
+    material: Material,
+    geometry: Shape,
+    loads: Mapping[str, Load],
+    end_to_end_length: float,
+    end: float,
 ) -> Iterator[str]:
     """Yield a line for each implausible value; none for plausible tissue."""
-    unit, pascal, density = material.stress_unit, STRESS_UNITS[material.stress_unit], material.chain_density
+    unit, pascal, density = (
+        material.stress_unit,
+        STRESS_UNITS[material.stress_unit],
+        material.chain_density,
+    )
     network = chain_stress(material, end_to_end_length)
     ratio, stiffness = network / material.lame_mu, material.lame_mu + network
     if network and (way := _outside_decades(ratio, NETWORK)):
         of_pascal = (
-            f" ({density:g} in a scene in Pa corresponds to {density * pascal:g} in {unit})" if pascal > 1 else ""
+            f" ({density:g} in a scene in Pa corresponds to {density * pascal:g} in {unit})"
+            if pascal > 1
+            else ""
         )
         yield (
             f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} "
@@ -118,7 +134,11 @@ def doubts(
             one = "check the units, all lengths are in geometry.length_unit"
             yield f"geometry.{key} = {getattr(geometry, key):g}: {words} is {ratio:.3g}; {one}"
     for name, load in loads.items():
-        key, kind, value = f"loads.{name}.value", geometry.loads_on(faces_of(loads))[name], load.largest(end)
+        key, kind, value = (
+            f"loads.{name}.value",
+            geometry.loads_on(faces_of(loads))[name],
+            load.largest(end),
+        )
         if words := convention_doubt(name, value):
             yield f"{key}: {words}"
         stress = abs(largest_stress(kind, value, geometry) or 0.0)
@@ -150,7 +170,9 @@ def borne(tissue: Tissue, is_loaded: bool) -> float:
         if not chain.locks or half <= 1:
             return math.inf
         stretch = half + math.sqrt(half**2 - 1)
-        modulus += tissue.network_modulus * chain.stiffness(length, tissue.contour_length) * start**2 / 3
+        modulus += (
+            tissue.network_modulus * chain.stiffness(length, tissue.contour_length) * start**2 / 3
+        )
     return float(modulus * (1 - stretch**-2) * (stretch if is_loaded else 1))
 
 
@@ -159,7 +181,10 @@ def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
     log_of_radii = scene.geometry.log_of_radii(wall)
     if log_of_radii is None or "pressure" not in scene.loads:
         return
-    stress = max(case.loads["pressure"].largest(scene.last_time) for case in scene.each_case()) / log_of_radii
+    stress = (
+        max(case.loads["pressure"].largest(scene.last_time) for case in scene.each_case())
+        / log_of_radii
+    )
     most = max(borne(one.tissue, scene.geometry.is_loaded) for one in scene.properties().values())
     if stress > most:
         unit = scene.material.stress_unit
@@ -182,7 +207,9 @@ def _doubted_keys(values: Mapping[str, object]) -> Iterator[str]:
 def chain_stress(material: Material, end_to_end_length: float) -> float:
     """Return the network's initial stiffness c g(r0) r0^2 in stress_unit; 0 without chains."""
     tissue = material.tissue(end_to_end_length)
-    return float(tissue.repulsion_modulus * end_to_end_length**2) if tissue.chain is not None else 0.0
+    return (
+        float(tissue.repulsion_modulus * end_to_end_length**2) if tissue.chain is not None else 0.0
+    )
 
 
 def largest_stress(kind: LoadKind, value: float, geometry: Shape) -> float | None:
@@ -279,7 +306,9 @@ class Scene(Table):
         default=(), json_schema_extra={"allowed": "a list of tables, each [[cases]]"}
     )
     """Load cases of a cycle, a table `[[cases]]` each. Without them the loads act all the time."""
-    remodeling: Annotated[SerializeAsAny[Remodeling], KeysOfParts({"law": LAWS}, tables=REMODELS)] = Remodeling()
+    remodeling: Annotated[
+        SerializeAsAny[Remodeling], KeysOfParts({"law": LAWS}, tables=REMODELS)
+    ] = Remodeling()
     time: Time
     solver: Solver = Solver()
     output: Output = Output()
@@ -293,7 +322,9 @@ class Scene(Table):
         own = _with_measured_cells(_in_present_format(_plain(values)))
         for name in ("regions", "loads", "cases", "supports"):
             if isinstance(found := own.get(name), dict | list | tuple) and len(found) > MOST_TABLES:
-                raise validation_error(f"has {len(found)} tables; must have at most {MOST_TABLES}", name, None)
+                raise validation_error(
+                    f"has {len(found)} tables; must have at most {MOST_TABLES}", name, None
+                )
         presets.check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
         if preset is not None:
@@ -306,13 +337,19 @@ class Scene(Table):
         else:
             if shape not in presets.PRESETS[preset]:
                 known = ", ".join(map(repr, presets.PRESETS[preset]))
-                raise validation_error(f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape)
+                raise validation_error(
+                    f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape
+                )
             base = merge_nested(base, presets.PRESETS[preset][shape])
         presets.without_coupling(base, own)
 
         def made(settings: Mapping[str, object]) -> Scene:
             values = merge_nested(merge_nested(base, presets.nested(settings)), own)
-            if large := [item for item in leaves(values) if is_number(item[1]) and abs(item[1]) > LARGEST_NUMBER]:
+            if large := [
+                item
+                for item in leaves(values)
+                if is_number(item[1]) and abs(item[1]) > LARGEST_NUMBER
+            ]:
                 raise validation_error(NUMBER_TOO_LARGE, *large[0])
             with scene_units(_units(values, SHAPES[shape])):
                 return handler(_with_numbers_of_loads(values, SHAPES[shape]))
@@ -326,8 +363,14 @@ class Scene(Table):
         """Yield faults across tables, after conversion of the experimental parameters."""
         whole = presets.with_own_numbers(self, Scene.whole)
         over = partial(Region.over, others=whole.whole())
-        regions = {name: presets.with_own_numbers(region, over) for name, region in self.regions.items()}
-        self.__dict__ |= {"material": whole.material, "remodeling": whole.remodeling, "regions": regions}
+        regions = {
+            name: presets.with_own_numbers(region, over) for name, region in self.regions.items()
+        }
+        self.__dict__ |= {
+            "material": whole.material,
+            "remodeling": whole.remodeling,
+            "regions": regions,
+        }
         for rule in self._rules:
             yield from rule(self)
 
@@ -342,11 +385,15 @@ class Scene(Table):
         """The formulation that is set, or the one that "auto" resolves to."""
         if self.mesh.formulation != AUTO:
             return self.mesh.formulation
-        return "displacement" if not self._bulk_is_stiff or self.displacement_reason() else NOT_LOCKING
+        return (
+            "displacement" if not self._bulk_is_stiff or self.displacement_reason() else NOT_LOCKING
+        )
 
     @property
     def _bulk_is_stiff(self) -> bool:
-        return self._stiffness_ratio > FORMULATIONS[NOT_LOCKING].auto_threshold(self.mesh.element, self.mesh.degree)
+        return self._stiffness_ratio > FORMULATIONS[NOT_LOCKING].auto_threshold(
+            self.mesh.element, self.mesh.degree
+        )
 
     def displacement_reason(self) -> str:
         """Return why "auto" cannot use the locking-free formulation, or an empty string."""
@@ -364,7 +411,9 @@ class Scene(Table):
         """Describe the resolved formulation and its reason."""
         needs = self.displacement_reason() if self._bulk_is_stiff else ""
         ratio = f"lambda/mu = {self._stiffness_ratio:.4g}"
-        return f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
+        return (
+            f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
+        )
 
     @property
     def end_of_ramps(self) -> float:
@@ -403,7 +452,9 @@ class Scene(Table):
         for case in self.cases:
             loads = dict(self.loads)
             for name in {*case.loads} & {*loads}:
-                loads[name] = loads[name].model_copy(update={"value": loads[name].value * case.loads[name]})
+                loads[name] = loads[name].model_copy(
+                    update={"value": loads[name].value * case.loads[name]}
+                )
             found.append(self.model_copy(update={"loads": loads, "cases": ()}))
         return found or [self]
 
@@ -427,12 +478,16 @@ class Scene(Table):
     @property
     def has_random_cells(self) -> bool:
         """Whether any cells are random."""
-        return any(properties.cells.initial == "random" for properties in self.properties().values())
+        return any(
+            properties.cells.initial == "random" for properties in self.properties().values()
+        )
 
     @property
     def has_order_jumps(self) -> bool:
         """Whether the law is ranked and the lengths of cells vary, so that their order can jump."""
-        return LAWS[self.remodeling.law].is_ranked and (self.has_random_cells or bool(self.measured_cells))
+        return LAWS[self.remodeling.law].is_ranked and (
+            self.has_random_cells or bool(self.measured_cells)
+        )
 
     @property
     def is_as_run(self) -> bool:
@@ -449,12 +504,17 @@ class Scene(Table):
     def column_names(self) -> list[str]:
         """Names of all columns that a history can have; a region's name can cause duplicates."""
         always = columns_of(self.geometry, regions=self.regions)
-        return [*columns_on_request(self.geometry, self.regions, self.held_faces), *(column.name for column in always)]
+        return [
+            *columns_on_request(self.geometry, self.regions, self.held_faces),
+            *(column.name for column in always),
+        ]
 
     def columns(self, more: Iterable[str] = ()) -> tuple[Column, ...]:
         """Return the columns of the history in file order, with `more` of those on request."""
         requested = [*self.output.columns, *more]
-        return columns_of(self.geometry, requested, self.loads, self.regions, len(self.cases), self.held_faces)
+        return columns_of(
+            self.geometry, requested, self.loads, self.regions, len(self.cases), self.held_faces
+        )
 
     @property
     def held_faces(self) -> list[str]:
@@ -477,13 +537,23 @@ class Scene(Table):
     def lacking_fields(self) -> dict[str, str]:
         """Fields that the body does not have, each with the reason."""
         turnover, same = self.remodeling.turnover, self.natural.is_trivial
-        stress_free = "the mesh is stress-free ([natural]): 'fibre_angle' is the angle in the unloaded body"
+        stress_free = (
+            "the mesh is stress-free ([natural]): 'fibre_angle' is the angle in the unloaded body"
+        )
         reasons: list[tuple[bool, Sequence[str], str]] = [
             (not self.regions, (REGION,), "the scene has no regions"),
             (same, (UNLOADED,), stress_free),
             (same and not turnover.grows, (NATURAL_GRADIENT,), stress_free),
-            (not turnover.is_on, TURNED_OVER, "it changes only with remodeling.turnover, which is not set"),
-            (not turnover.grows, (GROWTH,), "tissue grows only with a remodeling.turnover.volume above 0"),
+            (
+                not turnover.is_on,
+                TURNED_OVER,
+                "it changes only with remodeling.turnover, which is not set",
+            ),
+            (
+                not turnover.grows,
+                (GROWTH,),
+                "tissue grows only with a remodeling.turnover.volume above 0",
+            ),
         ]
         return {name: reason for lacks, names, reason in reasons if lacks for name in names}
 
@@ -491,24 +561,30 @@ class Scene(Table):
     def has_free_length(self) -> bool:
         """Whether the body's length is an unknown."""
         kinds, shape = self.load_kinds, self.geometry
-        return (self.supports.ends in shape.ends and shape.ends[self.supports.ends].makes_length_unknown) or any(
-            kinds[name].makes_length_unknown for name in self.loads
-        )
+        return (
+            self.supports.ends in shape.ends and shape.ends[self.supports.ends].makes_length_unknown
+        ) or any(kinds[name].makes_length_unknown for name in self.loads)
 
     def summary(self) -> str:
         """Describe stiffness of network and matrix and largest loads on one line, in one unit."""
         loads = {}
         for name in self.loads:
-            largest = max((case.loads[name].largest(self.last_time) for case in self.each_case()), key=abs)
+            largest = max(
+                (case.loads[name].largest(self.last_time) for case in self.each_case()), key=abs
+            )
             stress = largest_stress(self.load_kinds[name], largest, self.geometry)
             if stress is not None:
                 is_force = self.load_kinds[name].dimension == FORCE
                 loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
         found = self.properties()
-        parts = [_words(name) + properties.material.summary(loads) for name, properties in found.items()]
+        parts = [
+            _words(name) + properties.material.summary(loads) for name, properties in found.items()
+        ]
         turnover = self.remodeling.turnover
         if turnover.is_on:
-            parts.append(f"turnover with rates = {turnover.rates!r} and volume = {turnover.volume:g}")
+            parts.append(
+                f"turnover with rates = {turnover.rates!r} and volume = {turnover.volume:g}"
+            )
         return "; ".join(parts)
 
     def warnings(self, wall: object = None) -> list[str]:
@@ -525,18 +601,29 @@ class Scene(Table):
             properties.pop("", None)  # The entry holds nowhere.
         for name, (material, cells, _) in properties.items():
             for case in self.each_case():
-                lines = doubts(material, self.geometry, case.loads, cells.end_to_end_length, self.last_time)
-                found |= dict.fromkeys(line if line.startswith("geometry.") else _words(name) + line for line in lines)
+                lines = doubts(
+                    material, self.geometry, case.loads, cells.end_to_end_length, self.last_time
+                )
+                found |= dict.fromkeys(
+                    line if line.startswith("geometry.") else _words(name) + line for line in lines
+                )
         # Doubtful units explain a soft wall.
         found |= {} if found else dict.fromkeys(too_soft(self, wall))
         found |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
         tables = self.model_dump(exclude={"loads", "cases"})
         found |= dict.fromkeys(_doubted_keys(tables))
-        return [*found, *self.loaded_shape_warnings(), *self._turnover_warnings(), *self.remodeling.warnings()]
+        return [
+            *found,
+            *self.loaded_shape_warnings(),
+            *self._turnover_warnings(),
+            *self.remodeling.warnings(),
+        ]
 
     def loaded_shape_warnings(self) -> list[str]:
         """Return a warning if the cells reorient, so that rows leave the loaded geometry."""
-        turns = LAWS[self.remodeling.law].remodels and any(one.kappa for one in self.properties().values())
+        turns = LAWS[self.remodeling.law].remodels and any(
+            one.kappa for one in self.properties().values()
+        )
         if not (self.geometry.is_loaded and turns and self.natural.cells == AS_GIVEN):
             return []
         way = "apply all loads in the first step to have a row with this shape"
@@ -565,7 +652,11 @@ class Scene(Table):
                 words = "if collagen alone carries the loads, shorter with a matrix"
                 yield f"{says}: reaches equilibrium slowly, time constant {slowly:.3g} {words}"
         chosen = self.time.is_equilibrium or self.time.tolerance is not None
-        if not chosen and not COUPLINGS[self.remodeling.coupling].solves_cells and step > turnover.time:
+        if (
+            not chosen
+            and not COUPLINGS[self.remodeling.coupling].solves_cells
+            and step > turnover.time
+        ):
             yield (
                 f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: "
                 "content and natural length overshoot in each step; reduce time.step or set time.tolerance"
@@ -593,7 +684,9 @@ class Scene(Table):
         values = self._values()
         for key, value in changes.items():
             if not isinstance(key, str):
-                raise SceneError(f"{format_value(key)} = {format_value(value)}: a key must be text, as in 'cells.seed'")
+                raise SceneError(
+                    f"{format_value(key)} = {format_value(value)}: a key must be text, as in 'cells.seed'"
+                )
             set_nested(values, key, value)
         _follow(values, changes, is_whole=True)
         return type(self)(**values)
@@ -618,12 +711,16 @@ def _in_present_format(values: Mapping[str, object]) -> dict[str, object]:
     if not isinstance(written, int) or isinstance(written, bool) or written < 1:
         return dict(values)  # The field's own error describes a wrong value.
     if written > FORMAT:
-        rule = f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
+        rule = (
+            f"written by a newer version of remodel_fenicsx; this one reads formats up to {FORMAT}"
+        )
         raise validation_error(rule, "format", written)
     values = {**values, "format": FORMAT}
     turnover = presets.said(values, "remodeling", "turnover")
     if isinstance(turnover, Mapping) and "time" in turnover:  # defaults of version 0.3.0
-        values = merge_nested({"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values)
+        values = merge_nested(
+            {"remodeling": {"turnover": {"rates": "tension", "volume": 0.0}}}, values
+        )
     return values
 
 
@@ -647,7 +744,9 @@ def _beside(values: dict[str, object], folder: Path) -> dict[str, object]:
     """Resolve the file names of a scene against its folder."""
     for name, part in presets.parts_of(values):
         if isinstance(file := presets.said(part, "cells", "fibres"), str):
-            values = presets.with_part(values, name, {"cells": {"fibres": str(folder.absolute() / file)}})
+            values = presets.with_part(
+                values, name, {"cells": {"fibres": str(folder.absolute() / file)}}
+            )
     kind = presets.said(values, "geometry", "shape")
     if isinstance(kind, str) and kind in SHAPES:
         values = {**values, "geometry": SHAPES[kind].with_files_from(values["geometry"], folder)}
@@ -661,7 +760,12 @@ def _words(region: str) -> str:
 def _follow(values: dict[str, Any], changed: Mapping[str, object], is_whole: bool) -> None:
     """Remove values that no longer fit changed keys; with `is_whole` also replaced values."""
     times, end = presets.said(values, "output", "times"), presets.said(values, "time", "end")
-    if "time.end" in changed and "output.times" not in changed and is_number(end) and isinstance(times, list | tuple):
+    if (
+        "time.end" in changed
+        and "output.times" not in changed
+        and is_number(end)
+        and isinstance(times, list | tuple)
+    ):
         values["output"]["times"] = [time for time in times if not is_number(time) or time <= end]
         if (dropped := len(times) - len(values["output"]["times"])) and is_first_rank():
             log.warning("output.times: dropped %d times after time.end = %g", dropped, end)
@@ -679,7 +783,9 @@ def _known_shape(geometry: object) -> str:
     if not isinstance(geometry, Mapping):
         raise validation_error("must be a table", "geometry", geometry)
     if "shape" not in geometry:
-        raise validation_error("missing; must be one of " + ", ".join(map(repr, SHAPES)), "geometry.shape", None)
+        raise validation_error(
+            "missing; must be one of " + ", ".join(map(repr, SHAPES)), "geometry.shape", None
+        )
     _check_name("geometry.shape", geometry["shape"], SHAPES)
     return str(geometry["shape"])
 
@@ -705,7 +811,10 @@ def _with_numbers_of_loads(values: Mapping[str, object], shape: type[Shape]) -> 
     for name, kind in shape.loads_on(faces_of(loads)).items():
         load = loads.get(name)
         if isinstance(load, Mapping) and "value" in load and kind.dimension is not None:
-            found[name] = {**load, "value": kind.dimension.number(load["value"], f"loads.{quoted(name)}.value")}
+            found[name] = {
+                **load,
+                "value": kind.dimension.number(load["value"], f"loads.{quoted(name)}.value"),
+            }
     return {**values, "loads": found}
 
 
@@ -714,20 +823,30 @@ def _check_load_names(shape: str, loads: object) -> None:
     kind = SHAPES[shape]
     names = kind.loads
     for name, load in loads.items() if isinstance(loads, Mapping) else ():
-        if kind.supported_faces is None and isinstance(load, Mapping) and ("kind" in load or "face" in load):
+        if (
+            kind.supported_faces is None
+            and isinstance(load, Mapping)
+            and ("kind" in load or "face" in load)
+        ):
             _check_load_on_face(kind, str(name), load)
         elif name not in names:
-            key, listed = f"loads.{quoted(str(name))}", ", ".join(f"loads.{known}" for known in names)
+            key, listed = f"loads.{quoted(str(name))}", ", ".join(
+                f"loads.{known}" for known in names
+            )
             raise validation_error(f"a {shape} has no such load; allowed: {listed}", key, load)
 
 
 def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object]) -> None:
     key = f"loads.{quoted(name)}"
     if not isinstance(load.get("face"), str):
-        raise validation_error("missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face"))
+        raise validation_error(
+            "missing; a load of this kind needs the name of a face", f"{key}.face", load.get("face")
+        )
     if name in shape.loads:
         raise validation_error(
-            f"{shape.loads[name].meaning}; rename the load to use another face", f"{key}.face", load["face"]
+            f"{shape.loads[name].meaning}; rename the load to use another face",
+            f"{key}.face",
+            load["face"],
         )
     if not re.fullmatch(NAME, name) or name in {column.name for column in columns_of(shape)}:
         raise validation_error(
@@ -742,7 +861,11 @@ def _plain(value: object) -> Any:
     if isinstance(value, BaseModel):
         kind = {"shape": value.name} if isinstance(value, Shape) else {}
         return kind | value.model_dump(exclude_unset=True, exclude_none=True)
-    return {name: _plain(entry) for name, entry in value.items()} if isinstance(value, Mapping) else value
+    return (
+        {name: _plain(entry) for name, entry in value.items()}
+        if isinstance(value, Mapping)
+        else value
+    )
 
 
 # ---------------------------------------------------------------- reading
@@ -789,7 +912,9 @@ def preset_scene(preset: str, shape: str) -> Scene:
     return scene_from_dict({"name": shape, "preset": preset, "geometry": {"shape": shape}})
 
 
-def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), profile: str | None = None) -> Scene:
+def read_scene(
+    path: str | os.PathLike[str], overrides: Iterable[str] = (), profile: str | None = None
+) -> Scene:
     """Read a scene from a TOML file.
 
     Parameters
@@ -825,7 +950,9 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), prof
     read = read_toml(Path(path))
     # Other dots belong to the name.
     name = re.sub(r"\.toml$", "", Path(path).name, flags=re.IGNORECASE)
-    read.setdefault("name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene")
+    read.setdefault(
+        "name", re.sub(r"^[^\w]+|[^\w+-]+$|[^\w .+-]", "", name)[:100].rstrip(" .") or "scene"
+    )
     changes = dict(parse_override(override) for override in overrides)
     chosen = set(CHOSEN_BY_RUNS) - set(changes) if changes and "format" in read else set()
 
@@ -870,14 +997,26 @@ def _with_profile(name: str, made: Callable[[Mapping[str, object]], Scene]) -> S
 
 # Keys that may change: they determine no result of the steps done, or only how these were solved.
 # Of a mesh file only the contents matter (geometry.sha256).
-RESUMABLE_KEYS = ("format", "name", "preset", "profile", "output", "solver", "loads", "time.end", "geometry.file")
+RESUMABLE_KEYS = (
+    "format",
+    "name",
+    "preset",
+    "profile",
+    "output",
+    "solver",
+    "loads",
+    "time.end",
+    "geometry.file",
+)
 SAME_LOAD = 1e-12  # relative difference below which two loads are equal
 
 
 def check_continuation(old: Scene, new: Scene, time: float) -> None:
     """Check that a scene has the physics of the recorded run until `time`."""
     rule = f"a resumed run may change time.end, output, solver, and loads after its checkpoint at {time:g}"
-    before, now = (dict(leaves(scene.model_dump(mode="json"), RESUMABLE_KEYS)) for scene in (old, new))
+    before, now = (
+        dict(leaves(scene.model_dump(mode="json"), RESUMABLE_KEYS)) for scene in (old, new)
+    )
     for key in [*before, *(key for key in now if key not in before)]:
         if before.get(key) != now.get(key):
             was = format_value(before[key]) if key in before else "not set"
@@ -885,13 +1024,23 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
     for name in {**old.load_kinds, **new.load_kinds}:
         first, second = old.loads.get(name), new.loads.get(name)
         if first and second and first.face != second.face:
-            raise SceneError(f"loads.{name}.face = {format_value(second.face)}: was {format_value(first.face)}; {rule}")
+            raise SceneError(
+                f"loads.{name}.face = {format_value(second.face)}: was {format_value(first.face)}; {rule}"
+            )
         for moment in sorted({0.0, time, *_ramp_times(first), *_ramp_times(second)}):
-            old_value, value = (0.0 if one is None else one.value * one.factor(moment) for one in (first, second))
-            if moment <= time and abs(old_value - value) > SAME_LOAD * max(abs(old_value), abs(value)):
-                raise SceneError(f"loads.{name} = {value:g} at time {moment:g}: was {old_value:g}; {rule}")
+            old_value, value = (
+                0.0 if one is None else one.value * one.factor(moment) for one in (first, second)
+            )
+            if moment <= time and abs(old_value - value) > SAME_LOAD * max(
+                abs(old_value), abs(value)
+            ):
+                raise SceneError(
+                    f"loads.{name} = {value:g} at time {moment:g}: was {old_value:g}; {rule}"
+                )
     if new.last_time < time:
-        raise SceneError(f"time.end = {format_value(new.time.end)}: must be at least {time:g}, the checkpoint's time")
+        raise SceneError(
+            f"time.end = {format_value(new.time.end)}: must be at least {time:g}, the checkpoint's time"
+        )
 
 
 def _ramp_times(load: Load | None) -> list[float]:

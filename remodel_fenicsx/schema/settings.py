@@ -17,7 +17,14 @@ from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Optional
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema, SerializeAsAny, create_model
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    GetPydanticSchema,
+    SerializeAsAny,
+    create_model,
+)
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import resolved
@@ -51,7 +58,14 @@ from remodel_fenicsx.schema.tables import (
     format_value,
     with_key,
 )
-from remodel_fenicsx.schema.units import FORCE, FOUNDATION, LENGTH, NUMBER_DENSITY, STRESS, TEMPERATURE
+from remodel_fenicsx.schema.units import (
+    FORCE,
+    FOUNDATION,
+    LENGTH,
+    NUMBER_DENSITY,
+    STRESS,
+    TEMPERATURE,
+)
 
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1.0e3, "MPa": 1.0e6}  # in Pa
 MEASURED_CELLS = "fibres"  # the value of cells.initial that selects the file cells.fibres
@@ -161,7 +175,10 @@ class Supports(Table):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Support] = Field(init=False)
 
-    ends: str = Field(default="free", json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"})
+    ends: str = Field(
+        default="free",
+        json_schema_extra={"allowed": "'free', for a tube also 'clamped' and 'closed'"},
+    )
     """Supports of a tube's ends. 'free': the ends stay in their planes and may move radially.
     'clamped': the ends also keep their circles. 'closed': the ends are free and have caps under the
     pressure; the length is then an unknown."""
@@ -241,7 +258,12 @@ class Material(Table):
     @property
     def network_modulus(self) -> float:
         """Network modulus c = omega k theta n_chn / (4 A_p), in stress_unit (default 1.568 Pa)."""
-        pascal = BOLTZMANN_CONSTANT * self.temperature * self.chain_density / (4 * self.persistence_length)
+        pascal = (
+            BOLTZMANN_CONSTANT
+            * self.temperature
+            * self.chain_density
+            / (4 * self.persistence_length)
+        )
         return self.energy_factor * pascal / STRESS_UNITS[self.stress_unit]
 
     def tissue(self, end_to_end_length: float) -> Tissue:
@@ -266,7 +288,11 @@ class Material(Table):
     def _part(self, part: Any) -> Any:
         """Return a part with the values of its own parameters."""
         own = getattr(part, "parameters", None)
-        return part.with_parameters({name: getattr(self, name, own[name].default) for name in own}) if own else part
+        return (
+            part.with_parameters({name: getattr(self, name, own[name].default) for name in own})
+            if own
+            else part
+        )
 
     def summary(self, loads: Mapping[str, float]) -> str:
         """Return the moduli of network and matrix and the loads, in one unit and on one line.
@@ -276,8 +302,14 @@ class Material(Table):
         loads
             Stresses by their label, in stress_unit.
         """
-        stresses = {"network modulus c =": self.network_modulus, "shear modulus mu =": self.lame_mu, **loads}
-        return ", ".join(f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items())
+        stresses = {
+            "network modulus c =": self.network_modulus,
+            "shear modulus mu =": self.lame_mu,
+            **loads,
+        }
+        return ", ".join(
+            f"{words} {value:.4g} {self.stress_unit}" for words, value in stresses.items()
+        )
 
 
 class Prestretch(Table):
@@ -302,12 +334,19 @@ class Prestretch(Table):
         """Circumferential, axial and radial stretch."""
         given = (self.circumferential, self.axial, self.radial)
         known = math.prod(value for value in given if value is not None)
-        around, along, across = (known ** (-1 / given.count(None)) if value is None else value for value in given)
+        around, along, across = (
+            known ** (-1 / given.count(None)) if value is None else value for value in given
+        )
         return around, along, across
 
 
 _From: Any = with_key(
-    "from", float, default=0.0, ge=0, lt=1, description="Start of the layer, from the inside (0) to the outside (1)."
+    "from",
+    float,
+    default=0.0,
+    ge=0,
+    lt=1,
+    description="Start of the layer, from the inside (0) to the outside (1).",
 )
 
 
@@ -316,7 +355,9 @@ class NaturalLayer(_From):  # type: ignore[misc]
 
     to: float = Field(default=1.0, gt=0, le=1)
     """End of the layer."""
-    region: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a region"})
+    region: str | None = Field(
+        default=None, min_length=1, json_schema_extra={"allowed": "the name of a region"}
+    )
     """Name of a region, instead of `from` and `to`."""
     prestretch: Prestretch
     """Stretches from the layer's stress-free configuration to the unloaded body."""
@@ -370,9 +411,13 @@ class Natural(Table):
             if (layer.region is None) != (other.region is None):
                 rule = "must be set for all layers or for none"
                 yield rule, f"layers[{index}].region", layer.region
-            meet = layer.share[0] < other.share[1] and other.share[0] < layer.share[1]  # layers with regions all do
+            meet = (
+                layer.share[0] < other.share[1] and other.share[0] < layer.share[1]
+            )  # layers with regions all do
             if meet and layer.region == other.region:
-                yield "overlaps another layer", f"layers[{index}]", layer.region or list(layer.share)
+                yield "overlaps another layer", f"layers[{index}]", layer.region or list(
+                    layer.share
+                )
 
 
 # Size of a group of antithetic seeds. Over the three cyclic permutations of l_1, l_2, l_3 the mean
@@ -408,19 +453,25 @@ class Cells(Table):
 
     initial: InitialCells = Field(
         default="random",
-        json_schema_extra={"allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]"},
+        json_schema_extra={
+            "allowed": "'random', 'isotropic', 'aligned', 'fibres' or three lengths [l1, l2, l3]"
+        },
     )
     """Cell dimensions l_I at t = 0, with |l| = end_to_end_length. 'random': one draw per element,
     uniform on the positive octant of the sphere. 'isotropic': three equal ones. 'aligned': all
     along aligned_axis. 'fibres': from the file cells.fibres. [l1, l2, l3]: these, in link
     lengths."""
     fibres: str | None = Field(
-        default=None, min_length=1, json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"}
+        default=None,
+        min_length=1,
+        json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"},
     )
     """File of measured fibres, relative to the scene: axes and dimensions of the cells at t = 0 (docs/my_own_vessel.md,
     Measured fibres in)."""
     fibres_sha256: str | None = Field(
-        default=None, pattern="^[0-9a-f]{64}$", json_schema_extra={"allowed": "64 hexadecimal digits"}
+        default=None,
+        pattern="^[0-9a-f]{64}$",
+        json_schema_extra={"allowed": "64 hexadecimal digits"},
     )
     """SHA-256 of the file cells.fibres. The scene that a run stores has it, and rejects another
     file."""
@@ -445,7 +496,9 @@ class Cells(Table):
 
     def length_problem(self) -> str | None:
         """Return why `initial` contradicts `end_to_end_length`, or None if it does not."""
-        length = self.end_to_end_length if isinstance(self.initial, str) else math.hypot(*self.initial)
+        length = (
+            self.end_to_end_length if isinstance(self.initial, str) else math.hypot(*self.initial)
+        )
         if abs(length - self.end_to_end_length) <= 1e-6 * self.end_to_end_length:
             return None
         r0 = format_value(self.end_to_end_length)
@@ -460,7 +513,9 @@ class Cells(Table):
         """
         r0 = self.end_to_end_length
         if self.initial == "random":
-            seed, turn = divmod(self.seed + 2, ANTITHETIC_GROUP) if self.antithetic else (self.seed, 0)
+            seed, turn = (
+                divmod(self.seed + 2, ANTITHETIC_GROUP) if self.antithetic else (self.seed, 0)
+            )
             draws = np.abs(np.random.default_rng(seed).standard_normal((number_of_elements, 3)))
             draws = np.roll(draws, turn, axis=1)
             return r0 * draws / np.linalg.norm(draws, axis=1, keepdims=True)
@@ -531,7 +586,9 @@ class CouplingKind:
 
 
 IMPLICIT = "implicit"
-IN_ITS_PLACE = "take 'extrapolated' with remodeling.law = 'tensor', or 'staggered' with smaller steps"
+IN_ITS_PLACE = (
+    "take 'extrapolated' with remodeling.law = 'tensor', or 'staggered' with smaller steps"
+)
 
 
 def _refuse_implicit(*parts: object) -> NoReturn:
@@ -625,7 +682,9 @@ class Turnover(_WithStart):  # type: ignore[misc]
     def rule(self) -> TurnoverRule:
         """Turnover rule as a function of arrays."""
         assert self.time is not None
-        return TurnoverRule(self.time, self.deposition_stretch, self.gain, TURNOVER_RATES[self.rates])
+        return TurnoverRule(
+            self.time, self.deposition_stretch, self.gain, TURNOVER_RATES[self.rates]
+        )
 
     @property
     def is_on(self) -> bool:
@@ -742,7 +801,12 @@ class Remodeling(Table):
     def warnings(self) -> list[str]:
         """Return a warning if the coupling relaxes a law and thereby slows it down."""
         law, share = LAWS[self.law], self.relaxation_factor
-        if not COUPLINGS[self.coupling].relaxes or share == 1 or not law.remodels or law.depends_on_absolute_time:
+        if (
+            not COUPLINGS[self.coupling].relaxes
+            or share == 1
+            or not law.remodels
+            or law.depends_on_absolute_time
+        ):
             return []
         return [
             f"remodeling.coupling = {self.coupling!r} makes {share:g} of each pass, which the law "
@@ -752,7 +816,11 @@ class Remodeling(Table):
     @property
     def beside(self) -> list[RemodelsKind]:
         """Registry entries of the quantities that remodel in addition to the cells."""
-        return [kind for name, kind in REMODELS.items() if (table := getattr(self, name, None)) and table.is_on]
+        return [
+            kind
+            for name, kind in REMODELS.items()
+            if (table := getattr(self, name, None)) and table.is_on
+        ]
 
     @property
     def own_parameters(self) -> dict[str, float]:
@@ -825,7 +893,10 @@ def _for_regions(table: type[Table], key: str, *names: str) -> Any:
     fields: Any = {}
     for name in names:
         field = copy.copy(table.model_fields[name])
-        field.default, field.description = None, f"As `{key}.{name}`, for this region. Default: that of the whole body."
+        field.default, field.description = (
+            None,
+            f"As `{key}.{name}`, for this region. Default: that of the whole body.",
+        )
         fields[name] = Optional[field.annotation], field
     return create_model(f"_Some_{key}", __base__=Table, **fields)
 
@@ -868,7 +939,9 @@ class Region(Table):
     outer_radius: Annotated[float | None, LENGTH] = Field(default=None, gt=0)
     """For a tube: the outer radius of the layer, in the scene's unit of length. The layer begins at
     the outer radius of the next inner layer. The key is optional for the outermost layer."""
-    material: Annotated[SerializeAsAny[RegionMaterial], KeysOfParts({"matrix": MATRICES}, True)] = RegionMaterial()
+    material: Annotated[SerializeAsAny[RegionMaterial], KeysOfParts({"matrix": MATRICES}, True)] = (
+        RegionMaterial()
+    )
     cells: RegionCells = RegionCells()
     remodeling: RegionRemodeling = RegionRemodeling()
 
@@ -904,7 +977,9 @@ class Load(Table):
 
     value: float
     """Full value, at factor 1. An elongation has no unit and is greater than -1."""
-    ramp: Ramp = Field(json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"})
+    ramp: Ramp = Field(
+        json_schema_extra={"allowed": "a list of pairs [time, factor] with increasing times"}
+    )
     """Factor on the value over time, linear between pairs, constant before the first and after the
     last. Times up to time.end must be multiples of time.step. With time.tolerance a step ends at
     each time."""
@@ -913,7 +988,9 @@ class Load(Table):
     """For a further load of a user-supplied body: 'pressure' acts against the outward normal of the
     deformed face. 'displacement' moves a held, guided or sliding face along its mean outward
     normal."""
-    face: str | None = Field(default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"})
+    face: str | None = Field(
+        default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"}
+    )
     """For a further load of a user-supplied body: the face on which the load acts."""
 
     def _faults(self) -> Faults:
@@ -930,7 +1007,9 @@ class Load(Table):
     def factor(self, time: float) -> float:
         """Return the load factor at a time: piecewise linear, constant outside the ramp."""
         times, factors = zip(*self.ramp, strict=True)
-        hits = [corner for corner in times if math.isclose(time, corner)]  # exact at the ramp's times
+        hits = [
+            corner for corner in times if math.isclose(time, corner)
+        ]  # exact at the ramp's times
         return float(np.interp(hits[0] if hits else time, times, factors))
 
     @property
@@ -959,7 +1038,8 @@ class LoadCase(Table):
     weight: float = Field(gt=0, le=1)
     """Fraction of the time. The weights of all cases sum to 1."""
     loads: dict[str, float] = Field(
-        default_factory=dict, json_schema_extra={"allowed": "a table of numbers by the names of loads"}
+        default_factory=dict,
+        json_schema_extra={"allowed": "a table of numbers by the names of loads"},
     )
     """Factor on each load by its name, in addition to the factor of its ramp. The default is 1."""
 
@@ -975,7 +1055,9 @@ def faces_of(loads: Mapping[str, object]) -> dict[str, OnFace]:
     """Return face and kind of a scene's further loads by name, from validated tables or as read."""
     tables = {name: dict(load) for name, load in loads.items() if isinstance(load, (Mapping, Load))}
     return {
-        name: OnFace(load["face"], "displacement" if load.get("kind") == "displacement" else "pressure")
+        name: OnFace(
+            load["face"], "displacement" if load.get("kind") == "displacement" else "pressure"
+        )
         for name, load in tables.items()
         if isinstance(load.get("face"), str)
     }
@@ -1106,7 +1188,9 @@ class Solver(Table):
     continue. 'stop': check every step, and end the run after the last stable one (exit code 3)."""
     petsc_options: dict[str, str | bool | int | float] = Field(
         default_factory=dict,
-        json_schema_extra={"allowed": "a table with a string, a finite number, true or false for each option"},
+        json_schema_extra={
+            "allowed": "a table with a string, a finite number, true or false for each option"
+        },
     )
     """PETSc options that replace the method's, without the leading '-': snes_..., ksp_..., pc_...
     and mat_.... Options that run code or write files are rejected."""
@@ -1146,13 +1230,15 @@ class Output(Table):
 
     fields: bool | Annotated[tuple[_FieldName, ...], IN_A_LIST] = Field(
         default=True,
-        json_schema_extra={"allowed": "true, false or a list of: " + ", ".join(map(repr, ALL_FIELDS))},
+        json_schema_extra={
+            "allowed": "true, false or a list of: " + ", ".join(map(repr, ALL_FIELDS))
+        },
     )
     """Fields to write for ParaView: true for all, false for none, or a list of names
     (docs/commands.md). 'chains' stands for the chain lines. Other fields are not computed."""
-    columns: Annotated[tuple[str, ...], IN_A_LIST, AfterValidator(lambda names: tuple(dict.fromkeys(names)))] = Field(
-        default=(), json_schema_extra={"allowed": "a list of names of columns"}
-    )
+    columns: Annotated[
+        tuple[str, ...], IN_A_LIST, AfterValidator(lambda names: tuple(dict.fromkeys(names)))
+    ] = Field(default=(), json_schema_extra={"allowed": "a list of names of columns"})
     """Columns of the history (docs/commands.md). Columns on request are added to the default ones.
     If any other column is named, only the named columns are measured, with time and loads."""
     every: int = Field(default=1, ge=1)

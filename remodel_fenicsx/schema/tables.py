@@ -13,7 +13,17 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType, NoneType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, TypeVar, get_args, get_origin
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Literal,
+    Protocol,
+    Self,
+    TypeVar,
+    get_args,
+    get_origin,
+)
 
 from pydantic import (
     BaseModel,
@@ -27,7 +37,13 @@ from pydantic import (
     model_validator,
 )
 from pydantic.fields import FieldInfo
-from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, SchemaValidator, core_schema
+from pydantic_core import (
+    CoreSchema,
+    ErrorDetails,
+    PydanticCustomError,
+    SchemaValidator,
+    core_schema,
+)
 
 from remodel_fenicsx.errors import RemodelError, printable, shortened
 
@@ -106,7 +122,9 @@ class Table(BaseModel):
         return self
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+    def __get_pydantic_json_schema__(
+        cls, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
         """Return the schema with each key's meaning, without the entries that only scripts need."""
         found = handler(schema)
         table = handler.resolve_ref_schema(found)
@@ -150,8 +168,12 @@ def _of_python(value: Any) -> object:
 class Before:
     """Annotation of a field whose values are preprocessed before validation."""
 
-    def __get_pydantic_core_schema__(self, source: type, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(functools.partial(self.seen, source), handler(source))
+    def __get_pydantic_core_schema__(
+        self, source: type, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(
+            functools.partial(self.seen, source), handler(source)
+        )
 
     def seen(self, source: type, value: object) -> object:
         """Return the value that replaces the value of a field of type `source`."""
@@ -171,7 +193,9 @@ class OneOf(Before):
         """Allowed values of the field."""
         return [*self.also, *(name for name in self.registry if name not in (self.removed or ()))]
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
         return {"enum": self.choices}
 
     def seen(self, source: type, value: object) -> object:
@@ -190,13 +214,17 @@ class VariantOf(Before):
     registry: Mapping[str, type[Table]]
     tag: str
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
         """Return a schema with the keys of all variants, for completion in an editor, and those of
         each."""
         known: dict[str, Any] = {}
         chosen = []
         for tag, table in self.registry.items():
-            known |= {name: {"description": description(table, name)} for name in table.model_fields}
+            known |= {
+                name: {"description": description(table, name)} for name in table.model_fields
+            }
             keys = handler(table.__pydantic_core_schema__)
             chosen.append({"if": {"properties": {self.tag: {"const": tag}}}, "then": keys})
         known[self.tag]["enum"] = list(self.registry)
@@ -207,7 +235,9 @@ class VariantOf(Before):
         if not isinstance(value, Mapping):
             return value
         name = value[self.tag]
-        only = core_schema.tagged_union_schema({name: self.registry[name].__pydantic_core_schema__}, self.tag)
+        only = core_schema.tagged_union_schema(
+            {name: self.registry[name].__pydantic_core_schema__}, self.tag
+        )
         # The locations of its errors have the variant's name after the field's.
         return SchemaValidator(only).validate_python(dict(value))
 
@@ -241,9 +271,17 @@ class KeysOfParts(Before):
         if not isinstance(value, Mapping):
             return value
         chosen = {key: value.get(key, table.model_fields[key].default) for key in self.registries}
-        parts = [self.registries[key].get(name) for key, name in chosen.items() if isinstance(name, str)]
-        own = {name: number for part in parts for name, number in getattr(part, "parameters", {}).items()}
-        own |= {name: part.table for name, part in self.tables.items() if name not in table.model_fields}
+        parts = [
+            self.registries[key].get(name) for key, name in chosen.items() if isinstance(name, str)
+        ]
+        own = {
+            name: number
+            for part in parts
+            for name, number in getattr(part, "parameters", {}).items()
+        }
+        own |= {
+            name: part.table for name, part in self.tables.items() if name not in table.model_fields
+        }
         if not own:
             return value
         wide = _extended_table(table, tuple(own.items()), self.optional)
@@ -264,7 +302,9 @@ def _extended_table(table: type[Table], own: Own, optional: bool) -> type[Table]
         name: (
             kind,
             Field(
-                default=None if optional else number.default, gt=number.exclusive_minimum, description=number.meaning
+                default=None if optional else number.default,
+                gt=number.exclusive_minimum,
+                description=number.meaning,
             ),
         )
         for name, number in own
@@ -295,7 +335,11 @@ def listed(names: Iterable[str], wrong: str, most: int = 24) -> str:
 
 def is_number(value: object) -> TypeGuard[float]:
     """Return whether a value is a finite number in the range of a float; true and false are not."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and abs(value) <= sys.float_info.max
+    )
 
 
 # ---------------------------------------------------------------- errors on one line
@@ -304,7 +348,9 @@ def is_number(value: object) -> TypeGuard[float]:
 def one_line(error: ValidationError, table: type[Table]) -> str:
     """Format the first fault as `key = value: rule`, with the number of further faults."""
     faults: dict[str, ErrorDetails] = {}  # a key that allows several types has an error for each
-    for detail in sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden"):
+    for detail in sorted(
+        error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden"
+    ):
         faults.setdefault(locate(table, detail["loc"])[0], detail)
     for detail in [detail for detail in faults.values() if detail["type"] == "extra_forbidden"]:
         key, owner, _ = locate(table, detail["loc"])
@@ -328,10 +374,14 @@ def _describe(detail: ErrorDetails, table: type[Table]) -> str:
     if kind == "extra_forbidden":
         return f"{key} = {format_value(value)}: unknown key; {_suggestion(key, owner, table)}"
     rule = detail["msg"] if field is None else allowed(field)
-    return f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {format_value(value)}: {rule}"
+    return (
+        f"{key}: missing; {rule}" if kind == "missing" else f"{key} = {format_value(value)}: {rule}"
+    )
 
 
-def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, type[Table], FieldInfo | None]:
+def locate(
+    table: type[Table], location: tuple[int | str, ...]
+) -> tuple[str, type[Table], FieldInfo | None]:
     """Return the dotted key at a location, the table class that owns it, and its field or None."""
     key, owner, field = "", table, None
     inside: type[Table] | None = table  # the table that owns the next item as a key
@@ -339,7 +389,9 @@ def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, ty
     while items:
         item = items.pop(0)
         if inside is None:
-            if isinstance(item, int) or (field is not None and get_origin(field.annotation) is dict):
+            if isinstance(item, int) or (
+                field is not None and get_origin(field.annotation) is dict
+            ):
                 key = _joined(key, _step(item))
             if isinstance(item, str):
                 break  # the remaining items are pydantic's names of the types of the value
@@ -355,7 +407,11 @@ def locate(table: type[Table], location: tuple[int | str, ...]) -> tuple[str, ty
         if several and "" not in several and items:
             inside = several[str(items.pop(0))][1]
         elif suffix and items and inside is not None:
-            key, owner, field = _joined(key, _step(items.pop(0))), inside, FieldInfo.from_annotation(inside)
+            key, owner, field = (
+                _joined(key, _step(items.pop(0))),
+                inside,
+                FieldInfo.from_annotation(inside),
+            )
     return key, owner, field
 
 
@@ -390,7 +446,9 @@ def _toml_text(value: object) -> str:
     if isinstance(value, BaseModel):
         return _toml_text(value.model_dump(exclude_unset=True))
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{name} = {_toml_text(entry)}" for name, entry in value.items()) + "}"
+        return (
+            "{" + ", ".join(f"{name} = {_toml_text(entry)}" for name, entry in value.items()) + "}"
+        )
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml_text(entry) for entry in value) + "]"
     return str(value)
@@ -413,7 +471,9 @@ def _suggestion(key: str, owner: type[Table], table: type[Table]) -> str:
     if near := _nearest_key(key, owner):
         return f"did you mean {near}?"
     others = [(other, inner) for other, _, inner in sections(table) if other != parent]
-    elsewhere = {known: _joined(other, known) for other, inner in others for known in inner.model_fields}
+    elsewhere = {
+        known: _joined(other, known) for other, inner in others for known in inner.model_fields
+    }
     if names := _nearest(name, elsewhere, cutoff=0.8):
         return f"did you mean {elsewhere[names[0]]}?"
     return "allowed: " + ", ".join(_joined(parent, known) for known in owner.model_fields)
@@ -445,20 +505,31 @@ def choices(field: FieldInfo) -> list[object]:
 def _kind(field: FieldInfo) -> object:
     """Return the annotation of a field without None, if it is one type or None."""
     kinds = [kind for kind in get_args(field.annotation) if kind is not NoneType]
-    return kinds[0] if get_args(field.annotation) == (*kinds, NoneType) and len(kinds) == 1 else field.annotation
+    return (
+        kinds[0]
+        if get_args(field.annotation) == (*kinds, NoneType) and len(kinds) == 1
+        else field.annotation
+    )
 
 
 def allowed(field: FieldInfo) -> str:
     """Describe the values that a field allows, for errors and the reference of keys."""
     if listed := choices(field):
-        return f"must be {'one of ' if len(listed) > 1 else ''}" + ", ".join(map(format_value, listed))
+        return f"must be {'one of ' if len(listed) > 1 else ''}" + ", ".join(
+            map(format_value, listed)
+        )
     if isinstance(field.json_schema_extra, dict):
         return f"must be {field.json_schema_extra['allowed']}"
     if is_table(field.annotation) or get_origin(field.annotation) is dict:
         fields: dict[str, FieldInfo] = getattr(field.annotation, "model_fields", {})
         required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
-    nouns: dict[object, str] = {float: "a finite number", int: "an integer", bool: "true or false", str: "a string"}
+    nouns: dict[object, str] = {
+        float: "a finite number",
+        int: "an integer",
+        bool: "true or false",
+        str: "a string",
+    }
     words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
     bounds = [
         f"{word} {getattr(entry, name)}"
@@ -475,10 +546,16 @@ def tables_in(field: FieldInfo) -> Iterator[tuple[str, str, type[Table]]]:
         yield from (("", tag, kind) for tag, kind in several.registry.items())
         return
     suffix = {dict: ".NAME", tuple: "[]"}.get(get_origin(field.annotation) or str, "")
-    yield from ((suffix, "", kind) for kind in (field.annotation, *get_args(field.annotation)) if is_table(kind))
+    yield from (
+        (suffix, "", kind)
+        for kind in (field.annotation, *get_args(field.annotation))
+        if is_table(kind)
+    )
 
 
-def sections(table: type[Table], key: str = "", variant: str = "") -> Iterator[tuple[str, str, type[Table]]]:
+def sections(
+    table: type[Table], key: str = "", variant: str = ""
+) -> Iterator[tuple[str, str, type[Table]]]:
     """Yield dotted key, variant and class of a table and its inner tables; NAME is a free name."""
     yield key, variant, table
     if (kind := table.further) is not None:
@@ -498,4 +575,6 @@ def description(table: type[Table], name: str) -> str:
 
 def meaning(table: type[Table]) -> str:
     """Return a table's docstring without the sections that only scripts need."""
-    return re.split(r"\n\nIts keyword arguments |\n\n\w+\n---", inspect.cleandoc(table.__doc__ or ""))[0]
+    return re.split(
+        r"\n\nIts keyword arguments |\n\n\w+\n---", inspect.cleandoc(table.__doc__ or "")
+    )[0]

@@ -43,19 +43,29 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: no such file; a scene is a TOML file") from None
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        raise SceneError(f"{path}: line {line}: not UTF-8 text; a scene is a TOML file in UTF-8") from None
+        raise SceneError(
+            f"{path}: line {line}: not UTF-8 text; a scene is a TOML file in UTF-8"
+        ) from None
     except (OSError, ValueError) as error:
-        raise SceneError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise SceneError(
+            f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from None
     for number, words in enumerate(text.splitlines(), start=1):
         if not words.lstrip().startswith("#") and _DECIMAL.sub("", words).count(".") > MOST_PARTS:
-            raise SceneError(f"{path}: line {number}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
+            raise SceneError(
+                f"{path}: line {number}: a key of more than {MOST_PARTS} parts; a scene has up to 4"
+            )
     try:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        place = re.search(r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL)
+        place = re.search(
+            r"^(.*) \(at (?:line (\d+), column \d+|(end of document))\)$", str(error), re.DOTALL
+        )
         where = f"line {place[2] or len(text.splitlines())}: " if place else ""
         words = text.splitlines()[int(place[2]) - 1] if place and place[2] else ""
-        raise SceneError(f"{path}: {where}not TOML: {place[1] if place else error}{_marks(words)}") from None
+        raise SceneError(
+            f"{path}: {where}not TOML: {place[1] if place else error}{_marks(words)}"
+        ) from None
     if _depth_exceeds(values, MOST_PARTS):
         raise SceneError(f"{path}: more than {MOST_PARTS} nested tables; a scene has up to 4")
     return values
@@ -81,9 +91,13 @@ def parse_override(text: str) -> tuple[str, object]:
     if not equals:
         raise SceneError(f"--set {format_value(text)}: must be KEY=VALUE, as in cells.seed=2")
     if len(key.split(".")) > MOST_PARTS:
-        raise SceneError(f"--set {format_value(text)}: a key of more than {MOST_PARTS} parts; a scene has up to 4")
+        raise SceneError(
+            f"--set {format_value(text)}: a key of more than {MOST_PARTS} parts; a scene has up to 4"
+        )
     if not all(key.split(".")):
-        raise SceneError(f"--set {format_value(text)}: the key must be a dotted path, as in cells.seed=2")
+        raise SceneError(
+            f"--set {format_value(text)}: the key must be a dotted path, as in cells.seed=2"
+        )
     try:
         parsed = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):
@@ -92,7 +106,9 @@ def parse_override(text: str) -> tuple[str, object]:
         return key, parsed["value"]
     if re.fullmatch(r"[\w.+/:-]+", value) or is_quantity(value):
         return key, value
-    raise SceneError(f"--set {key} = {format_value(value)}: must be a TOML value or a bare word{_marks(value)}")
+    raise SceneError(
+        f"--set {key} = {format_value(value)}: must be a TOML value or a bare word{_marks(value)}"
+    )
 
 
 def set_nested(values: dict[str, object], key: str, value: object) -> None:
@@ -102,7 +118,9 @@ def set_nested(values: dict[str, object], key: str, value: object) -> None:
         table = values.setdefault(parent, {})
         if not isinstance(table, dict):
             place = ".".join(parents[: depth + 1])
-            raise SceneError(f"{key} = {format_value(value)}: {place} = {format_value(table)} is a value, not a table")
+            raise SceneError(
+                f"{key} = {format_value(value)}: {place} = {format_value(table)} is a value, not a table"
+            )
         values = table
     values[name] = value
 
@@ -113,7 +131,9 @@ def merge_nested(base: Mapping[str, object], over: Mapping[str, object]) -> dict
     for name, value in over.items():
         below = result.get(name)
         result[name] = (
-            merge_nested(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+            merge_nested(below, value)
+            if isinstance(below, Mapping) and isinstance(value, Mapping)
+            else value
         )
     return result
 
@@ -149,7 +169,9 @@ def _lines(table: BaseModel | Mapping[str, object], place: str = "") -> Iterator
 
 @functools.cache
 def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(" ".join(text.split()), COMMENT_WIDTH + 2, initial_indent="# ", subsequent_indent="# ")
+    return textwrap.wrap(
+        " ".join(text.split()), COMMENT_WIDTH + 2, initial_indent="# ", subsequent_indent="# "
+    )
 
 
 # ---------------------------------------------------------------- tables of numbers
@@ -171,8 +193,12 @@ def read_columns(
     head = [known.get((spellings or {}).get(name.lower(), name.lower()), "") for name in names]
     if unknown := [name for name, found in zip(names, head, strict=True) if not found]:
         if all(_number(name, ".") is not None for name in names):
-            raise UnreadableFile("begins with a row of numbers; the first row must have the names of the columns")
-        raise UnreadableFile(f"unknown column {format_value(unknown[0])}; allowed: {listed(allowed, unknown[0])}")
+            raise UnreadableFile(
+                "begins with a row of numbers; the first row must have the names of the columns"
+            )
+        raise UnreadableFile(
+            f"unknown column {format_value(unknown[0])}; allowed: {listed(allowed, unknown[0])}"
+        )
     if twice := [name for number, name in enumerate(head) if name in head[:number]]:
         raise UnreadableFile(f"duplicate column {twice[0]}")
     mark = "," if any("," in cell for row in rows for cell in row) else "."
@@ -183,11 +209,17 @@ def read_columns(
         for place, cell in enumerate(row):
             if (value := _number(cell, mark)) is None:
                 more = " (others have decimal commas)" if mark == "," and "." in cell else ""
-                raise UnreadableFile(f"row {number + 1}, {head[place]}: {format_value(cell)} is not a number{more}")
+                raise UnreadableFile(
+                    f"row {number + 1}, {head[place]}: {format_value(cell)} is not a number{more}"
+                )
             values[number, place] = value
     used = {name: column for name, column in zip(head, values.T, strict=True) if name not in unused}
     words = [f"{written} between columns", *(["decimal commas"] if mark == "," else [])]
-    words += [f"not used: {', '.join(left)}"] if (left := [name for name in head if name in unused]) else []
+    words += (
+        [f"not used: {', '.join(left)}"]
+        if (left := [name for name in head if name in unused])
+        else []
+    )
     log.info("%s: %d rows of %s; %s", file, len(rows), ", ".join(used), "; ".join(words))
     return used
 
@@ -199,14 +231,19 @@ def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise UnreadableFile("is not text in UTF-8") from error
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    lines = [
+        line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
+    ]
     said = lines.pop(0).strip()[4:] if lines and lines[0].lower().startswith("sep=") else ""
     head = lines[0] if lines else ""
     mark = said or next((one for one in DELIMITERS if one in head.strip()), ",")
     if mark == " " or not mark.isspace():
         lines = [line.strip(" ") for line in lines]
     try:
-        table = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)]
+        table = [
+            [cell.strip() for cell in row]
+            for row in csv.reader(lines, delimiter=mark, skipinitialspace=True)
+        ]
     except (TypeError, csv.Error) as error:  # a delimiter of several letters
         raise UnreadableFile(f"cannot be read as a table: {error}") from error
     while table and table[0] and not table[0][-1]:

@@ -83,7 +83,9 @@ class Dimension:
     example: str
     powers: tuple[tuple[str, int], ...]
 
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         return core_schema.no_info_before_validator_function(self.number, handler(source))
 
     def number(self, value: object, key: str = "") -> Any:
@@ -110,7 +112,10 @@ class Dimension:
         units = _UNITS.get()
         if not isinstance(value, str) or units is None:
             return value
-        rule, found = f"a unit of {self.name} as in {format_value(self.example)}", _QUANTITY.fullmatch(value.strip())
+        rule, found = (
+            f"a unit of {self.name} as in {format_value(self.example)}",
+            _QUANTITY.fullmatch(value.strip()),
+        )
         if found is None:
             raise validation_error(f"must be a number, or one with {rule}", key, value)
         source = _unit(found[2])
@@ -119,16 +124,24 @@ class Dimension:
         # first.
         target = _unit(" * ".join(f"{unit or 'm'}**{power}" for unit, power in powers.items()))
         if source is None or target is None or source.dimensionality != target.dimensionality:
-            raise validation_error(f"{format_value(found[2])} is no unit of {self.name}; must be {rule}", key, value)
+            raise validation_error(
+                f"{format_value(found[2])} is no unit of {self.name}; must be {rule}", key, value
+            )
         if unset := [name for name, _ in self.powers if units.get(name, name) is None]:
             remedy = f"set {unset[0]} (m, cm, mm or um), or omit the unit"
-            raise validation_error(f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value)
+            raise validation_error(
+                f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value
+            )
         number = float(found[1])  # rejects exponents that would make a fraction of a billion digits
         if abs(number) > LARGEST_NUMBER:
             raise validation_error(NUMBER_TOO_LARGE, key, value)
-        return float(_registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude)
+        return float(
+            _registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude
+        )
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
         return {"anyOf": [handler(schema), schema_with_unit(self)]}
 
 
@@ -212,17 +225,27 @@ class Doubt(NamedTuple):
 
 # Only the first entry that holds is reported. Comparisons with NaN do not hold.
 CONVENTIONS = (
-    Doubt("elongation", lambda x, _: x.max() > 3.0, "reaches {high:.4g}: percent? An elongation of 10 % is 0.1"),
+    Doubt(
+        "elongation",
+        lambda x, _: x.max() > 3.0,
+        "reaches {high:.4g}: percent? An elongation of 10 % is 0.1",
+    ),
     # A table of stretches begins at 1 within the measurement error.
     Doubt(
         "elongation",
         lambda x, _: x.min() > 0.98,
         "reaches {high:.4g}: a stretch? A stretch of 1.1 is an elongation of 0.1, an engineering strain",
     ),
-    Doubt("stretch", lambda x, _: x.max() > 10.0, "reaches {high:.4g}: percent? A stretch of 110 % is 1.1"),
+    Doubt(
+        "stretch",
+        lambda x, _: x.max() > 10.0,
+        "reaches {high:.4g}: percent? A stretch of 110 % is 1.1",
+    ),
     # Soft tissue is compressed to a stretch of 0.5 at most.
     Doubt(
-        "stretch", lambda x, _: x.min() < 0.4, "begins at {low:.4g}: strains? A stretch of 1 is the reference length"
+        "stretch",
+        lambda x, _: x.min() < 0.4,
+        "begins at {low:.4g}: strains? A stretch of 1 is the reference length",
     ),
     # Circumferential fibres have angles of 0.1 and less. The model's angles may be small too.
     Doubt(
@@ -255,7 +278,9 @@ CONVENTIONS = (
 
 def convention_doubt(quantity: str, values: ArrayLike, model: ArrayLike = np.nan) -> str:
     """Return a warning that numbers seem to use another convention, or an empty string."""
-    numbers, expected = np.abs(np.atleast_1d(values)), np.maximum(np.abs(np.atleast_1d(model)), 1e-300)
+    numbers, expected = np.abs(np.atleast_1d(values)), np.maximum(
+        np.abs(np.atleast_1d(model)), 1e-300
+    )
     for doubt in CONVENTIONS:
         if re.search(doubt.quantity, quantity) and doubt.holds(numbers, expected):
             ratio = np.median(numbers / expected)

@@ -30,10 +30,14 @@ MADE_ANEW = Attempt(
     "FullNewton.fallback",
     "Newton failed; retrying",
 )
-IN_PARTS = Attempt("in substeps: first the remodeled cells, then the loads; a failed substep is halved", "Change")
+IN_PARTS = Attempt(
+    "in substeps: first the remodeled cells, then the loads; a failed substep is halved", "Change"
+)
 STEP_REFUSED = Attempt("the step fails, with its cause and advice", "diagnose_failure")
 SHORTER_STEP = Attempt(
-    "with time.tolerance: a quarter of the step size, up to three times", "StepControl", "retrying with a smaller step"
+    "with time.tolerance: a quarter of the step size, up to three times",
+    "StepControl",
+    "retrying with a smaller step",
 )
 ATTEMPTS = (FROM_EXPECTED, FROM_LAST, MADE_ANEW, IN_PARTS, STEP_REFUSED, SHORTER_STEP)
 """Attempts in their order; docs/architecture.md has the table."""

@@ -22,8 +22,20 @@ from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import attempted
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits
-from remodel_fenicsx.solver.newton import POSSIBLE_JUMP, SolverCounts, GuardedNewton, Solution, SolveFailure
-from remodel_fenicsx.solver.diagnosis import BIFURCATION, LIMIT_POINT, SEVERAL_SOLUTIONS, FailureCause, diagnose_failure
+from remodel_fenicsx.solver.newton import (
+    POSSIBLE_JUMP,
+    SolverCounts,
+    GuardedNewton,
+    Solution,
+    SolveFailure,
+)
+from remodel_fenicsx.solver.diagnosis import (
+    BIFURCATION,
+    LIMIT_POINT,
+    SEVERAL_SOLUTIONS,
+    FailureCause,
+    diagnose_failure,
+)
 from remodel_fenicsx.state import StateNumbers, State
 
 log = logging.getLogger(__name__)
@@ -41,8 +53,13 @@ SAME_SOLUTION = 1e-4
 # Ratio of the displacement to that of the substep before that may be a jump. Towards a limit point
 # the last of equal substeps moves up to 3 times as far.
 FASTER = 4.0
-END_OF_PATH = (LIMIT_POINT.kind, BIFURCATION.kind)  # causes of failure for which no smaller step helps
-MIN_HALVINGS_FOR_JUMP = 8  # number of halvings needed to distinguish a jump from a step that is too large
+END_OF_PATH = (
+    LIMIT_POINT.kind,
+    BIFURCATION.kind,
+)  # causes of failure for which no smaller step helps
+MIN_HALVINGS_FOR_JUMP = (
+    8  # number of halvings needed to distinguish a jump from a step that is too large
+)
 # Number of jumps in a run that are checked, each by about 25 solves. A body that collapses jumps in
 # every step.
 MOST_JUMPS = 3
@@ -165,13 +182,17 @@ class Continuation:
         while done < 1.0:
             attempts += 1
             self.state.tell(
-                f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, " f"attempt {attempts}: {100 * part:.2g} %"
+                f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, "
+                f"attempt {attempts}: {100 * part:.2g} %"
             )
             before = self.state.unknown.x.array.copy()
             part = min(part, 1.0 - done, self.largest_part(done))
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
-            solution = attempted(partial(self.newton.solve, before, self.loose_tolerance and not is_last), SolveFailure)
+            solution = attempted(
+                partial(self.newton.solve, before, self.loose_tolerance and not is_last),
+                SolveFailure,
+            )
             work.add(solution)
             if isinstance(solution, SolveFailure):
                 self.state.unknown.x.array[:] = before
@@ -180,7 +201,10 @@ class Continuation:
                 expected = 0.0 if self._direction is None else part * self._size(self._direction)
                 moved = self._size(self.state.unknown.x.array - before)
                 if self.is_another_branch(solution, moved, expected) and self._may_check_jumps():
-                    solved, self.state.unknown.x.array[:] = self.state.unknown.x.array.copy(), before
+                    solved, self.state.unknown.x.array[:] = (
+                        self.state.unknown.x.array.copy(),
+                        before,
+                    )
                     if part / 2 >= self._smallest:
                         log.debug(
                             "%s: far from the last substep, %.3g of the first Newton step",
@@ -205,7 +229,9 @@ class Continuation:
         unknown, jumps = self.state.unknown.x.array, self._jumps
         moved, last = self._size(unknown - before), jumps["moved"]
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
-        looked = self.is_another_branch(work.last, moved, expected, tangents) and self._may_check_jumps()
+        looked = (
+            self.is_another_branch(work.last, moved, expected, tangents) and self._may_check_jumps()
+        )
         if looked:
             self.repeat_in_substeps(before, work)
             moved = self._size(unknown - before)
@@ -231,8 +257,14 @@ class Continuation:
             )
         work.count(parts)
         if leads_on and self._size(unknown - found) > SAME_SOLUTION * self._size(found - before):
-            log.info("time %g: several solutions exist; using the one reached by substeps", self.time)
-            work.residual, work.extension, work.substeps = parts.residual, parts.extension, parts.substeps
+            log.info(
+                "time %g: several solutions exist; using the one reached by substeps", self.time
+            )
+            work.residual, work.extension, work.substeps = (
+                parts.residual,
+                parts.extension,
+                parts.substeps,
+            )
             return
         unknown[:] = found
         self.set_fraction(1.0)
@@ -241,7 +273,9 @@ class Continuation:
     def _smallest(self) -> float:
         return 2.0**-self.maximum_halvings
 
-    def is_another_branch(self, solution: Solution | None, moved: float, expected: float, tangents: int = 0) -> bool:
+    def is_another_branch(
+        self, solution: Solution | None, moved: float, expected: float, tangents: int = 0
+    ) -> bool:
         """Return whether a solve may have jumped: far from its tangent, slow, or too far."""
         # `expected`: distance predicted by the last substep, 0 if unknown; `tangents`: number of a
         # whole step.
@@ -273,7 +307,9 @@ class Continuation:
         self._jumps["found"] += 1
         state, far = self.state, self._size(solved - self.state.unknown.x.array)
         if state.comm.rank == 0:
-            loads = ", ".join(f"{name} {value:.4g}" for name, value in state.loading.values.items() if value)
+            loads = ", ".join(
+                f"{name} {value:.4g}" for name, value in state.loading.values.items() if value
+            )
             log.warning(
                 "time %g: jump to another solution branch (largest displacement change %.3g). "
                 "The previous branch ends at %s (%s). Set a smaller time.step to resolve it",
@@ -310,7 +346,12 @@ class CellHomotopy:
         def at_points() -> list[UnitCell]:
             return shares(old.point_cells, new.point_cells, float(np.real(self.theta.value)))
 
-        return Equilibrium(self.state, self.tissue, shares(old.symbolic_cell, new.symbolic_cell, self.theta), at_points)
+        return Equilibrium(
+            self.state,
+            self.tissue,
+            shares(old.symbolic_cell, new.symbolic_cell, self.theta),
+            at_points,
+        )
 
     @functools.cached_property
     def newton(self) -> GuardedNewton:
@@ -338,7 +379,9 @@ class CellHomotopy:
         # Infinite without locking.
         allowed = ((1 - KEPT_RESERVE) * length + KEPT_RESERVE * np.sqrt(now)) ** 2
         increase = end - now
-        room = np.where(increase > 0, (allowed - now) / np.where(increase > 0, increase, 1.0), np.inf)
+        room = np.where(
+            increase > 0, (allowed - now) / np.where(increase > 0, increase, 1.0), np.inf
+        )
         return (1.0 - done) * quadrature.minimum(room)
 
 

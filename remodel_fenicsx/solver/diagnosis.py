@@ -212,7 +212,9 @@ class Inertia:
         largest = self.equilibrium.comm.allreduce(float(np.max(amplitude, initial=0.0)), MPI.MAX)
         # Of nodes that are equal by symmetry the first one in space, for any number of ranks.
         candidates = (np.round(nodes[amplitude >= (1 - 1e-6) * largest], 12) + 0.0).tolist()
-        place = min(tuple(node) for rank in self.equilibrium.comm.allgather(candidates) for node in rank)
+        place = min(
+            tuple(node) for rank in self.equilibrium.comm.allgather(candidates) for node in rank
+        )
         return Mode(eigenvalue, place, function.x.array.copy())
 
 
@@ -251,13 +253,18 @@ class FailureCause:
     def __str__(self) -> str:
         if not self.kind:
             return self.advice
-        return f"{self.kind} ({self.finding}): {self.advice}" if self.finding else f"{self.kind}: {self.advice}"
+        return (
+            f"{self.kind} ({self.finding}): {self.advice}"
+            if self.finding
+            else f"{self.kind}: {self.advice}"
+        )
 
 
 TOO_LARGE = FailureCause("", "try a smaller time.step, a slower ramp or lower loads")
 LIMIT_POINT = FailureCause(
     "limit point",
-    "the load approaches the largest that the body can carry; " "lower it, or prescribe a displacement instead",
+    "the load approaches the largest that the body can carry; "
+    "lower it, or prescribe a displacement instead",
 )
 BIFURCATION = FailureCause(
     "bifurcation",
@@ -275,16 +282,22 @@ KINEMATIC_LOCKING = FailureCause(
 )
 SOLVER_TOLERANCE = FailureCause(
     "solver tolerance",
-    "the residual does not fall below the tolerance; " "try a larger solver.maximum_iterations, or a smaller time.step",
+    "the residual does not fall below the tolerance; "
+    "try a larger solver.maximum_iterations, or a smaller time.step",
 )
 SEVERAL_SOLUTIONS = FailureCause(
-    "several solutions", "this solution does not continue the previous branch; try a slower ramp, or lower loads"
+    "several solutions",
+    "this solution does not continue the previous branch; try a slower ramp, or lower loads",
 )
-UNSTABLE = FailureCause("lost stability", 'lower the load, or continue beyond it with solver.unstable = "warn"')
+UNSTABLE = FailureCause(
+    "lost stability", 'lower the load, or continue beyond it with solver.unstable = "warn"'
+)
 
 
 def diagnose_failure(
-    newton: GuardedNewton, failure: SolveFailure | None, direction: NDArray[np.float64] | None = None
+    newton: GuardedNewton,
+    failure: SolveFailure | None,
+    direction: NDArray[np.float64] | None = None,
 ) -> FailureCause:
     """Return the cause of a failure, from the last solved state. Collective."""
     extension = newton.equilibrium.extension()
@@ -294,9 +307,13 @@ def diagnose_failure(
     moved = newton.equilibrium.comm.allreduce(bool(np.any(np.nan_to_num(prescribed))), MPI.LOR)
     if longest > (NEARLY_LOCKED if moved else LOCKED):
         place = ", ".join(f"{c:.4g}" for c in extension.worst_point)
-        return replace(CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last solved state")
+        return replace(
+            CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last solved state"
+        )
     if extension.min_jacobian < COLLAPSED_JACOBIAN:
-        return replace(KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last solved state")
+        return replace(
+            KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last solved state"
+        )
     inertia = Inertia(newton.equilibrium)
     try:
         found = _of_the_tangent(inertia, direction)
@@ -316,7 +333,8 @@ def _of_the_tolerance(failure: SolveFailure) -> FailureCause | None:
     if not 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
         return None
     found = replace(
-        SOLVER_TOLERANCE, finding=f"the residual is {failure.residual_over_tolerance:.3g} times the tolerance"
+        SOLVER_TOLERANCE,
+        finding=f"the residual is {failure.residual_over_tolerance:.3g} times the tolerance",
     )
     if failure.relative_residual > MAX_ADVISED_TOLERANCE:
         return found
@@ -324,7 +342,9 @@ def _of_the_tolerance(failure: SolveFailure) -> FailureCause | None:
     enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))
     key = f"solver.relative_tolerance = {enough:g}"
     if failure.stagnates:
-        return replace(found, advice=f"the residual stagnates at rounding errors; {key} accepts this state")
+        return replace(
+            found, advice=f"the residual stagnates at rounding errors; {key} accepts this state"
+        )
     return replace(found, advice=f"{found.advice}; {key} would accept this state")
 
 

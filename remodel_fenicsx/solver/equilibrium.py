@@ -26,7 +26,12 @@ from remodel_fenicsx.fem.assembly import (
 )
 from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import Stresses, Tissue, squared_end_to_end_length, total_structure_tensor
+from remodel_fenicsx.model.energy import (
+    Stresses,
+    Tissue,
+    squared_end_to_end_length,
+    total_structure_tensor,
+)
 from remodel_fenicsx.model.tensors import MANDEL, det, determinant_changes_sign
 from remodel_fenicsx.state import State
 
@@ -52,7 +57,11 @@ class PointwiseRepulsion:
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
         self.stiffness = self.quadrature.function("repulsion_stiffness", (6, 6))
         of_cells = [ufl.as_ufl(part) for cell in cells for part in cell]
-        of_stress = [state.kinematics.elastic_gradient(state.unknown), *of_cells, *self.tissue.parameters.values()]
+        of_stress = [
+            state.kinematics.elastic_gradient(state.unknown),
+            *of_cells,
+            *self.tissue.parameters.values(),
+        ]
         self._structure: CachedValue[Array] = CachedValue(None, *of_cells)
         self._stresses, self._stiffnesses = (CachedValue[None](None, *of_stress) for _ in range(2))
 
@@ -70,7 +79,9 @@ class PointwiseRepulsion:
         first, second = derivatives(np.swapaxes(F, 1, 2) @ F, A, stiffness)
         shape = self.quadrature.shape
         # W_rep = -c g(r0)/2 M: S = 2 dW/dC and 2 dS/dC = 4 d2W/dC2
-        self.quadrature.values(self.stress, (3, 3))[:] = (-modulus[:, None, None] * first).reshape(*shape, 3, 3)
+        self.quadrature.values(self.stress, (3, 3))[:] = (-modulus[:, None, None] * first).reshape(
+            *shape, 3, 3
+        )
         if second is not None:
             values = self.quadrature.values(self.stiffness, (6, 6))
             values[:] = (-2 * modulus[:, None, None] * second).reshape(*shape, 6, 6)
@@ -91,7 +102,9 @@ class PointwiseRepulsion:
         """Return the derivative of `residual`, UFL."""
         variation, increment = ufl.derivative(F, u, test), ufl.derivative(F, u, trial)
         geometric = ufl.inner(ufl.dot(increment, self.stress), variation)
-        strains = [ufl.sym(ufl.dot(ufl.transpose(F), direction)) for direction in (increment, variation)]
+        strains = [
+            ufl.sym(ufl.dot(ufl.transpose(F), direction)) for direction in (increment, variation)
+        ]
         along, across = (mandel_vector(strain) for strain in strains)
         return geometric + ufl.inner(ufl.dot(self.stiffness, along), across)
 
@@ -125,7 +138,9 @@ class PointStresses:
 
 def mandel_vector(tensor: Expr) -> Expr:
     """Return the six Mandel components of a symmetric UFL tensor."""
-    return ufl.as_vector([tensor[i, j] if i == j else np.sqrt(2.0) * tensor[i, j] for i, j in MANDEL])
+    return ufl.as_vector(
+        [tensor[i, j] if i == j else np.sqrt(2.0) * tensor[i, j] for i, j in MANDEL]
+    )
 
 
 def pointwise_repulsion(
@@ -179,7 +194,9 @@ class Equilibrium:
         u, shares, loading = state.unknown, shares or [state.cells.symbolic_cell], state.loading
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.elastic_gradient(u)
-        self.energies = state.dilatation.energies(self.tissue, F, shares, state.kinematics.stress_free_weight(mesh))
+        self.energies = state.dilatation.energies(
+            self.tissue, F, shares, state.kinematics.stress_free_weight(mesh)
+        )
         external = loading.external_residual(test)
         self.pointwise = pointwise_repulsion(state, self.tissue, shares, point_shares)
         internal = [ufl.derivative(energy, u, test) for energy in self.energies]
@@ -196,7 +213,9 @@ class Equilibrium:
             self.tangent_forms.append(jit.form(ufl.derivative(external, u, trial)))
         chains = [] if self.tissue.chain is None else [part for cell in shares for part in cell]
         length = 0.0 if self.tissue.locking_length is None else self.tissue.locking_length
-        self._known: CachedValue[PointState] = CachedValue(self.comm, F, *map(ufl.as_ufl, [*chains, length]))
+        self._known: CachedValue[PointState] = CachedValue(
+            self.comm, F, *map(ufl.as_ufl, [*chains, length])
+        )
         self._energy_forms: list[dolfinx.fem.Form] = []
 
     # ------------------------------------------------------------ state and limits
@@ -213,20 +232,28 @@ class Equilibrium:
 
     def _look(self) -> PointState:
         quadrature = self.quadrature
-        squares, lengths = quadrature.owned(self.squared_lengths()), quadrature.owned(self.locking_length())
+        squares, lengths = quadrature.owned(self.squared_lengths()), quadrature.owned(
+            self.locking_length()
+        )
         gradients = self.state.elastic_gradient()[: squares.size]
         jacobians = det(gradients).reshape(squares.shape)
         with np.errstate(invalid="ignore"):
             stretches = np.sqrt(squares) / lengths
         stretches[~np.isfinite(stretches)] = np.inf
-        smallest = min(map(_smallest, (jacobians, quadrature.owned(self.state.dilatation.jacobians()))))
+        smallest = min(
+            map(_smallest, (jacobians, quadrature.owned(self.state.dilatation.jacobians())))
+        )
         local: tuple[float, tuple[float, ...]] = (-np.inf, (np.nan,) * 3)
         if stretches.size:
             worst = int(np.argmax(stretches))
-            local = stretches.item(worst), tuple(quadrature.coordinates.reshape(-1, 3)[worst].tolist())
+            local = stretches.item(worst), tuple(
+                quadrature.coordinates.reshape(-1, 3)[worst].tolist()
+            )
         ranks = allgather(self.comm, (*local, smallest, self.state.stop_signal()))
         largest, worst_point, _, _ = max(ranks, key=lambda rank: rank[0])
-        extension = StateLimits(largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks))
+        extension = StateLimits(
+            largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks)
+        )
         return PointState(extension, stretches, jacobians, gradients)
 
     def keeps_margin(
@@ -254,9 +281,13 @@ class Equilibrium:
         """Return the largest |dF| with J > 0 and r/L < `far` at all points. Collective."""
         look, lengths = self.evaluate(), self.state.cells.dimension_values
         chains = np.sqrt((lengths**2).sum(axis=-1)) / self.locking_length()
-        volume = 2.0 * look.jacobians.ravel() / np.einsum("nij,nij->n", look.gradients, look.gradients)
+        volume = (
+            2.0 * look.jacobians.ravel() / np.einsum("nij,nij->n", look.gradients, look.gradients)
+        )
         length = (far - look.stretches) / np.maximum(self.quadrature.owned(chains), 1e-300)
-        return float(allreduce(self.comm, np.minimum(volume, length.ravel()).min(initial=np.inf), MPI.MIN))
+        return float(
+            allreduce(self.comm, np.minimum(volume, length.ravel()).min(initial=np.inf), MPI.MIN)
+        )
 
     def squared_lengths(self) -> Array:
         """Return r^2 in squared link lengths, (elements, points); 0 without chains."""
@@ -265,7 +296,9 @@ class Equilibrium:
             return np.zeros(shape)
         F = self.state.elastic_gradient()
         if self._point_shares is None:
-            return self.state.cells.kernels.squared_length(F, self.state.cells.point_cells).reshape(shape)
+            return self.state.cells.kernels.squared_length(F, self.state.cells.point_cells).reshape(
+                shape
+            )
         return np.asarray(squared_end_to_end_length(F, self._point_shares())).reshape(shape)
 
     def locking_length(self) -> NDArray[np.float64]:

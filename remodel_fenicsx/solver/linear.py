@@ -15,7 +15,13 @@ from petsc4py import PETSc
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.fem.assembly import PMultigrid, degree_one, allreduce, rigid_body_modes
-from remodel_fenicsx.fem.solver_methods import DEFINITE, GENERAL, ProblemOptions, SYMMETRIC, factor_options
+from remodel_fenicsx.fem.solver_methods import (
+    DEFINITE,
+    GENERAL,
+    ProblemOptions,
+    SYMMETRIC,
+    factor_options,
+)
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 if TYPE_CHECKING:
@@ -67,7 +73,9 @@ class LimitedMemoryUpdate:
             weights.append(product(taken, right) / curvature)
             right -= weights[-1] * change
             better -= weights[-1] * image
-        for ((taken, change, _), curvature), weight in zip(self._pairs, reversed(weights), strict=True):
+        for ((taken, change, _), curvature), weight in zip(
+            self._pairs, reversed(weights), strict=True
+        ):
             better += (weight - product(change, better) / curvature) * taken
         step.array[:] = better
         return bool(weights)
@@ -141,7 +149,9 @@ class LaggedFactorisation:
 
     def _was_indefinite(self) -> bool:
         """Return whether MUMPS has counted negative pivots in its LDL^T factorisation."""
-        return self._kind == SYMMETRIC and self.preconditioner.getFactorMatrix().getMumpsInfog(12) > 0
+        return (
+            self._kind == SYMMETRIC and self.preconditioner.getFactorMatrix().getMumpsInfog(12) > 0
+        )
 
     def _factorised(self, kind: str, matrix: Mat) -> bool:
         if self._kind != kind:
@@ -333,7 +343,9 @@ class Multigrid(FullNewton):
         given = {name.split("_")[0] for name in options.given}
         self._chooses = "ksp" not in given and "snes_ksp_ew" not in options.given
         if self._space.ufl_element().degree > 1 and not given & {"pc", "mg"}:
-            self._below = PMultigrid(self._solver.getPC(), degree_one(self._space), matrix, elastic=True)
+            self._below = PMultigrid(
+                self._solver.getPC(), degree_one(self._space), matrix, elastic=True
+            )
             if self._chooses:
                 # The tolerance is then that of the residual itself.
                 self._solver.setPCSide(PETSc.PC.Side.RIGHT)
@@ -421,7 +433,12 @@ class Lagged(FullNewton):
 
     def tangent(self, norm: float, tolerance: float) -> None:
         self._norms.append(norm)
-        if self._always or self._due or self._renewed_over(MOST_RENEWALS) or self._costs_more(tolerance):
+        if (
+            self._always
+            or self._due
+            or self._renewed_over(MOST_RENEWALS)
+            or self._costs_more(tolerance)
+        ):
             self.renew()
 
     def renew(self) -> None:
@@ -443,10 +460,16 @@ class Lagged(FullNewton):
         # The mean cost of a step, including that of the factorisation, is smallest if the next step
         # would cost more.
         self._spent, self._solves = self._spent + iterations, self._solves + 1
-        self._due = self._always or iterations > SLOW_STEP * self.worth or iterations * self._solves > self._spent
+        self._due = (
+            self._always
+            or iterations > SLOW_STEP * self.worth
+            or iterations * self._solves > self._spent
+        )
 
     def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return None if self._always else ("with a new factorisation in every iteration", self._anew())
+        return (
+            None if self._always else ("with a new factorisation in every iteration", self._anew())
+        )
 
     def _costs_more(self, tolerance: float) -> bool:
         """Return whether the remaining iterations cost more than factorising, or diverge."""

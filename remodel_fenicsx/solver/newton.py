@@ -88,8 +88,12 @@ class Convergence:
         tolerance = self.tolerance()
         if norm > tolerance:
             return False
-        requested = self.settings.absolute_tolerance + self.settings.relative_tolerance * self.force_scale
-        coarse = self.max_chain_extension > NEARLY_STRAIGHT and tolerance > COARSE * self.force_scale
+        requested = (
+            self.settings.absolute_tolerance + self.settings.relative_tolerance * self.force_scale
+        )
+        coarse = (
+            self.max_chain_extension > NEARLY_STRAIGHT and tolerance > COARSE * self.force_scale
+        )
         certain = requested if coarse else self.tolerance(rounded_strains=0.0)
         return norm <= certain or norm > STAGNATION * previous
 
@@ -103,7 +107,10 @@ class Convergence:
         # Stresses have rounding errors, and so have displacements: in a thin element that is a
         # strain of eps |u|/h.
         relative = self.settings.relative_tolerance * self.force_scale
-        area = FORCE_ROUNDINGS * self._area + rounded_strains * self.displacement * self._area_of_gradients
+        area = (
+            FORCE_ROUNDINGS * self._area
+            + rounded_strains * self.displacement * self._area_of_gradients
+        )
         return self.settings.absolute_tolerance + max(relative, self._stress_rounding * area)
 
 
@@ -157,7 +164,10 @@ class SolveFailure(RuntimeError, SolverCounts):
     ):
         super().__init__(reason)
         self.reason, self.extension, self.stagnates = reason, found.extension, stagnates
-        self.residual_over_tolerance, self.relative_residual = residual_over_tolerance, relative_residual
+        self.residual_over_tolerance, self.relative_residual = (
+            residual_over_tolerance,
+            relative_residual,
+        )
         self.count(found)
 
 
@@ -188,7 +198,9 @@ DIVERGED_MAX_IT = -5
 def failure_text(reason: int, iterations: int, extension: StateLimits) -> str:
     """Return why SNES has failed; if it has converged, the state is not admissible."""
     if reason >= 0:
-        return f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
+        return (
+            f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
+        )
     if reason == DIVERGED_MAX_IT:
         return f"no equilibrium within {iterations} Newton iterations"
     return SNES_REASONS.get(reason, f"SNES stopped with reason {reason}")
@@ -211,18 +223,39 @@ class GuardedNewton:
 
     def _make_solver(self) -> None:
         """Create PETSc's objects of the method, which serve all steps."""
-        equilibrium, settings, kinematics = self.equilibrium, self.settings, self.equilibrium.state.kinematics
-        unknowns, ranks, narrow = self._x.getSize(), equilibrium.comm.size, not kinematics.three_dimensional
-        self.method = method = resolve_auto(settings.method, unknowns, narrow, kinematics.suits_multigrid)
+        equilibrium, settings, kinematics = (
+            self.equilibrium,
+            self.settings,
+            self.equilibrium.state.kinematics,
+        )
+        unknowns, ranks, narrow = (
+            self._x.getSize(),
+            equilibrium.comm.size,
+            not kinematics.three_dimensional,
+        )
+        self.method = method = resolve_auto(
+            settings.method, unknowns, narrow, kinematics.suits_multigrid
+        )
         # In three dimensions a named method is not replaced, so that results do not depend on the
         # size.
         small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
-        bounded = method == LAGGED and not self._robust and "snes_linesearch_type" not in self._options.given
-        self._bounded = bounded and kinematics.three_dimensional and equilibrium.state.dilatation.jacobian is None
+        bounded = (
+            method == LAGGED
+            and not self._robust
+            and "snes_linesearch_type" not in self._options.given
+        )
+        self._bounded = (
+            bounded
+            and kinematics.three_dimensional
+            and equilibrium.state.dilatation.jacobian is None
+        )
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
-        snes.setJacobian(lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()), self._matrix)
+        snes.setJacobian(
+            lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()),
+            self._matrix,
+        )
         snes.setLineSearchPreCheck(self._keep_admissible)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=settings.maximum_iterations)
         self._options.apply(snes)
@@ -230,7 +263,9 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]
         snes.setConvergenceTest(self._converged)
         self._snes: PETSc.SNES = snes
-        self._linear: FullNewton = SOLVER_METHODS[method].make_linear(equilibrium, snes, self._matrix, self._options)
+        self._linear: FullNewton = SOLVER_METHODS[method].make_linear(
+            equilibrium, snes, self._matrix, self._options
+        )
         if self._robust:
             self._linear.disable_reuse()
 
@@ -248,7 +283,9 @@ class GuardedNewton:
     def solve(self, origin: Array | None = None, loose_tolerance: bool = False) -> Solution:
         """Solve from the present unknowns, and set them; `loose_tolerance`: more substeps follow."""
         self.convergence.intermediate = loose_tolerance
-        first = attempted(lambda: self._attempt(origin, self._linear.iteration_factor), SolveFailure)
+        first = attempted(
+            lambda: self._attempt(origin, self._linear.iteration_factor), SolveFailure
+        )
         if isinstance(first, Solution):
             return first
         second = self._linear.fallback()
@@ -266,7 +303,9 @@ class GuardedNewton:
     def is_admissible_start(self, last_extension: float) -> bool:
         """Return whether a solve may start here: admissible, and not too near to locking."""
         extension, least = self.equilibrium.extension(), RESERVE * (1 - last_extension)
-        near = extension.max_chain_extension > NEAR_LIMIT and 1 - extension.max_chain_extension < least
+        near = (
+            extension.max_chain_extension > NEAR_LIMIT and 1 - extension.max_chain_extension < least
+        )
         return extension.admissible and not near
 
     def _attempt(self, origin: Array | None, iteration_factor: int = 1) -> Solution:
@@ -315,7 +354,9 @@ class GuardedNewton:
         equilibrium.assemble_internal(self._residual)
         equilibrium.assemble_external(self._external)
         self._residual.axpy(1.0, self._external)
-        dolfinx.fem.petsc.set_bc(self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0)
+        dolfinx.fem.petsc.set_bc(
+            self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0
+        )
         if not (self._linear.tangents if self._linear.keeps else tangents):
             self._linear.renew()
         solver, direction = self._snes.getKSP(), self._x.duplicate()
@@ -375,7 +416,9 @@ class GuardedNewton:
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
         present = self._present
         if present.is_certain:
-            present.inadmissible = allreduce(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
+            present.inadmissible = (
+                allreduce(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
+            )
         else:
             extension = equilibrium.extension()
             present.inadmissible = not extension.admissible or extension.stop_signal > 0
@@ -414,7 +457,10 @@ class GuardedNewton:
                 break
             step.scale(0.5)
         else:
-            log.debug("line search failed: no step with r < L and J > 0 after %d halvings", LINE_SEARCH_HALVINGS)
+            log.debug(
+                "line search failed: no step with r < L and J > 0 after %d halvings",
+                LINE_SEARCH_HALVINGS,
+            )
         if halving:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
@@ -424,11 +470,15 @@ class GuardedNewton:
         near, equilibrium = after.extension.max_chain_extension > NEAR_LIMIT, self.equilibrium
         if not after.extension.admissible:
             return False
-        if near and not equilibrium.keeps_margin(before.stretches, after.stretches, RESERVE, NEAR_LIMIT):
+        if near and not equilibrium.keeps_margin(
+            before.stretches, after.stretches, RESERVE, NEAR_LIMIT
+        ):
             return False
         return not equilibrium.inverts_between(before, after)
 
-    def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
+    def _converged(
+        self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]
+    ) -> int:
         """Return the SNES reason after an iteration, from `Convergence` and the iteration limit."""
         norm = norms[2]
         if not np.isfinite(norm):

@@ -74,14 +74,19 @@ Columns = dict[str, Array]
 # ---------------------------------------------------------------- what is read: data, checked before any solve
 LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
 DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
-SCALE, SCALE_BOUNDS = "scale.", (1e-3, 1e3)  # what keys of factors on columns begin with, and their bounds
+SCALE, SCALE_BOUNDS = "scale.", (
+    1e-3,
+    1e3,
+)  # what keys of factors on columns begin with, and their bounds
 WIDE = 1e3  # a bound that nobody gives over the start
 FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look `LOGARITHM_CHANGE` to both sides
 
 
 # ---------------------------------------------------------------- the file as it is written
 Positive = Annotated[float, Field(gt=0)]
-_Number = Annotated[Positive | None, Field(json_schema_extra={"allowed": "a finite number greater than 0"})]
+_Number = Annotated[
+    Positive | None, Field(json_schema_extra={"allowed": "a finite number greater than 0"})
+]
 
 
 class Unknown(Table):
@@ -97,9 +102,13 @@ class Unknown(Table):
     def _go_together(self) -> Unknown:
         lower, upper = self.bounds
         if not lower <= self.start <= upper or lower == upper:
-            raise validation_error(f"must lie between lower {lower:g} and upper {upper:g}", "start", self.start)
+            raise validation_error(
+                f"must lie between lower {lower:g} and upper {upper:g}", "start", self.start
+            )
         if (self.prior is None) != (self.prior_sd is None):
-            raise validation_error("prior and prior_sd (of the logarithm) go together", "prior", self.prior)
+            raise validation_error(
+                "prior and prior_sd (of the logarithm) go together", "prior", self.prior
+            )
         return self
 
     @property
@@ -114,16 +123,24 @@ class MeasuredTable(Table):
     file: str
     state: Literal["virgin", "history", "after"] = "virgin"
     time: _Number = None
-    sd: dict[str, Positive] = Field(default={}, json_schema_extra={"allowed": "numbers greater than 0 by column"})
-    scale: dict[str, Literal["unknown"]] = Field(default={}, json_schema_extra={"allowed": "'unknown' by column"})
+    sd: dict[str, Positive] = Field(
+        default={}, json_schema_extra={"allowed": "numbers greater than 0 by column"}
+    )
+    scale: dict[str, Literal["unknown"]] = Field(
+        default={}, json_schema_extra={"allowed": "'unknown' by column"}
+    )
     units: dict[str, str] = Field(default={}, json_schema_extra={"allowed": "units by column"})
-    drive: tuple[str, ...] = Field(default=(), strict=False, json_schema_extra={"allowed": "names of columns of loads"})
+    drive: tuple[str, ...] = Field(
+        default=(), strict=False, json_schema_extra={"allowed": "names of columns of loads"}
+    )
 
     @model_validator(mode="after")
     def _go_together(self) -> MeasuredTable:
         if (self.time is not None) != (self.state == "after"):
             raise validation_error(
-                "goes with state = 'after', and is the time until which the tissue remodels", "time", self.time
+                "goes with state = 'after', and is the time until which the tissue remodels",
+                "time",
+                self.time,
             )
         return self
 
@@ -132,10 +149,13 @@ class DataFile(Table):
     """DATA.toml."""
 
     unknowns: dict[str, Unknown] = Field(
-        min_length=1, json_schema_extra={"allowed": 'a table of keys, as "material.lame_mu" = { start = 10.0 }'}
+        min_length=1,
+        json_schema_extra={"allowed": 'a table of keys, as "material.lame_mu" = { start = 10.0 }'},
     )
     measured: tuple[MeasuredTable, ...] = Field(
-        min_length=1, strict=False, json_schema_extra={"allowed": "tables [[measured]], each with a file"}
+        min_length=1,
+        strict=False,
+        json_schema_extra={"allowed": "tables [[measured]], each with a file"},
     )
 
 
@@ -151,7 +171,9 @@ class Measured:
     loads: tuple[str, ...]
     sd: dict[str, float]
     scaled: tuple[str, ...]
-    units: dict[str, tuple[str, float]]  # of the file where it has others, with their factors to the scene's
+    units: dict[
+        str, tuple[str, float]
+    ]  # of the file where it has others, with their factors to the scene's
 
     @property
     def rows(self) -> int:
@@ -166,7 +188,10 @@ class Measured:
     @property
     def protocols(self) -> list[NDArray[np.int64]]:
         """Rows of each protocol in their order: between two of them the loads fall by more than half."""
-        sizes = [np.abs(self.columns[name]) / (np.abs(self.columns[name]).max() or 1.0) for name in self.loads]
+        sizes = [
+            np.abs(self.columns[name]) / (np.abs(self.columns[name]).max() or 1.0)
+            for name in self.loads
+        ]
         size = np.max([np.zeros(self.rows), *sizes], axis=0)
         return np.split(np.arange(self.rows), np.flatnonzero(np.diff(size) < -0.5) + 1)
 
@@ -175,15 +200,22 @@ def read_measurements(path: Path, scene: Scene) -> tuple[dict[str, Unknown], lis
     """Unknowns by key, with bounds, and tables of DATA.toml, checked against a scene."""
     data = DataFile(**read_toml(path))
     measured = [
-        _measured(table, f"measured[{number}]", path.parent, scene) for number, table in enumerate(data.measured)
+        _measured(table, f"measured[{number}]", path.parent, scene)
+        for number, table in enumerate(data.measured)
     ]
     starts = {key: unknown.start for key, unknown in data.unknowns.items()}
     for key, start in starts.items():
-        scene.with_values({key: start})  # a key that there is not, or that takes no such number, is refused
+        scene.with_values(
+            {key: start}
+        )  # a key that there is not, or that takes no such number, is refused
     scene.with_values(starts)  # and what does not go together
-    unknowns = {key: _bounded(key, unknown, scene, starts) for key, unknown in data.unknowns.items()}
+    unknowns = {
+        key: _bounded(key, unknown, scene, starts) for key, unknown in data.unknowns.items()
+    }
     for name in (name for table in measured for name in table.scaled):
-        unknowns[f"{SCALE}{name}"] = Unknown(start=1.0, lower=SCALE_BOUNDS[0], upper=SCALE_BOUNDS[1])
+        unknowns[f"{SCALE}{name}"] = Unknown(
+            start=1.0, lower=SCALE_BOUNDS[0], upper=SCALE_BOUNDS[1]
+        )
     if len(unknowns) > sum(table.rows * len(table.sd) for table in measured):
         raise SceneError(f"unknowns: {len(unknowns)} unknowns need as many measurements at least")
     return unknowns, measured
@@ -214,13 +246,17 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
             end = float(np.exp(inside))
         ends.append(end)
     if not ends[0] < ends[1]:
-        raise SceneError(f"unknowns.{key}: the scene takes no number beside {unknown.start:g}, so it is not fitted")
+        raise SceneError(
+            f"unknowns.{key}: the scene takes no number beside {unknown.start:g}, so it is not fitted"
+        )
     return unknown.model_copy(update=dict(zip(("lower", "upper"), ends, strict=True)))
 
 
 def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> Measured:
     if table.state == "after" and scene.remodeling.turnover.is_on:
-        raise SceneError(f"{place}.state = 'after': takes cells alone, not what remodeling.turnover has changed")
+        raise SceneError(
+            f"{place}.state = 'after': takes cells alone, not what remodeling.turnover has changed"
+        )
     file = f"{place}.file = {format_value(table.file)}"
     columns = _read_columns(folder / table.file, file, scene)
     loads = _prescribed(columns, table, scene, place)
@@ -228,7 +264,9 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
     for key in ("units", "sd", "scale"):
         for name in getattr(table, key):
             if name not in columns or (name == "time" and key != "units"):
-                raise SceneError(f"{place}.{key}.{name}: no such column is measured; the file has {', '.join(columns)}")
+                raise SceneError(
+                    f"{place}.{key}.{name}: no such column is measured; the file has {', '.join(columns)}"
+                )
     units = {
         name: (unit, _factor(name, unit, scene, f"{place}.units.{name} = {format_value(unit)}"))
         for name, unit in table.units.items()
@@ -237,23 +275,42 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
     for name in columns:
         if (name in loads or name == "time") == (name in table.sd):
             rule = (
-                "is prescribed, not measured" if name in table.sd else "each measured column has a standard deviation"
+                "is prescribed, not measured"
+                if name in table.sd
+                else "each measured column has a standard deviation"
             )
             raise SceneError(f"{place}.sd.{name}: {rule}")
-    return Measured(table.file, table.state, table.time or 0.0, columns, loads, table.sd, tuple(table.scale), units)
+    return Measured(
+        table.file,
+        table.state,
+        table.time or 0.0,
+        columns,
+        loads,
+        table.sd,
+        tuple(table.scale),
+        units,
+    )
 
 
-def _prescribed(columns: Columns, table: MeasuredTable, scene: Scene, place: str) -> tuple[str, ...]:
+def _prescribed(
+    columns: Columns, table: MeasuredTable, scene: Scene, place: str
+) -> tuple[str, ...]:
     """The loads among the columns: those that drive the test; of a force and a strain along one axis the strain."""
     kinds = scene.load_kinds
     for name in table.drive:
         if name not in columns or name not in kinds:
             known = ", ".join(one for one in columns if one in kinds)
-            raise SceneError(f"{place}.drive = {format_value(name)}: allowed are the columns of loads: {known}")
+            raise SceneError(
+                f"{place}.drive = {format_value(name)}: allowed are the columns of loads: {known}"
+            )
     if table.drive:
         return table.drive
-    loads = [name for name in columns if name in scene.loads or (name in kinds and kinds[name].replaces)]
-    return tuple(name for name in loads if kinds[name].dimension is None or kinds[name].replaces not in loads)
+    loads = [
+        name for name in columns if name in scene.loads or (name in kinds and kinds[name].replaces)
+    ]
+    return tuple(
+        name for name in loads if kinds[name].dimension is None or kinds[name].replaces not in loads
+    )
 
 
 def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
@@ -268,7 +325,11 @@ def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
 
 def _read_columns(path: Path, place: str, scene: Scene) -> Columns:
     known = {*dimensions(scene)} - {"seconds", "substeps"}
-    strains = {name.replace("elongation", "stretch"): name for name in scene.load_kinds if "elongation" in name}
+    strains = {
+        name.replace("elongation", "stretch"): name
+        for name in scene.load_kinds
+        if "elongation" in name
+    }
     allowed = sorted({*scene.loads, *known, "time", *strains})
     try:
         columns = read_columns(read_regular(path, LARGEST_TABLE), path.name, allowed)
@@ -277,37 +338,52 @@ def _read_columns(path: Path, place: str, scene: Scene) -> Columns:
     for stretch, strain in strains.items():
         if stretch in columns and strain in columns:
             raise SceneError(f"{place}: has both {stretch} and {strain}")
-    for name in {*columns} & {*strains, *scene.load_kinds}:  # before any solve, which may fail because of them
+    for name in {*columns} & {
+        *strains,
+        *scene.load_kinds,
+    }:  # before any solve, which may fail because of them
         if words := convention_doubt(name, columns[name]):
             log.warning("%s, %s: %s", path.name, name, words)
     return {strains.get(name, name): values - (name in strains) for name, values in columns.items()}
 
 
-def _check_columns(columns: Columns, loads: tuple[str, ...], state: str, place: str, scene: Scene) -> None:
+def _check_columns(
+    columns: Columns, loads: tuple[str, ...], state: str, place: str, scene: Scene
+) -> None:
     if set(columns) <= {*loads, "time"}:
         raise SceneError(f"{place}: has no measured column")
     if state == "history":
         if "time" not in columns:
             raise SceneError(f"{place}: needs a column time with state = 'history'")
         if loads:
-            raise SceneError(f"{place}: {loads[0]}: with state = 'history' the scene's own ramps hold")
-        if scene.time.is_equilibrium or not (0 <= columns["time"].min() <= columns["time"].max() <= scene.last_time):
+            raise SceneError(
+                f"{place}: {loads[0]}: with state = 'history' the scene's own ramps hold"
+            )
+        if scene.time.is_equilibrium or not (
+            0 <= columns["time"].min() <= columns["time"].max() <= scene.last_time
+        ):
             raise SceneError(f"{place}: column time: must lie between 0 and the scene's time.end")
     elif not loads:
-        raise SceneError(f"{place}: needs a column of a load with state = {state!r}: {', '.join(scene.loads)}")
+        raise SceneError(
+            f"{place}: needs a column of a load with state = {state!r}: {', '.join(scene.loads)}"
+        )
 
 
 WALL = ("wall_thickness", "inner_radius")
 
 
-def data_warnings(tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene) -> Iterator[str]:
+def data_warnings(
+    tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene
+) -> Iterator[str]:
     """Lines on measured columns that may be in another convention, beside the model at the start."""
     units = dimensions(scene)
     for table, model in zip(tables, modelled, strict=True):
         pairs = {f"{name} ({units[name]})": (table.columns[name], model[name]) for name in table.sd}
         pairs = {name: pair for name, pair in pairs.items() if name.split()[0] not in table.scaled}
         if {*WALL} <= {*table.sd}:
-            thickness, radius = ([columns[name] for columns in (table.columns, model)] for name in WALL)
+            thickness, radius = (
+                [columns[name] for columns in (table.columns, model)] for name in WALL
+            )
             pairs[" / ".join(WALL)] = (thickness[0] / radius[0], thickness[1] / radius[1])
         for name, pair in pairs.items():
             if words := convention_doubt(name, *pair):
@@ -316,7 +392,10 @@ def data_warnings(tables: Sequence[Measured], modelled: Sequence[Columns], scene
 
 # ---------------------------------------------------------------- what a scene says where a table has measurements
 # keys whose numbers a simulation takes that is built already (`reset_simulation`)
-TISSUE, OTHERS = r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))", r"loads\.\w+\.value|natural\.\w+"
+TISSUE, OTHERS = (
+    r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))",
+    r"loads\.\w+\.value|natural\.\w+",
+)
 CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
 # what differences of runs divide by a small change is rounding alone
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
@@ -342,15 +421,24 @@ def model_of(
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
     """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
-    replaced = {scene.load_kinds[name].replaces for name in table.loads}  # cannot be beside those of the table
+    replaced = {
+        scene.load_kinds[name].replaces for name in table.loads
+    }  # cannot be beside those of the table
     loads = {}
-    for name in [name for name in dict.fromkeys((*scene.loads, *table.loads)) if name not in replaced]:
+    for name in [
+        name for name in dict.fromkeys((*scene.loads, *table.loads)) if name not in replaced
+    ]:
         if name in table.loads:
             values = scales.get(name, 1.0) * table.columns[name]
         else:
-            values = np.full(table.rows, scene.loads[name].value * scene.loads[name].factor(scene.last_time))
+            values = np.full(
+                table.rows, scene.loads[name].value * scene.loads[name].factor(scene.last_time)
+            )
         largest = float(values[np.abs(values).argmax()]) or 1.0
-        ramp = ((0.0, 0.0), *((number + 1.0, float(value / largest)) for number, value in enumerate(values)))
+        ramp = (
+            (0.0, 0.0),
+            *((number + 1.0, float(value / largest)) for number, value in enumerate(values)),
+        )
         loads[name] = Load(value=largest, ramp=ramp)
     changes = PASSIVE | {"time.step": 1.0, "time.end": float(table.rows)}
     return scene.model_copy(update={"loads": loads}).with_values(changes)
@@ -370,21 +458,32 @@ class SimulationCache(dict[object, tuple[Simulation, Snapshot]]):
         """At t = 0."""
         use = id(table), has_own_cells, scene.model.kinematics, scene.mesh.formulation
         if use in self:
-            if all(re.fullmatch(CAN_BE_SET, key) for key in self.keys_of_scene) and reset_simulation(*self[use], scene):
+            if all(
+                re.fullmatch(CAN_BE_SET, key) for key in self.keys_of_scene
+            ) and reset_simulation(*self[use], scene):
                 return self[use][0]
             self.pop(use)[0].close()
         made = Simulation(scene, MPI.COMM_SELF)
         made.watchers = [one for one in made.watchers if not isinstance(one, WarnsOnce)]
-        made.observer.columns = tuple(one for one in made.observer.columns if one.name in ("time", *table.sd))
+        made.observer.columns = tuple(
+            one for one in made.observer.columns if one.name in ("time", *table.sd)
+        )
         self[use] = made, made.state.snapshot()
         return made
 
 
 def _run(
-    scene: Scene, table: Measured, kept: SimulationCache | None = None, start: tuple[Array, Array] | None = None
+    scene: Scene,
+    table: Measured,
+    kept: SimulationCache | None = None,
+    start: tuple[Array, Array] | None = None,
 ) -> tuple[Columns, tuple[Array, Array]]:
     """Columns and `time` of all steps; dimensions and axes of the cells at the end."""
-    simulation = Simulation(scene, MPI.COMM_SELF) if kept is None else kept.simulation(scene, table, start is None)
+    simulation = (
+        Simulation(scene, MPI.COMM_SELF)
+        if kept is None
+        else kept.simulation(scene, table, start is None)
+    )
     cells = simulation.cells
     try:
         if start is not None:
@@ -424,28 +523,26 @@ def _line(point: Point, residuals: Array) -> str:
 def fingerprint(problem: Problem) -> str:
     """SHA-256 of all that a fit depends on but its starts."""
     parts = [__version__, PRECISE, problem.scene.to_toml(), problem.unknowns, problem.tables]
-    text = json.dumps(parts, default=lambda part: part.tolist() if isinstance(part, np.ndarray) else vars(part))
+    text = json.dumps(
+        parts, default=lambda part: part.tolist() if isinstance(part, np.ndarray) else vars(part)
+    )
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 # ---------------------------------------------------------------- least squares
-LOGARITHM_CHANGE = 1e-4  # of a logarithm: central differences err by 1e-8, those to one side by 1e-4
-SINGULAR_TOLERANCE = (
-    1e-7  # smallest singular value over the largest, below which the data say nothing: what differences err by
+LOGARITHM_CHANGE = (
+    1e-4  # of a logarithm: central differences err by 1e-8, those to one side by 1e-4
 )
+SINGULAR_TOLERANCE = 1e-7  # smallest singular value over the largest, below which the data say nothing: what differences err by
 NAMED = 0.1  # share of a blind direction from which on an unknown is named
 FAILED_RUN_RESIDUAL = 1e3  # standard deviations, of all rows of a state that has no equilibrium
 START_SPREAD = np.log(2.0)  # of further starts, to both sides
 SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
-FIT_TOLERANCE = (
-    1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
-)
+FIT_TOLERANCE = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
 TELLING = 0.5  # of a change of the residuals: where a Jacobian misses more, the next is made by differences
 CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
 PROFILE_STEPS = (-4, -2.5, -1.5, 0, 1.5, 2.5, 4)  # standard deviations of the straight line
-PROFILE_TOLERANCE = (
-    1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
-)
+PROFILE_TOLERANCE = 1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
 LIMITED_BY_MODEL = 1.5  # standard deviations that a model is off: the noise of ten rows alone is below 1.35 at 95 %
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
@@ -465,15 +562,23 @@ class Problem:
         self.journal = folder / JOURNAL
         check_no_link(self.journal)
         head = json.dumps({"fit": mark}) + "\n"
-        self.journal.write_text(head + "".join(_line(*one) for one in self.known.items()), encoding="utf-8")
+        self.journal.write_text(
+            head + "".join(_line(*one) for one in self.known.items()), encoding="utf-8"
+        )
 
     def scene_of(self, logarithms: Array) -> Scene:
         """The scene with these numbers."""
-        return self.scene.with_values({key: n for key, n in self._numbers(logarithms) if not key.startswith(SCALE)})
+        return self.scene.with_values(
+            {key: n for key, n in self._numbers(logarithms) if not key.startswith(SCALE)}
+        )
 
     def scales_of(self, logarithms: Array) -> dict[str, float]:
         """Factors on columns, by name."""
-        return {key.removeprefix(SCALE): n for key, n in self._numbers(logarithms) if key.startswith(SCALE)}
+        return {
+            key.removeprefix(SCALE): n
+            for key, n in self._numbers(logarithms)
+            if key.startswith(SCALE)
+        }
 
     def _numbers(self, logarithms: Array) -> zip[tuple[str, float]]:
         return zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
@@ -496,12 +601,18 @@ class Problem:
 
     def _evaluated(self, x: Array) -> Array:
         scales, models = self.scales_of(x), list[Columns]()
-        with suppress(StepFailure, SceneError):  # numbers that do not go together have no equilibrium either
+        with suppress(
+            StepFailure, SceneError
+        ):  # numbers that do not go together have no equilibrium either
             models = self.predictions(x, self.kept)
         parts: list[ArrayLike] = []
         for table, model in zip_longest(self.tables, models):
             for name, sd in table.sd.items():
-                off = model[name] - scales.get(name, 1.0) * table.columns[name] if model else FAILED_RUN_RESIDUAL * sd
+                off = (
+                    model[name] - scales.get(name, 1.0) * table.columns[name]
+                    if model
+                    else FAILED_RUN_RESIDUAL * sd
+                )
                 parts.append(np.full(table.rows, off / sd))
         for unknown, value in zip(self.unknowns.values(), x, strict=True):
             if unknown.prior is not None:
@@ -514,8 +625,12 @@ class Problem:
         for k, way in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
             ahead, behind = (np.clip(logarithms + side * way, *self.bounds.T) for side in (1, -1))
             if not central:
-                behind, ahead = (logarithms, ahead) if ahead[k] > logarithms[k] else (behind, logarithms)
-            columns.append((self.residuals(ahead) - self.residuals(behind)) / (ahead[k] - behind[k]))
+                behind, ahead = (
+                    (logarithms, ahead) if ahead[k] > logarithms[k] else (behind, logarithms)
+                )
+            columns.append(
+                (self.residuals(ahead) - self.residuals(behind)) / (ahead[k] - behind[k])
+            )
         return np.transpose(columns)
 
     def check_identifiable(self, jacobian: Array) -> None:
@@ -524,10 +639,14 @@ class Problem:
         if singular[-1] > SINGULAR_TOLERANCE * singular[0]:
             return
         blind = directions[-1] * np.sign(directions[-1][np.abs(directions[-1]).argmax()])
-        pairs = [(key, part) for key, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED]
+        pairs = [
+            (key, part) for key, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED
+        ]
         named = [f"{key} ({part:+.2f})" for key, part in pairs]
         if len(named) == 1:
-            raise SceneError(f"unknowns: {pairs[0][0]} changes nothing that is measured; fix it or give it a prior")
+            raise SceneError(
+                f"unknowns: {pairs[0][0]} changes nothing that is measured; fix it or give it a prior"
+            )
         raise SceneError(
             f"unknowns: the data cannot tell apart {', '.join(named)}: changed together by these powers of a factor "
             f"they give the same measurements; fix one of them or give it a prior"
@@ -574,9 +693,14 @@ class Part(Run):
 class _FitStudy(Study):
     """Parts of a fit, side by side."""
 
-    def answers(self, problem: Problem, place: Path, tasks: Mapping[str, Task]) -> list[OptimizeResult]:
+    def answers(
+        self, problem: Problem, place: Path, tasks: Mapping[str, Task]
+    ) -> list[OptimizeResult]:
         """What the tasks make of the problem, which then knows what was evaluated for them."""
-        parts = [Part(name, self.scene, self.folder / name, (problem, task)) for name, task in tasks.items()]
+        parts = [
+            Part(name, self.scene, self.folder / name, (problem, task))
+            for name, task in tasks.items()
+        ]
         self.runs = [*parts]
         self.run_all()
         problem.known |= read_journal(place)[1]
@@ -616,14 +740,26 @@ def fit(
         for words in (*describe_choice(scene), scene.describe_formulation()):
             log.info("%s", words)
         first, jacobian = _begun(problem)
-    with RunLock(place), open_log(place / "fit.log", quiet=quiet, held=held), TemporaryDirectory() as parts:
+    with (
+        RunLock(place),
+        open_log(place / "fit.log", quiet=quiet, held=held),
+        TemporaryDirectory() as parts,
+    ):
         problem.begin(place, mark)
         random = np.random.default_rng(1)
-        points = [first, *(first + random.uniform(-START_SPREAD, START_SPREAD, len(first)) for _ in range(starts - 1))]
+        points = [
+            first,
+            *(
+                first + random.uniform(-START_SPREAD, START_SPREAD, len(first))
+                for _ in range(starts - 1)
+            ),
+        ]
         rough = partial(minimised, near=(first, jacobian), enough=PROFILE_TOLERANCE)
         with closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)) as study:
             on_cores = partial(study.answers, problem, place)
-            found = on_cores({f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)})
+            found = on_cores(
+                {f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)}
+            )
             best = int(np.argmin([one.cost for one in found]))
             again = partial(minimised, start=found[best].x)
             (found[best],) = on_cores({f"from the end of start {best + 1}": again})
@@ -632,7 +768,9 @@ def fit(
             if profiles:
                 result = with_profiles(problem, result, on_cores)
         log.info("%s", result.verdict())
-        write_whole(place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode())
+        write_whole(
+            place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode()
+        )
         result.write(place)
     return place, result
 
@@ -645,7 +783,9 @@ def _begun(problem: Problem) -> tuple[Array, Array]:
     try:
         at_start = problem.predictions(first)
     except StepFailure as failure:
-        raise InfeasibleStart(f"at the start of the fit {failure}. {failure.refusal}; choose other starts") from failure
+        raise InfeasibleStart(
+            f"at the start of the fit {failure}. {failure.refusal}; choose other starts"
+        ) from failure
     for doubt in data_warnings(problem.tables, at_start, problem.scene):
         log.warning("%s", doubt)
     jacobian = problem.jacobian(first, central=True)
@@ -660,7 +800,9 @@ def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, dict[
     if present == mark:
         return wanted, known
     if present is not None and folder is not None:
-        raise SceneError(f"folder {wanted}: holds a fit of another scene, data or version; choose another folder")
+        raise SceneError(
+            f"folder {wanted}: holds a fit of another scene, data or version; choose another folder"
+        )
     return chosen_folder(folder, name, MPI.COMM_SELF), {}
 
 
@@ -697,7 +839,13 @@ def minimised(
 
     inside = np.clip(start[free], bounds[0] + 1e-6, bounds[1] - 1e-6)
     return least_squares(
-        lambda x: problem.residuals(whole(x)), inside, jacobian, bounds, x_scale="jac", xtol=enough, ftol=enough
+        lambda x: problem.residuals(whole(x)),
+        inside,
+        jacobian,
+        bounds,
+        x_scale="jac",
+        xtol=enough,
+        ftol=enough,
     )
 
 
@@ -707,18 +855,27 @@ def result_of(problem: Problem, found: Sequence[OptimizeResult]) -> Fit:
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_identifiable(jacobian)
     misfit = float(np.sqrt(np.mean(problem.residuals(logarithms) ** 2)))
-    covariance, minima = np.asarray(np.linalg.inv(jacobian.T @ jacobian)), [2 * float(one.cost) for one in found]
+    covariance, minima = np.asarray(np.linalg.inv(jacobian.T @ jacobian)), [
+        2 * float(one.cost) for one in found
+    ]
     scene, models = problem.scene_of(logarithms), problem.predictions(logarithms)
     return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
 
 
-def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Task]], list[OptimizeResult]]) -> Fit:
+def with_profiles(
+    problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Task]], list[OptimizeResult]]
+) -> Fit:
     """The fit with profiles of what goes together: the others are fitted again at each value."""
     best, ends = found.logarithms, problem.bounds.T
-    least, near = float(np.sum(problem.residuals(best) ** 2)), (best, problem.jacobian(best, central=True))
+    least, near = float(np.sum(problem.residuals(best) ** 2)), (
+        best,
+        problem.jacobian(best, central=True),
+    )
     chosen = np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1)
     ways = found.inflation * found.covariance[chosen] / found.deviations[chosen, None]
-    points = np.clip(best + np.multiply.outer(PROFILE_STEPS, ways), *ends)  # (steps, chosen, unknowns)
+    points = np.clip(
+        best + np.multiply.outer(PROFILE_STEPS, ways), *ends
+    )  # (steps, chosen, unknowns)
     tasks = {
         f"profile of {found.keys[held]} at {steps:+g}": partial(
             minimised, start=x, held=int(held), near=near, enough=PROFILE_TOLERANCE
@@ -728,11 +885,17 @@ def with_profiles(problem: Problem, found: Fit, on_cores: Callable[[Mapping[str,
     }
     costs = np.reshape([one.cost for one in on_cores(tasks)], points.shape[:2])
     profiles = {}
-    for held, values, cost in zip(chosen, points.T[chosen, range(len(chosen))], costs.T, strict=True):
+    for held, values, cost in zip(
+        chosen, points.T[chosen, range(len(chosen))], costs.T, strict=True
+    ):
         # the root of the increase is nearly a straight line; where it is that of the band; NaN beyond all points
-        roots = np.sign(PROFILE_STEPS) * np.sqrt(np.maximum(2 * cost - least, 0.0)) / found.inflation
+        roots = (
+            np.sign(PROFILE_STEPS) * np.sqrt(np.maximum(2 * cost - least, 0.0)) / found.inflation
+        )
         beyond = [value if value in ends[:, held] else np.nan for value in values[[0, -1]]]
-        profiles[found.keys[held]] = np.exp(np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond))
+        profiles[found.keys[held]] = np.exp(
+            np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond)
+        )
     return replace(found, profiles=profiles)
 
 
@@ -782,12 +945,17 @@ class Fit(StudyResult):
     def band(self) -> Array:
         """Ends of the logarithms, (2, n), not beyond the bounds."""
         half = NORMAL_95 * self.inflation * self.deviations
-        return np.clip([self.logarithms - half, self.logarithms + half], *self.problem.bounds.T[:, None])
+        return np.clip(
+            [self.logarithms - half, self.logarithms + half], *self.problem.bounds.T[:, None]
+        )
 
     @property
     def open(self) -> list[str]:
         """Which ends of each band are bounds: nothing, lower, upper or both."""
-        return [("", "lower", "upper", "both")[low + 2 * high] for low, high in self.band.T == self.problem.bounds]
+        return [
+            ("", "lower", "upper", "both")[low + 2 * high]
+            for low, high in self.band.T == self.problem.bounds
+        ]
 
     @property
     def limited_by(self) -> str:
@@ -817,7 +985,9 @@ class Fit(StudyResult):
         text = f"The model is off by {self.misfit:.2g} standard deviations (root mean square); "
         text += f"{same} of {len(self.minima)} starts end in this minimum."
         if self.limited_by == "model":
-            text += f" Bands are {self.misfit:.2g} times those of the noise, for the model limits them."
+            text += (
+                f" Bands are {self.misfit:.2g} times those of the noise, for the model limits them."
+            )
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:
@@ -842,13 +1012,25 @@ class Fit(StudyResult):
         (figure, grid), scales = panels(len(shown), 2.6), self.problem.scales_of(self.logarithms)
         for axes, (table, model, name, rows, which) in zip(grid, shown, strict=True):
             over = table.over(name)
-            (unit_of_x, per_x), (unit, per) = (table.units.get(one, ("", 1.0)) for one in (over, name))
+            (unit_of_x, per_x), (unit, per) = (
+                table.units.get(one, ("", 1.0)) for one in (over, name)
+            )
             x, y = (scales.get(one, 1.0) * table.columns[one][rows] for one in (over, name))
-            axes.errorbar(x / per_x, y / per, table.sd[name] / per, fmt="o", color=COLOURS[0], label="measured")
+            axes.errorbar(
+                x / per_x,
+                y / per,
+                table.sd[name] / per,
+                fmt="o",
+                color=COLOURS[0],
+                label="measured",
+            )
             axes.plot(x / per_x, model[rows] / per, color=COLOURS[1], label="fitted model")
             axes.set_title(
-                f"{Path(table.name).name} ({table.state}){which if len(table.protocols) > 1 else ''}", fontsize=8
+                f"{Path(table.name).name} ({table.state}){which if len(table.protocols) > 1 else ''}",
+                fontsize=8,
             )
-            axes.set(xlabel=label(self.scene, over, unit_of_x), ylabel=label(self.scene, name, unit))
+            axes.set(
+                xlabel=label(self.scene, over, unit_of_x), ylabel=label(self.scene, name, unit)
+            )
             axes.legend(fontsize=7)
         return figure

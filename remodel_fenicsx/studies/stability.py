@@ -41,7 +41,9 @@ def pass_factor(stepper: Stepper, step: Step) -> float:
     """
     state, remodeling, coupling = stepper.state, stepper.remodeling, stepper.coupling
     quadrature, cells = state.cells.quadrature, state.cells.point_cells.copy()
-    tensor, newton = structure_tensor(*cells[:2]), getattr(coupling, "newton")  # noqa: B009 - couplings of others
+    tensor, newton = structure_tensor(*cells[:2]), getattr(
+        coupling, "newton"
+    )  # noqa: B009 - couplings of others
 
     def passed() -> Array:
         asked, _ = remodeling.updated_cells(state.time, step.time, step.work.residual)
@@ -63,7 +65,13 @@ def pass_factor(stepper: Stepper, step: Step) -> float:
             state.cells.set(np.sqrt(np.maximum(squared, 0.0)), axes)
             newton.solve()
             before, change = change, passed() - undisturbed
-            factors.append(float(np.copysign((dot(change, change) / dot(before, before)) ** 0.5, dot(before, change))))
+            factors.append(
+                float(
+                    np.copysign(
+                        (dot(change, change) / dot(before, before)) ** 0.5, dot(before, change)
+                    )
+                )
+            )
             if len(factors) > 1 and abs(factors[-1] - factors[-2]) < SETTLED * abs(factors[-1]):
                 return factors[-1]
     return float(np.copysign(np.exp(np.mean(np.log(np.abs(factors[-AVERAGED:])))), factors[-1]))
@@ -83,7 +91,9 @@ class FactorWatcher(Watcher):
         try:
             self.factors[step.time] = pass_factor(self.stepper, step)
         except SolveFailure as failure:
-            log.warning("time %g: the factor of the pass is not known: %s", step.time, failure.reason)
+            log.warning(
+                "time %g: the factor of the pass is not known: %s", step.time, failure.reason
+            )
             self.factors[step.time] = np.nan
 
     def undone(self, step: Step) -> None:
@@ -100,11 +110,15 @@ def stability(
 ) -> tuple[Path, Analysis]:
     """Run a scene and compute the factor of its passes at some times."""
     if not LAWS[scene.remodeling.law].remodels:
-        raise SceneError(f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse")
+        raise SceneError(
+            f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse"
+        )
     if scene.cases[1:]:
         raise SceneError("cases: the analysis takes one load case; leave out [[cases]]")
     if scene.time.is_adaptive:
-        raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; leave it out")
+        raise SceneError(
+            f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; leave it out"
+        )
     place = chosen_folder(folder, f"{scene.name}-stability", comm)
     steps, made = scene.time.number_of_steps, list[FactorWatcher]()
     chosen = {round(steps * (index + 1) / number) for index in range(number)}
@@ -115,10 +129,19 @@ def stability(
 
     def answer() -> Analysis:
         stepper = made[0].stepper
-        return Analysis(scene, made[0].factors, stepper.state.kinematics.name, stepper.remodeling.relaxation)
+        return Analysis(
+            scene, made[0].factors, stepper.state.kinematics.name, stepper.remodeling.relaxation
+        )
 
     try:
-        run(scene.with_values({"output.fields": False}), place, comm, quiet, report=False, watchers=[watcher])
+        run(
+            scene.with_values({"output.fields": False}),
+            place,
+            comm,
+            quiet,
+            report=False,
+            watchers=[watcher],
+        )
     finally:
         if comm.rank == 0 and made and made[0].factors:  # of a run that ends early too
             answer().write(place)
@@ -159,7 +182,9 @@ class Analysis(StudyResult):
                 f"Unstable: at {grows.sum()} of {number} times a pass makes small changes of the cells larger, first "
                 f"at {times[grows][0]:g}; the worst by a factor of {factors[worst]:.5g}, at time {times[worst]:g}."
             )
-            if (lowest := np.nanmin(factors)) < -GROWS:  # of a smaller share it is 1 - (1 - factor) smaller / share
+            if (
+                lowest := np.nanmin(factors)
+            ) < -GROWS:  # of a smaller share it is 1 - (1 - factor) smaller / share
                 damping = 2 * self.share / (1 - lowest)
                 text += f" The coupling 'relaxed' with a relaxation_factor below {damping:.2g} damps what swings."
         elif missing := np.isnan(factors).sum():

@@ -46,7 +46,12 @@ from remodel_fenicsx.scene.scene import SceneError
 from remodel_fenicsx.initial import resolve_auto_settings
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.children import Worker, cores, wait_for_one
-from remodel_fenicsx.system.files import check_no_link, make_own_folder, refusal_in_words, write_whole
+from remodel_fenicsx.system.files import (
+    check_no_link,
+    make_own_folder,
+    refusal_in_words,
+    write_whole,
+)
 from remodel_fenicsx.system.interrupts import Interrupted, PAUSE, StopRequest
 from remodel_fenicsx.system.terminal import Line
 from remodel_fenicsx.unloading import as_unloaded
@@ -57,7 +62,9 @@ from remodel_fenicsx.unloading import as_unloaded
 MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
 DOTS_PER_INCH = 200
 COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
-STYLE = matplotlib.rc_params_from_file(Path(__file__).with_name("figures.mplstyle"), use_default_template=False)
+STYLE = matplotlib.rc_params_from_file(
+    Path(__file__).with_name("figures.mplstyle"), use_default_template=False
+)
 
 
 class Page:
@@ -74,7 +81,9 @@ class Page:
         figure.savefig(drawn, format="png", dpi=DOTS_PER_INCH, facecolor="white", metadata=about)
         self._write(f"{self.name}.png", drawn.getvalue())
 
-    def save_table(self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = "") -> None:
+    def save_table(
+        self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = ""
+    ) -> None:
         """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
         names, values = list(columns), [np.asarray(column) for column in columns.values()]
         text, file = io.StringIO(), f"{self.name}-{part}.csv" if part else f"{self.name}.csv"
@@ -83,8 +92,13 @@ class Page:
         for row in zip(*values, strict=True):
             writer.writerow([_cell(value) for value in row])
         _check_ours(self.folder / file, self.name)
-        said = {"made by": f"{MARK} {__version__}", "notes": read_notes(self.folder, self.name) | {file: list(notes)}}
-        self._write(f"{self.name}.json", (json.dumps(said, indent=1, ensure_ascii=False) + "\n").encode())
+        said = {
+            "made by": f"{MARK} {__version__}",
+            "notes": read_notes(self.folder, self.name) | {file: list(notes)},
+        }
+        self._write(
+            f"{self.name}.json", (json.dumps(said, indent=1, ensure_ascii=False) + "\n").encode()
+        )
         self._write(file, text.getvalue().encode())
 
     def _write(self, name: str, content: bytes) -> None:
@@ -117,7 +131,11 @@ class StudyResult(ABC):
 
     def lines(self) -> list[str]:
         """The table for a terminal."""
-        return aligned({name: cells for name, cells in self.table().items() if name not in self.only_in_file}, 8, 5)
+        return aligned(
+            {name: cells for name, cells in self.table().items() if name not in self.only_in_file},
+            8,
+            5,
+        )
 
     @abstractmethod
     def verdict(self) -> str:
@@ -145,7 +163,10 @@ def aligned(table: Mapping[str, ArrayLike | Sequence[str]], least: int, digits: 
     """Columns under their names, each `least` wide or more: numbers to the right, text to the left."""
     columns = []
     for name, values in table.items():
-        cells = [value if isinstance(value, str) else f"{value:.{digits}g}" for value in np.asarray(values).tolist()]
+        cells = [
+            value if isinstance(value, str) else f"{value:.{digits}g}"
+            for value in np.asarray(values).tolist()
+        ]
         side = "<" if np.asarray(values).dtype.kind == "U" else ">"
         width = max(least, *map(len, (name, *cells)))
         if not {*cells} <= {"", "nan"}:
@@ -182,7 +203,9 @@ def dimensions(scene: Scene) -> dict[str, str]:
 
 
 HEAD_LETTER, HEAD_LINE = 0.0585, 0.155  # inches: mean letter and line of a head
-TICK_LABEL = 0.14  # half of one at the end of an axis: which labels there are is settled after the layout
+TICK_LABEL = (
+    0.14  # half of one at the end of an axis: which labels there are is settled after the layout
+)
 
 
 def add_head(figure: Figure, title: str, verdict: str) -> None:
@@ -229,8 +252,12 @@ FEWEST_RUNS = 2  # runs, or settings, without which nothing is compared
 class TooFewRuns(RemodelError):  # noqa: N818 - what is recorded is whole, and the same call goes on
     """Fewer than `FEWEST_RUNS` have reached the end, so that there is no answer yet."""
 
-    def __init__(self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"):
-        super().__init__(f"{reached}, at least {FEWEST_RUNS} are needed; all that is recorded is kept, {advice}")
+    def __init__(
+        self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"
+    ):
+        super().__init__(
+            f"{reached}, at least {FEWEST_RUNS} are needed; all that is recorded is kept, {advice}"
+        )
         self.failed, self.exit_code = dict(failed), SOLVE_FAILED if failed else PAUSED
 
 
@@ -252,7 +279,9 @@ class Run:
             return False
         recording = RecordedRun(self.folder)
         if not _same(recording, self.scene):
-            raise SceneError(f"{self.folder}: holds a run of another scene; choose another folder with -o")
+            raise SceneError(
+                f"{self.folder}: holds a run of another scene; choose another folder with -o"
+            )
         try:
             history = recording.history
         except RecordingError:  # a last row that is not whole is done again
@@ -260,8 +289,13 @@ class Run:
         times = history["time"]
         if not len(times) or not math.isclose(float(times[-1]), self.scene.last_time):
             return False
-        if not {column.name for column in self.scene.columns()} <= set(history) or (np.diff(times) <= 0).any():
-            raise RecordingError(f"{self.folder}: its history has other columns or rows than its scene asks for")
+        if (
+            not {column.name for column in self.scene.columns()} <= set(history)
+            or (np.diff(times) <= 0).any()
+        ):
+            raise RecordingError(
+                f"{self.folder}: its history has other columns or rows than its scene asks for"
+            )
         return True
 
     def history(self) -> HistoryColumns:
@@ -386,7 +420,9 @@ class Study:
             if code is None:
                 continue
             del self._running[worker]
-            if code != 0 and not (pausing and code in (PAUSED, -PAUSE)):  # the latter before Python minds the signal
+            if code != 0 and not (
+                pausing and code in (PAUSED, -PAUSE)
+            ):  # the latter before Python minds the signal
                 self.failed[run.name] = worker.last_output()
             if worker.is_alive:
                 self._idle.append(worker)

@@ -49,12 +49,19 @@ def grid(axes: Mapping[str, Sequence[Number]]) -> list[dict[str, Number]]:
     return [dict(zip(axes, numbers, strict=True)) for numbers in product(*axes.values())]
 
 
-def latin_hypercube(ranges: Mapping[str, Sequence[Number]], samples: int, seed: int = 1) -> list[dict[str, Number]]:
+def latin_hypercube(
+    ranges: Mapping[str, Sequence[Number]], samples: int, seed: int = 1
+) -> list[dict[str, Number]]:
     """Points of which each `samples`-th part of each range has one, at a random place in it (McKay et al. 1979)."""
     random = np.random.default_rng(seed)
-    shares = {key: (random.permutation(samples) + random.random(samples)) / samples for key in ranges}
+    shares = {
+        key: (random.permutation(samples) + random.random(samples)) / samples for key in ranges
+    }
     return [
-        {key: float(f"{low + (high - low) * shares[key][number]:.6g}") for key, (low, high) in ranges.items()}
+        {
+            key: float(f"{low + (high - low) * shares[key][number]:.6g}")
+            for key, (low, high) in ranges.items()
+        }
         for number in range(samples)
     ]
 
@@ -80,7 +87,9 @@ def _axis(text: str, is_range: bool) -> tuple[str, list[Number]]:
     if is_range:
         fits = has_ends and len(numbers) == 2 and numbers[0] < numbers[1]
     elif has_ends:
-        fits = len(numbers) == 3 and numbers[0] != numbers[1] and numbers[2] in range(2, MOST_RUNS + 1)
+        fits = (
+            len(numbers) == 3 and numbers[0] != numbers[1] and numbers[2] in range(2, MOST_RUNS + 1)
+        )
     else:
         fits = len(numbers) > 0
     if not fits or not re.fullmatch(r"[\w-]+(\.[\w-]+)+", key):
@@ -125,21 +134,32 @@ class Sweep(StudyResult):
     def values(self) -> dict[str, Array]:
         """Numbers of the runs by key."""
         points = list(self.points.values())
-        return {key: np.array([point[key] for point in points], dtype=np.float64) for key in points[0]}
+        return {
+            key: np.array([point[key] for point in points], dtype=np.float64) for key in points[0]
+        }
 
     @cached_property
     def ends(self) -> dict[str, Array]:
         """Last rows of the runs by column; NaN where a run has failed."""
         names = next(iter(self.histories.values()))
-        ends = [[self.histories[run][n][-1] if run in self.histories else np.nan for n in names] for run in self.points]
+        ends = [
+            [self.histories[run][n][-1] if run in self.histories else np.nan for n in names]
+            for run in self.points
+        ]
         return dict(zip(names, np.transpose(ends), strict=True))
 
     @cached_property
     def shown(self) -> list[str]:
         """Columns that differ between the runs at the end, the shape's own first."""
         own = [column.name for column in self.scene.geometry.columns]
-        spread = {name: np.nanmax(v) - np.nanmin(v) for name, v in self.ends.items() if np.isfinite(v).any()}
-        varying = [name for name, width in spread.items() if width > 0 and name not in OF_THE_SOLVER]
+        spread = {
+            name: np.nanmax(v) - np.nanmin(v)
+            for name, v in self.ends.items()
+            if np.isfinite(v).any()
+        }
+        varying = [
+            name for name, width in spread.items() if width > 0 and name not in OF_THE_SOLVER
+        ]
         return sorted(varying, key=lambda name: own.index(name) if name in own else len(own))
 
     def table(self) -> dict[str, Array]:
@@ -148,14 +168,19 @@ class Sweep(StudyResult):
 
     def lines(self) -> list[str]:
         """A row for each run."""
-        return aligned(self.values | {name: self.ends[name] for name in self.shown[:PANEL_COLUMNS]}, 12, 6)
+        return aligned(
+            self.values | {name: self.ends[name] for name in self.shown[:PANEL_COLUMNS]}, 12, 6
+        )
 
     def verdict(self) -> str:
         """Between which ends the columns lie, and where."""
         parts = []
         for name in self.shown[:2]:
             ends = self.ends[name]
-            least, most = (f"{ends[run]:.4g} ({self._at(run)})" for run in (np.nanargmin(ends), np.nanargmax(ends)))
+            least, most = (
+                f"{ends[run]:.4g} ({self._at(run)})"
+                for run in (np.nanargmin(ends), np.nanargmax(ends))
+            )
             parts.append(f"{name} from {least} to {most}")
         if not parts:
             return "No column of the last row differs between the runs."
@@ -168,7 +193,9 @@ class Sweep(StudyResult):
         """Columns over keys."""
         keys, columns = list(self.values)[:PANEL_KEYS], self.shown[:PANEL_COLUMNS]
         figure = Figure(figsize=(7.2, 2.2 * max(1, len(columns)) + 0.4), layout="constrained")
-        grid = figure.subplots(max(1, len(columns)), len(keys), squeeze=False, sharey="row", sharex="col")
+        grid = figure.subplots(
+            max(1, len(columns)), len(keys), squeeze=False, sharey="row", sharex="col"
+        )
         for (row, name), (column, key) in product(enumerate(columns), enumerate(keys)):
             axes, order = grid[row, column], np.argsort(self.values[key])
             look = "o-" if len(self.values) == 1 else "o"
@@ -189,7 +216,9 @@ def sweep(
     """Run a scene with other numbers; of points that were drawn those that are no scenes have failed."""
     if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
         raise SceneError(f"sweep: {len(points)} runs; allowed are {FEWEST_RUNS} to {MOST_RUNS}")
-    named = {"_".join(f"{key}-{value:.10g}" for key, value in point.items()): point for point in points}
+    named = {
+        "_".join(f"{key}-{value:.10g}" for key, value in point.items()): point for point in points
+    }
     scenes, refused = {}, {}
     for name, point in named.items():
         try:
@@ -250,14 +279,27 @@ class Ensemble(Sweep):
     def statistics(self) -> dict[str, dict[str, Array]]:
         """Of each column over the seeds, at each time."""
         runs = [*self.histories.values()]
-        columns = {name: np.array([run[name] for run in runs]) for name in runs[0] if name not in OF_THE_SOLVER}
-        kinds: dict[str, Any] = {"mean": np.mean, "deviation": partial(np.std, ddof=1), "least": np.min, "most": np.max}
-        return {name: {kind: of(v, axis=0) for kind, of in kinds.items()} for name, v in columns.items()}
+        columns = {
+            name: np.array([run[name] for run in runs])
+            for name in runs[0]
+            if name not in OF_THE_SOLVER
+        }
+        kinds: dict[str, Any] = {
+            "mean": np.mean,
+            "deviation": partial(np.std, ddof=1),
+            "least": np.min,
+            "most": np.max,
+        }
+        return {
+            name: {kind: of(v, axis=0) for kind, of in kinds.items()} for name, v in columns.items()
+        }
 
     def table(self) -> dict[str, Array]:
         """Of each column mean, standard deviation, least and most."""
         columns = self.statistics.items()
-        found = {f"{name}_{kind}": values for name, kinds in columns for kind, values in kinds.items()}
+        found = {
+            f"{name}_{kind}": values for name, kinds in columns for kind, values in kinds.items()
+        }
         return {"time": next(iter(self.histories.values()))["time"], **found}
 
     def lines(self) -> list[str]:
@@ -272,9 +314,13 @@ class Ensemble(Sweep):
         time, seeds = f"At time {self.table()['time'][-1]:g}", len(self.histories)
         if not self.shown:
             return f"{time} no column differs between the {seeds} seeds."
-        ends = [(name, *(values[-1] for values in self.statistics[name].values())) for name in self.shown[:2]]
+        ends = [
+            (name, *(values[-1] for values in self.statistics[name].values()))
+            for name in self.shown[:2]
+        ]
         parts = [
-            f"{name} is {mean:.4g}, with a standard deviation of {deviation:.2g}" for name, mean, deviation, *_ in ends
+            f"{name} is {mean:.4g}, with a standard deviation of {deviation:.2g}"
+            for name, mean, deviation, *_ in ends
         ]
         means = "; ".join(only_for_means(self.scene))
         note = f" The deviations are not those of the whole body: {means}." if means else ""
@@ -288,8 +334,12 @@ class Ensemble(Sweep):
             band: dict[str, Any] = {"color": COLOURS[0], "linewidth": 0}
             axes.plot(time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
             words = "mean and one standard deviation"
-            axes.fill_between(time, mean - deviation, mean + deviation, alpha=0.35, label=words, **band)
-            axes.fill_between(time, least, most, alpha=0.15, label="least to most of all seeds", **band)
+            axes.fill_between(
+                time, mean - deviation, mean + deviation, alpha=0.35, label=words, **band
+            )
+            axes.fill_between(
+                time, least, most, alpha=0.15, label="least to most of all seeds", **band
+            )
             axes.set(xlabel="time", ylabel=label(self.scene, name), xlim=(0, time[-1]))
         if self.shown:
             figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
@@ -297,16 +347,27 @@ class Ensemble(Sweep):
 
 
 def ensemble(
-    scene: Scene, folder: Path | str | None = None, seeds: int = 32, jobs: int | None = None, quiet: bool = True
+    scene: Scene,
+    folder: Path | str | None = None,
+    seeds: int = 32,
+    jobs: int | None = None,
+    quiet: bool = True,
 ) -> tuple[Path, Ensemble]:
     """Run a scene with many seeds, from its own on."""
     if seeds < FEWEST_RUNS:
         raise SceneError(f"--seeds {seeds}: allowed is a whole number at least {FEWEST_RUNS}")
     if not scene.has_random_cells:
-        raise SceneError(f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells")
+        raise SceneError(
+            f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells"
+        )
     if scene.time.is_adaptive:
-        raise SceneError(f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out")
+        raise SceneError(
+            f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out"
+        )
     first = scene.cells.seed
     points = {f"seed-{n}": {"cells.seed": n} for n in range(first, first + seeds)}
-    scenes = {name: scene.with_values({"output.fields": False, "name": name, **p}) for name, p in points.items()}
+    scenes = {
+        name: scene.with_values({"output.fields": False, "name": name, **p})
+        for name, p in points.items()
+    }
     return _answered(Ensemble, points, {}, Study("ensemble", scene, folder, scenes, jobs, quiet))

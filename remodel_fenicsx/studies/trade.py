@@ -32,7 +32,9 @@ log = logging.getLogger(__name__)
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
 STEPS = (8.0, 4.0, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
-MESHES = [*product((1, 2, 4), (1, 2), (1.0, 0.25))]  # refinement in the scene's own, degree, step in the scene's own
+MESHES = [
+    *product((1, 2, 4), (1, 2), (1.0, 0.25))
+]  # refinement in the scene's own, degree, step in the scene's own
 SEEDS = 3  # of random cells
 COMPARED = 9  # times at which rows are compared, the last is the end
 KINEMATIC = "model.kinematics"
@@ -73,11 +75,16 @@ def ladder(scene: Scene) -> list[Setting]:
     seeds = tuple(range(base.cells.seed, base.cells.seed + number))
     found: dict[str, Setting] = {}
     for profile, values in _wanted(scene, base):
-        if isinstance(base.geometry, FromFile) or KINEMATICS[values.get(KINEMATIC, cheapest)].homogeneous:
+        if (
+            isinstance(base.geometry, FromFile)
+            or KINEMATICS[values.get(KINEMATIC, cheapest)].homogeneous
+        ):
             values = {key: value for key, value in values.items() if not key.startswith("mesh.")}
         try:
             changed = base.with_values(values)
-        except SceneError as error:  # a step of which a corner is no multiple, an element that a formulation has not
+        except (
+            SceneError
+        ) as error:  # a step of which a corner is no multiple, an element that a formulation has not
             log.debug("left out: %s", error)
             continue
         time = changed.time
@@ -101,7 +108,11 @@ def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
         yield "", mesh | {"time.step": factor * step}
     for tolerance in TOLERANCES if remodels else ():
         yield "", {"time.tolerance": tolerance}
-        yield "", {"time.tolerance": tolerance, "mesh.refinement": 2 * base.mesh.refinement, "mesh.degree": 2}
+        yield "", {
+            "time.tolerance": tolerance,
+            "mesh.refinement": 2 * base.mesh.refinement,
+            "mesh.degree": 2,
+        }
     yield "", {KINEMATIC: choice(scene).name}
     for name in ("sector", "full"):
         if not (objections(scene, name) or is_for_means(scene, name)):
@@ -114,14 +125,25 @@ def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
     if radii := [column.name for column in columns if column.unit == "length"]:
         return "radii", radii
     stretch = [column.name for column in columns if column.name == "mean_stretch"]
-    return ("stretch", stretch) if stretch else ("volume", [c.name for c in columns if c.unit == "length^3"])
+    return (
+        ("stretch", stretch)
+        if stretch
+        else ("volume", [c.name for c in columns if c.unit == "length^3"])
+    )
 
 
 def as_run(setting: Setting, seed: int = 1) -> Scene:
     """The scene of a run of the study: only what is compared is measured."""
     columns = [*compared_lengths(setting.scene)[1], "processor_seconds", *PROFILE]
-    values = {"output.fields": False, "output.columns": columns, "output.every": 1, "output.times": []}
-    return setting.scene.with_values({**values, "cells.seed": seed, "name": f"{setting.name}-{seed}"})
+    values = {
+        "output.fields": False,
+        "output.columns": columns,
+        "output.every": 1,
+        "output.times": [],
+    }
+    return setting.scene.with_values(
+        {**values, "cells.seed": seed, "name": f"{setting.name}-{seed}"}
+    )
 
 
 # ---------------------------------------------------------------- errors against the finest
@@ -157,9 +179,13 @@ def nanrms(values: Array) -> float:
 
 def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
     """Which of some settings no other one beats in cost and error, to two digits: timings are not known to more."""
-    pairs = [(float(f"{cost:.2g}"), float(f"{error:.2g}")) for cost, error in zip(costs, errors, strict=True)]
+    pairs = [
+        (float(f"{cost:.2g}"), float(f"{error:.2g}"))
+        for cost, error in zip(costs, errors, strict=True)
+    ]
     return [
-        np.isfinite(error) and not any((c <= cost and e < error) or (c < cost and e <= error) for c, e in pairs)
+        np.isfinite(error)
+        and not any((c <= cost and e < error) or (c < cost and e <= error) for c, e in pairs)
         for cost, error in pairs
     ]
 
@@ -178,7 +204,9 @@ def _row(result: Result, finest: Result) -> Row:
         return Row(setting, np.nan, np.nan, result.seconds, "the others are compared with it")
     apart = result.angles - finest.angles  # seed by seed: steps are compared on the same cells
     noise = nanrms(np.std(apart, axis=0, ddof=1)) / seeds**0.5 if seeds > 1 else 0.0
-    error, ratio = nanrms(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
+    error, ratio = nanrms(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(
+        finest.lengths, axis=0
+    )
     sizes = {"steps": (setting.step, finest.setting.step)}
     if not KINEMATICS[setting.scene.model.kinematics].homogeneous:
         sizes["elements"] = setting.element, finest.setting.element
@@ -207,7 +235,9 @@ class _TradeStudy(Study):
 
     def __init__(self, scene: Scene, folder: Path | str | None, budget: float, *how: Any):
         deadline = clock.monotonic() + budget
-        runs = [(setting, as_run(setting, seed)) for setting in ladder(scene) for seed in setting.seeds]
+        runs = [
+            (setting, as_run(setting, seed)) for setting in ladder(scene) for seed in setting.seeds
+        ]
         super().__init__("trade", scene, folder, {run.name: run for _, run in runs}, *how)
         self.settings = {run.name: setting for setting, run in runs}
         self.budget, self.deadline = budget, deadline
@@ -222,9 +252,13 @@ class _TradeStudy(Study):
     def answer(self) -> Trade:
         """The table of what was run."""
         if len(self._results) < FEWEST_RUNS:
-            reached = f"{len(self._results)} of {len({*self.settings.values()})} settings reached the end"
+            reached = (
+                f"{len(self._results)} of {len({*self.settings.values()})} settings reached the end"
+            )
             advice = "a larger budget goes on" if self.left else "the same command tries again"
-            raise TooFewRuns(f"{reached} within the budget of {self.budget:g} s", self.failed, advice)
+            raise TooFewRuns(
+                f"{reached} within the budget of {self.budget:g} s", self.failed, advice
+            )
         names = ", ".join(setting.name for setting in self.left)
         notes = [f"left out, over the budget: {names}"] if names else []
         return Trade(self.scene, compared([*self._results.values()]), notes, self.failed)
@@ -233,7 +267,9 @@ class _TradeStudy(Study):
         """Read what is new."""
         for setting in self.left:
             runs = [run for run in self.runs if self.settings[run.name] is setting]
-            with suppress(RecordingError):  # one that is damaged will be among those that have failed
+            with suppress(
+                RecordingError
+            ):  # one that is damaged will be among those that have failed
                 if all(run.is_complete() for run in runs):
                     self._results[setting] = read(setting, [run.history() for run in runs])
 
@@ -243,7 +279,9 @@ def read(setting: Setting, histories: Sequence[Mapping[str, Array]]) -> Result:
     times = np.linspace(0.0, setting.scene.last_time, COMPARED + 1)[1:]
 
     def columns(names: Sequence[str]) -> Array:
-        return np.array([[np.interp(times, each["time"], each[name]) for name in names] for each in histories])
+        return np.array(
+            [[np.interp(times, each["time"], each[name]) for name in names] for each in histories]
+        )
 
     seconds = float(np.mean([np.nansum(each["processor_seconds"]) for each in histories]))
     return Result(setting, columns(PROFILE), columns(compared_lengths(setting.scene)[1]), seconds)
@@ -275,7 +313,16 @@ class Trade(StudyResult):
             for one in self.rows
         ]  # fmt: skip
         lengths = f"error_{compared_lengths(self.scene)[0]}"
-        names = "setting", "scene", "error_degrees", lengths, "cpu_seconds", "on_front", "trusted", "doubt"
+        names = (
+            "setting",
+            "scene",
+            "error_degrees",
+            lengths,
+            "cpu_seconds",
+            "on_front",
+            "trusted",
+            "doubt",
+        )
         return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
 
     def verdict(self) -> str:
@@ -285,7 +332,9 @@ class Trade(StudyResult):
         if not trusted:
             return f"Not known: all {len(self.rows)} errors are doubted; trade.csv says why."
         best = min(good or trusted, key=lambda row: (row.seconds if good else 0.0, row.angle_error))
-        cost = f"{best.seconds:.2g} s of the processor for an error of {best.angle_error:.2g} degrees"
+        cost = (
+            f"{best.seconds:.2g} s of the processor for an error of {best.angle_error:.2g} degrees"
+        )
         if not good:
             return f"No setting is known to be within {WANTED:g} degree; the closest is {best.setting.name}, {cost}."
         return f"The cheapest setting within {WANTED:g} degree is {best.setting.name}, {cost}."
@@ -308,11 +357,19 @@ class Trade(StudyResult):
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
         axes.plot(
-            [row.seconds for row in known], [row.angle_error for row in known], "o", color=COLOURS[0], mfc="white"
+            [row.seconds for row in known],
+            [row.angle_error for row in known],
+            "o",
+            color=COLOURS[0],
+            mfc="white",
         )
         for row in known:
             if row.on_front:
                 axes.plot(row.seconds, row.angle_error, "o", label=row.setting.name)
-        look = {"title": "filled: no other one\nis as good for less", "title_fontsize": 7.5, "fontsize": 6.5}
+        look = {
+            "title": "filled: no other one\nis as good for less",
+            "title_fontsize": 7.5,
+            "fontsize": 6.5,
+        }
         figure.legend(loc="outside right center", **look)
         return figure

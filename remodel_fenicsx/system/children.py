@@ -42,7 +42,9 @@ class Worker:
         self.process = subprocess.Popen(
             command, env=environment_of_child(), stdin=pipe, stdout=pipe, text=True, bufsize=1
         )
-        self._tasks, self._answers = cast(IO[str], self.process.stdin), cast(IO[str], self.process.stdout)
+        self._tasks, self._answers = cast(IO[str], self.process.stdin), cast(
+            IO[str], self.process.stdout
+        )
         self.messages: Path | None = None
         self.is_at_work = False
 
@@ -74,7 +76,9 @@ class Worker:
         if code is not None and code < 0:
             return f"killed by {signal.Signals(-code).name}"
         assert self.messages is not None
-        return last_line(self.messages.read_text(errors="replace")).removeprefix("remodel-fenicsx: ")
+        return last_line(self.messages.read_text(errors="replace")).removeprefix(
+            "remodel-fenicsx: "
+        )
 
     def stop(self) -> None:
         """Stop the worker; kill it after `SECONDS_TO_END`."""
@@ -96,7 +100,9 @@ def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
 
 def serve(command: Callable[[Sequence[str]], int]) -> int:
     """Run the commands that a `Worker` sends, until it closes the pipe; return the exit code."""
-    if sys.platform == "linux":  # SIGTERM if the parent is killed; before this call standard input has ended
+    if (
+        sys.platform == "linux"
+    ):  # SIGTERM if the parent is killed; before this call standard input has ended
         ctypes.CDLL(None).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
@@ -167,13 +173,17 @@ class NoRoomError(RemodelError):
     exit_code = BAD_ENVIRONMENT
 
     def __init__(self) -> None:
-        super().__init__("cannot store the arrays of a file: full disk, or a file size limit (ulimit -f)")
+        super().__init__(
+            "cannot store the arrays of a file: full disk, or a file size limit (ulimit -f)"
+        )
 
 
 def read_guarded(path: Path, reader: str) -> tuple[dict[str, NDArray[Any]], bytes]:
     """Read a file in a child with limits; return the arrays and the bytes that were read."""
     data = read_regular(path, LARGEST_FILE)
-    seconds, memory = SECONDS + SECONDS_PER_MB * len(data) / 1e6, MEMORY + MEMORY_PER_BYTE * len(data)
+    seconds, memory = SECONDS + SECONDS_PER_MB * len(data) / 1e6, MEMORY + MEMORY_PER_BYTE * len(
+        data
+    )
     return made_apart(data, path.name, reader, seconds, memory), data
 
 
@@ -181,7 +191,10 @@ def made_apart(
     data: bytes, name: str, reader: str, seconds: float = FOR_EVER, memory: int = NO_LIMIT
 ) -> dict[str, NDArray[Any]]:
     """Call a reader on these bytes in a child with limits; return the arrays."""
-    with os.fdopen(os.memfd_create("read"), "wb") as source, os.fdopen(os.memfd_create("found"), "rb") as found:
+    with (
+        os.fdopen(os.memfd_create("read"), "wb") as source,
+        os.fdopen(os.memfd_create("found"), "rb") as found,
+    ):
         try:
             with open(source.fileno(), "wb", closefd=False) as copy:
                 copy.write(data)
@@ -191,7 +204,15 @@ def made_apart(
         words = [reader, *map(str, (*ends, int(seconds), memory))]
         try:
             done = subprocess.run(
-                [sys.executable, "-P", "-W", "ignore", "-m", "remodel_fenicsx.system.children", *words],
+                [
+                    sys.executable,
+                    "-P",
+                    "-W",
+                    "ignore",
+                    "-m",
+                    "remodel_fenicsx.system.children",
+                    *words,
+                ],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=WAITING * seconds,
@@ -205,13 +226,17 @@ def made_apart(
         said = _LOGGED.sub("", " ".join(done.stderr[-4000:].decode(errors="replace").split()))
         said = said.replace(f"/proc/self/fd/{source.fileno()}", name)
         if -done.returncode in (signal.SIGXCPU, signal.SIGKILL):
-            raise UnreadableFile(f"takes more than {seconds:.3g} seconds or {memory / 1e6:.0f} MB to read")
+            raise UnreadableFile(
+                f"takes more than {seconds:.3g} seconds or {memory / 1e6:.0f} MB to read"
+            )
         if done.returncode < 0:
             raise UnreadableFile(
                 f"{DAMAGED}file is corrupt, its reader has crashed ({signal.Signals(-done.returncode).name})"
             )
         if done.returncode or said:
-            raise UnreadableFile(DAMAGED + (said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]} ..."))
+            raise UnreadableFile(
+                DAMAGED + (said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]} ...")
+            )
         found.seek(0)
         import numpy as np  # Imported late because most commands need no arrays.
 
@@ -224,7 +249,11 @@ def made_apart(
 
 def read_as_child(reader: str, source: str, found: str, seconds: str, memory: str) -> None:
     """Read a file in the child: set limits, guard, read, and save the arrays."""
-    for limit, most in ((resource.RLIMIT_CPU, seconds), (resource.RLIMIT_AS, memory), (resource.RLIMIT_CORE, 0)):
+    for limit, most in (
+        (resource.RLIMIT_CPU, seconds),
+        (resource.RLIMIT_AS, memory),
+        (resource.RLIMIT_CORE, 0),
+    ):
         highest = resource.getrlimit(limit)[1]  # set by the process that has started the command
         most = int(most) if highest == resource.RLIM_INFINITY else min(int(most), highest)
         resource.setrlimit(limit, (most, most))
@@ -259,7 +288,12 @@ def _guard(file: str) -> None:
         _check_xml(data)
     if found := _LINES.search(data[: 10**6]):
         raise UnreadableFile(f"has a negative number: {found[0].decode().strip()}")
-    own = tuple({*map(os.path.realpath, sysconfig.get_paths().values()), str(Path(__file__).resolve().parents[1])})
+    own = tuple(
+        {
+            *map(os.path.realpath, sysconfig.get_paths().values()),
+            str(Path(__file__).resolve().parents[1]),
+        }
+    )
     own += tuple(os.path.realpath(folder) for folder in sys.path if folder)
 
     def elsewhere(*_: object, **__: object) -> None:
@@ -269,7 +303,13 @@ def _guard(file: str) -> None:
     sys.modules["h5py"].File = elsewhere  # type: ignore[attr-defined]
 
     def watch(event: str, arguments: tuple[object, ...]) -> None:
-        if event in ("socket.connect", "subprocess.Popen", "os.system", "os.exec", "os.posix_spawn"):
+        if event in (
+            "socket.connect",
+            "subprocess.Popen",
+            "os.system",
+            "os.exec",
+            "os.posix_spawn",
+        ):
             raise UnreadableFile("refers to something outside the file")
         if event == "open" and isinstance(arguments[0], (str, bytes)):
             path = os.fsdecode(arguments[0])
@@ -307,7 +347,9 @@ def _check_xml(data: bytes) -> None:
         if (kind := element.get("header_type", "UInt32")) not in ("UInt32", "UInt64"):
             raise UnreadableFile(f"header_type = {kind!r}: must be 'UInt32' or 'UInt64'")
     if len(list(root.iter("Piece"))) > 1:
-        raise UnreadableFile("has several pieces, must have one: read it in ParaView, Merge Blocks, save it again")
+        raise UnreadableFile(
+            "has several pieces, must have one: read it in ParaView, Merge Blocks, save it again"
+        )
 
 
 if __name__ == "__main__":

@@ -86,7 +86,9 @@ def environment_problem() -> str | None:
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         return f"{', '.join(missing)} is missing"
-    if not any(shutil.which(name) for name in (os.environ.get("CC", "cc").split()[0], "gcc", "clang")):
+    if not any(
+        shutil.which(name) for name in (os.environ.get("CC", "cc").split()[0], "gcc", "clang")
+    ):
         return "there is no C compiler"
     try:
         restore_signal_handlers()
@@ -142,13 +144,17 @@ def load_extensions(files: Sequence[str]) -> None:
         if path.name not in _loaded:
             _loaded[path.name] = path, SUM + _run(path, file)
         elif _loaded[path.name][0] != path:
-            raise ExtensionError(f"extension {file}: {_loaded[path.name][0]} has the same name; names must differ")
+            raise ExtensionError(
+                f"extension {file}: {_loaded[path.name][0]} has the same name; names must differ"
+            )
 
 
 def _run(path: Path, file: str) -> str:
     """Run a file as a module of its own; return the SHA-256 of its source."""
     if len(path.name.split()) > 1 or os.pathsep in str(path):
-        raise ExtensionError(f"extension {file}: must have a name without spaces, in a folder without {os.pathsep!r}")
+        raise ExtensionError(
+            f"extension {file}: must have a name without spaces, in a folder without {os.pathsep!r}"
+        )
     try:
         source = read_regular(path, LARGEST_EXTENSION)
     except OSError as error:
@@ -160,7 +166,9 @@ def _run(path: Path, file: str) -> str:
         exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)
     except (Exception, SystemExit) as error:
         words = getattr(error, "msg", error)
-        raise ExtensionError(f"extension {file}{_line(error, path)}: {type(error).__name__}: {words}") from error
+        raise ExtensionError(
+            f"extension {file}{_line(error, path)}: {type(error).__name__}: {words}"
+        ) from error
     return hashlib.sha256(source).hexdigest()
 
 
@@ -195,4 +203,6 @@ def check_extensions(versions: Mapping[str, str], place: Path) -> None:
     """Check that all extensions of a run are loaded."""
     for name, version in versions.items():
         if version.startswith(SUM) and name not in _loaded:
-            raise ExtensionError(f"{place}: was started with extension {name}; add --with and its path")
+            raise ExtensionError(
+                f"{place}: was started with extension {name}; add --with and its path"
+            )

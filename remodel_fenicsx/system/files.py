@@ -74,7 +74,9 @@ def open_own(path: Path, flags: int) -> int:
     descriptor, found = _regular(path, flags | os.O_NOFOLLOW)
     if found.st_nlink > 1:
         os.close(descriptor)
-        raise ForeignFileError(errno.EMLINK, "has a second name (a hard link); nothing is written to it", str(path))
+        raise ForeignFileError(
+            errno.EMLINK, "has a second name (a hard link); nothing is written to it", str(path)
+        )
     return descriptor
 
 
@@ -144,7 +146,9 @@ def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
     try:
         descriptor = os.open(path, flags | NON_BLOCKING, 0o666)
     except ValueError as error:  # A name with a NUL, or not in UTF-8.
-        raise ForeignFileError(errno.EINVAL, f"is not a file name: {error}", ascii(str(path))) from None
+        raise ForeignFileError(
+            errno.EINVAL, f"is not a file name: {error}", ascii(str(path))
+        ) from None
     except OSError as error:
         if error.errno in FOREIGN and (error.errno != errno.EEXIST or path.is_symlink()):
             raise ForeignFileError(error.errno, FOREIGN[error.errno], str(path)) from None
@@ -176,9 +180,13 @@ class ClosedAtEnd:
 def wall_time(text: str) -> float:
     """Convert a duration such as 90s, 30min or 2h to seconds."""
     found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
-    seconds = float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
+    seconds = (
+        float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
+    )
     if seconds <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be a time greater than 0 with its unit: 90s, 30min, 2h, 1.5d")
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: must be a time greater than 0 with its unit: 90s, 30min, 2h, 1.5d"
+        )
     return seconds
 
 

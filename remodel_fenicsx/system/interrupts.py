@@ -31,7 +31,14 @@ _ONE_SIGNAL = 0.2
 
 # Signals on which PETSc aborts, including some that a run survives: a closed pipe, and the hangup
 # that nohup ignores.
-_NOT_PETSCS = (signal.SIGHUP, signal.SIGINT, signal.SIGPIPE, signal.SIGQUIT, signal.SIGTERM, signal.SIGURG)
+_NOT_PETSCS = (
+    signal.SIGHUP,
+    signal.SIGINT,
+    signal.SIGPIPE,
+    signal.SIGQUIT,
+    signal.SIGTERM,
+    signal.SIGURG,
+)
 
 
 def _exit_code(number: int) -> int:
@@ -99,7 +106,9 @@ def blocked(*numbers: int) -> Iterator[None]:
 def _has_foreign_options() -> bool:
     """Return whether PETSc would read options from a working folder that is not the user's home."""
     home = Path.home()
-    return any(map(os.path.lexists, (".petscrc", "petscrc"))) and not (home.exists() and home.samefile("."))
+    return any(map(os.path.lexists, (".petscrc", "petscrc"))) and not (
+        home.exists() and home.samefile(".")
+    )
 
 
 def _is_main_thread() -> bool:
@@ -109,10 +118,16 @@ def _is_main_thread() -> bool:
 
 @contextmanager
 def handled(
-    handler: Callable[[int, FrameType | None], object], numbers: Iterable[int], where: Callable[[object], bool]
+    handler: Callable[[int, FrameType | None], object],
+    numbers: Iterable[int],
+    where: Callable[[object], bool],
 ) -> Iterator[None]:
     """Install a handler for those signals whose present handler satisfies `where`."""
-    chosen = [number for number in numbers if where(signal.getsignal(number))] if _is_main_thread() else []
+    chosen = (
+        [number for number in numbers if where(signal.getsignal(number))]
+        if _is_main_thread()
+        else []
+    )
     before = {number: signal.signal(number, handler) for number in chosen}
     try:
         yield
@@ -170,7 +185,9 @@ def end_all_ranks_on_exception() -> None:
         sys.excepthook = _print_and_abort
 
 
-def _print_and_abort(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def _print_and_abort(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
     from mpi4py import MPI
 
     traceback.print_exception(kind, error, trace)
@@ -205,7 +222,9 @@ class StopRequest:
         self.number = 0
         self.pause = False
         self.raises = False
-        self._handled = handled(self._remember, (*SIGNALS, PAUSE), lambda handler: handler != signal.SIG_IGN)
+        self._handled = handled(
+            self._remember, (*SIGNALS, PAUSE), lambda handler: handler != signal.SIG_IGN
+        )
 
     def __enter__(self) -> StopRequest:
         self._handled.__enter__()

@@ -28,7 +28,15 @@ LINE_EVERY = 10.0  # seconds between plain lines
 class Progress:
     """Progress of a run on stderr: a bar on a terminal, otherwise a plain line at intervals."""
 
-    def __init__(self, total_steps: int, title: str, comm_rank: int = 0, *, interval: float = 60.0, done: float = 0):
+    def __init__(
+        self,
+        total_steps: int,
+        title: str,
+        comm_rank: int = 0,
+        *,
+        interval: float = 60.0,
+        done: float = 0,
+    ):
         self._total, self._title, self._done = total_steps, title, done
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
@@ -54,7 +62,9 @@ class Progress:
             return
         count, left = count or f"{index}/{self._total}", self._time_left(index)
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=index, count=count, state=state, left=left)
+            self._bar.update(
+                self._bar.task_ids[0], completed=index, count=count, state=state, left=left
+            )
         else:
             said = f"step {count}", state, left
             self._say(", ".join(filter(None, said)), at_once=index >= self._total)
@@ -107,12 +117,18 @@ def _bar(title: str, total: int | None, done: float) -> RichProgress:
         refresh_per_second=4,
         redirect_stdout=sys.stdout.isatty(),
     )
-    found.update(found.add_task(title, total=total, count="", state="starting", left=""), completed=done)
+    found.update(
+        found.add_task(title, total=total, count="", state="starting", left=""), completed=done
+    )
     return found
 
 
 def _is_terminal() -> bool:
-    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+    return (
+        sys.stderr is not None
+        and sys.stderr.isatty()
+        and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+    )
 
 
 def announce(line: str) -> None:

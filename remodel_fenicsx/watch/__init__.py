@@ -66,9 +66,13 @@ class WatcherKind:
 _WARNINGS = "remodel_fenicsx.watch.warnings:"
 
 WATCHERS = {
-    "over-correction": WatcherKind("remodel_fenicsx.watch.over_correction:OverCorrection.for_scene"),
+    "over-correction": WatcherKind(
+        "remodel_fenicsx.watch.over_correction:OverCorrection.for_scene"
+    ),
     "locking": WatcherKind(_WARNINGS + "LockingWarning.for_scene", each_case=True),
-    "buckling": WatcherKind("remodel_fenicsx.watch.stability:BucklingWarning.for_scene", each_case=True),
+    "buckling": WatcherKind(
+        "remodel_fenicsx.watch.stability:BucklingWarning.for_scene", each_case=True
+    ),
     "volume": WatcherKind(_WARNINGS + "VolumeLoss.for_scene", each_case=True),
     "pressure-noise": WatcherKind(_WARNINGS + "PressureNoise.for_scene"),
     "weak-tension": WatcherKind(_WARNINGS + "WeakTension.for_scene"),

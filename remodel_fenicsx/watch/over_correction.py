@@ -60,7 +60,9 @@ class OverCorrection(WarnsOnce):
     """Warning that the cells oscillate from pass to pass, with an effect on results."""
 
     name = "over_correction"
-    initial = dict.fromkeys(("growing", "sustained", *(f"time_{age}" for age in range(ORDER + 1))), 0.0)
+    initial = dict.fromkeys(
+        ("growing", "sustained", *(f"time_{age}" for age in range(ORDER + 1))), 0.0
+    )
 
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
@@ -68,12 +70,20 @@ class OverCorrection(WarnsOnce):
         # Histories of previous passes, including the newest one.
         cells = partial(self.quadrature.function, "", (6,))
         self._cells = FieldHistory(self.state, "over_correction_cells", cells, ORDER + 1)
-        self._body = FieldHistory(self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1)
-        self.rested = ReactivatedCells(stepper) if stepper.remodeling.law.depends_on_absolute_time else None
+        self._body = FieldHistory(
+            self.state, "over_correction_body", self.state.unknown.copy, ORDER + 1
+        )
+        self.rested = (
+            ReactivatedCells(stepper) if stepper.remodeling.law.depends_on_absolute_time else None
+        )
 
     @classmethod
     def for_scene(cls, scene: Scene, stepper: Stepper) -> OverCorrection | None:
-        return cls(stepper) if stepper.remodeling.law.remodels and not scene.time.is_equilibrium else None
+        return (
+            cls(stepper)
+            if stepper.remodeling.law.remodels and not scene.time.is_equilibrium
+            else None
+        )
 
     def started(self, step: Step) -> None:
         """Reset the histories to the cells before the first pass. Collective."""
@@ -100,20 +110,29 @@ class OverCorrection(WarnsOnce):
 
     def _judge(self, step: Step, cells: Array, times: Array) -> None:
         """Warn of oscillations of the last passes (passes, ...), the newest first. Collective."""
-        quadrature, r0 = self.quadrature, self.stepper.remodeling.parameters.largest().end_to_end_length
+        quadrature, r0 = (
+            self.quadrature,
+            self.stepper.remodeling.parameters.largest().end_to_end_length,
+        )
         scale = np.sqrt(quadrature.owned(quadrature.volumes) / quadrature.volume)[..., None] / r0**2
         of_cells = (cells[:, : len(scale)] * scale).reshape(len(cells), -1)
-        of_body = np.array([self.state.unknown.x.array, *self._body.values])[:, : self.state.number_of_owned_unknowns]
+        of_body = np.array([self.state.unknown.x.array, *self._body.values])[
+            :, : self.state.number_of_owned_unknowns
+        ]
         of_body /= dolfinx.la.norm(self.state.unknown.x) or 1.0
         cells_swing, body_swing = self._swing(times, of_cells), self._swing(times, of_body)
         self.swings = {"growing": cells_swing, "sustained": body_swing}
         tells, found = self._is_pass_oscillation(step, cells, times), False
-        for (name, swing), (factor, passes) in zip(self.swings.items(), (GROWING, SUSTAINED), strict=True):
+        for (name, swing), (factor, passes) in zip(
+            self.swings.items(), (GROWING, SUSTAINED), strict=True
+        ):
             self._numbers[name] = self._numbers[name] + 1 if tells and swing.factor < factor else 0
             after_one_more = swing.size * abs(swing.factor)
             found |= self._numbers[name] >= passes and after_one_more >= TOLD_SIZE
         if found and not self.is_reported:
-            most = quadrature.shown_place_of_largest(np.linalg.norm(_difference(times, cells), axis=-1))
+            most = quadrature.shown_place_of_largest(
+                np.linalg.norm(_difference(times, cells), axis=-1)
+            )
             self.emit(
                 step,
                 "the remodeling pass overshoots: the cells oscillate from pass to pass. "
@@ -128,12 +147,16 @@ class OverCorrection(WarnsOnce):
         """Return the oscillation of this rank's values (passes, n), in their norm. Collective."""
         changes = np.array([_difference(times, values), _difference(times[1:], values[1:])])
         products = allreduce(self.state.comm, changes @ changes.T, MPI.SUM)
-        return Oscillation(np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf))
+        return Oscillation(
+            np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf)
+        )
 
     def _is_pass_oscillation(self, step: Step, cells: Array, times: Array) -> bool:
         """Return whether passes oscillate, not loads, unequal steps or delays. Collective."""
         # At time 0 there are no loads.
-        loads = np.array([[*self.stepper.load_values(time).values()] for time in times]) * (times[:, None] > 0)
+        loads = np.array([[*self.stepper.load_values(time).values()] for time in times]) * (
+            times[:, None] > 0
+        )
         lengths, rested = -np.diff(times), (cells[:-1] == cells[1:]).all(axis=-1).astype(np.float64)
         return bool(
             np.all(np.abs(_difference(times, loads)) <= LOAD_JUMP * GAIN * np.abs(loads[0]))
@@ -158,7 +181,9 @@ class ReactivatedCells(WarnsOnce):
     def __init__(self, stepper: Stepper):
         super().__init__(stepper)
         # Number of passes at each point since its cell has changed; 0 before its first change.
-        self._rest = FieldHistory(self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1)
+        self._rest = FieldHistory(
+            self.state, "rested_cells_moved", partial(self.quadrature.function, "", ()), 1
+        )
 
     def forget(self) -> None:
         """Reset the record of all passes."""

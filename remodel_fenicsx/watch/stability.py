@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from remodel_fenicsx.body.reductions import Strut
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, WarnsOnce, Watcher
 from remodel_fenicsx.solver.continuation import StepFailure
-from remodel_fenicsx.solver.diagnosis import FactorisationFailed, Inertia, Mode, UNSTABLE, inertia_without_loads
+from remodel_fenicsx.solver.diagnosis import (
+    FactorisationFailed,
+    Inertia,
+    Mode,
+    UNSTABLE,
+    inertia_without_loads,
+)
 from remodel_fenicsx.solver.linear import fill_asymmetric
 from remodel_fenicsx.state import FieldHistory, StateNumbers
 
@@ -63,7 +69,9 @@ class EquilibriumStability(Watcher):
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
-        factorisation = self.stepper.coupling.newton.factorisation() if step.work.newton_iterations else None
+        factorisation = (
+            self.stepper.coupling.newton.factorisation() if step.work.newton_iterations else None
+        )
         suspicious = factorisation is not None and self._curvature(factorisation) < 0 and known == 0
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
@@ -95,7 +103,9 @@ class EquilibriumStability(Watcher):
 
     def _judge(self, step: Step, before: int, now: int) -> None:
         if now < before:
-            self._log(logging.INFO, f"{step.label}: {eigenvalues(now)} of the tangent, {before} before")
+            self._log(
+                logging.INFO, f"{step.label}: {eigenvalues(now)} of the tangent, {before} before"
+            )
             return
         unloaded, scale = self._unloaded
         if now <= unloaded:
@@ -105,10 +115,17 @@ class EquilibriumStability(Watcher):
                 f"{unloaded}, from the stress of its initial cells: the equilibrium is not lost",
             )
             return
-        text = f"{eigenvalues(now)} of the tangent (before: {before}); " f"{described(self.inertia.lowest(), scale)}"
+        text = (
+            f"{eigenvalues(now)} of the tangent (before: {before}); "
+            f"{described(self.inertia.lowest(), scale)}"
+        )
         if self.stops:
-            raise StepFailure(step.time, f"the equilibrium at {step.label} is unstable: {text}", UNSTABLE)
-        unstable = f"{step.label}: unstable equilibrium: {text}. A perturbed body would leave this state"
+            raise StepFailure(
+                step.time, f"the equilibrium at {step.label} is unstable: {text}", UNSTABLE
+            )
+        unstable = (
+            f"{step.label}: unstable equilibrium: {text}. A perturbed body would leave this state"
+        )
         self._log(logging.WARNING, unstable)
 
     @cached_property
@@ -154,7 +171,11 @@ def eigenvalues(number: int) -> str:
 def described(mode: Mode, unloaded: float) -> str:
     """Return a mode as text, relative to the unloaded body's lowest eigenvalue if positive."""
     place = ", ".join(f"{c:.4g}" for c in mode.place)
-    size = f"{mode.eigenvalue / unloaded:.3g} times its unloaded value" if unloaded > 0 else f"{mode.eigenvalue:.3g}"
+    size = (
+        f"{mode.eigenvalue / unloaded:.3g} times its unloaded value"
+        if unloaded > 0
+        else f"{mode.eigenvalue:.3g}"
+    )
     return f"the lowest is {size}, and its mode is largest at ({place})"
 
 
@@ -181,7 +202,9 @@ class BucklingWarning(WarnsOnce):
 
     @classmethod
     def for_scene(cls, scene: Scene, stepper: Stepper) -> BucklingWarning | None:
-        strut = scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
+        strut = (
+            scene.geometry.strut(scene.supports.ends) if stepper.state.kinematics.reduced else None
+        )
         return None if strut is None else cls(stepper, strut)  # full kinematics show buckling
 
     def check(self, step: Step | None = None) -> str:
@@ -203,11 +226,17 @@ class BucklingWarning(WarnsOnce):
 
     def lumen_area(self) -> float:
         """Return the lumen's present area, from the mean radius of its nodes. Collective."""
-        kinematics, unknown, radius = self.state.kinematics, self.state.unknown, self.strut.inner_radius
+        kinematics, unknown, radius = (
+            self.state.kinematics,
+            self.state.unknown,
+            self.strut.inner_radius,
+        )
         assert radius is not None
         nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
         here = np.isclose(np.linalg.norm(nodes[:, :2], axis=1), radius, rtol=1e-6)
-        deformed = np.linalg.norm((nodes + kinematics.nodal_displacement(unknown))[here, :2], axis=1)
+        deformed = np.linalg.norm(
+            (nodes + kinematics.nodal_displacement(unknown))[here, :2], axis=1
+        )
         total, number = self.state.comm.allreduce(np.array([deformed.sum(), here.sum()]))
         return float(np.pi * (total / number) ** 2)
 
@@ -217,16 +246,27 @@ class BucklingWarning(WarnsOnce):
         for i, j in itertools.combinations_with_replacement(range(3), 2):
             H[i, j] = H[j, i] = self._derivative(i, j)
         coupling = H[:2, ALONG].T[..., None]
-        modulus = H[ALONG, ALONG] - (coupling * np.linalg.solve(H[:2, :2].transpose(2, 0, 1), coupling)).sum(
-            axis=(1, 2)
+        modulus = H[ALONG, ALONG] - (
+            coupling * np.linalg.solve(H[:2, :2].transpose(2, 0, 1), coupling)
+        ).sum(axis=(1, 2))
+        around = np.einsum(
+            "nij,nj->ni", self.state.elastic_gradient(), self._directions[:, :, AROUND]
         )
-        around = np.einsum("nij,nj->ni", self.state.elastic_gradient(), self._directions[:, :, AROUND])
         squares = self.strut.squared_distances(self._places) * np.square(around).sum(axis=1)
         length = self._length()
-        return np.pi**2 * self._integral(modulus * squares) / length / (self.strut.end_factor * length) ** 2
+        return (
+            np.pi**2
+            * self._integral(modulus * squares)
+            / length
+            / (self.strut.end_factor * length) ** 2
+        )
 
     def _length(self) -> float:
-        return self.strut.length * self._integral(self.state.elastic_gradient()[:, 2, 2]) / self.quadrature.volume
+        return (
+            self.strut.length
+            * self._integral(self.state.elastic_gradient()[:, 2, 2])
+            / self.quadrature.volume
+        )
 
     def _integral(self, values: Array) -> float:
         """Integrate values (n,) over the reference configuration. Collective."""
@@ -247,4 +287,6 @@ class BucklingWarning(WarnsOnce):
         """Return W at the points after further stretches exp(strains) along the axes, (n,)."""
         Q, tissue = self._directions, self.state.parameters(self.stepper.tissue).at_points()
         stretch = (Q * np.exp(strains)) @ Q.swapaxes(1, 2)
-        return tissue.strain_energy(stretch @ self.state.elastic_gradient(), [self.state.cells.point_cells])
+        return tissue.strain_energy(
+            stretch @ self.state.elastic_gradient(), [self.state.cells.point_cells]
+        )

@@ -71,8 +71,13 @@ class ElementWarning(WarnsOnce):
     def __init__(self, stepper: Stepper, remedy: str = REMEDY):
         super().__init__(stepper)
         tissue, shape = self.state.parameters(stepper.tissue).at_points(), self.quadrature.shape
-        self.stiffnesses = [self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)]
-        self.ratio, self.remedy = self.quadrature.maximum(self.stiffnesses[0] / self.stiffnesses[1]), remedy
+        self.stiffnesses = [
+            self.quadrature.owned(v.reshape(shape)) for v in (tissue.lame_lambda, tissue.lame_mu)
+        ]
+        self.ratio, self.remedy = (
+            self.quadrature.maximum(self.stiffnesses[0] / self.stiffnesses[1]),
+            remedy,
+        )
 
 
 class LockingWarning(ElementWarning):
@@ -109,7 +114,11 @@ class LockingWarning(ElementWarning):
     def _energy_of_elongation(self) -> float:
         """Return the energy 3/2 mu e^2 of a prescribed isochoric elongation. Collective."""
         elongation = self.stepper.state.loading.values.get("elongation", 0.0)
-        return self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2) if elongation else 0.0
+        return (
+            self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2)
+            if elongation
+            else 0.0
+        )
 
     def energies(self) -> tuple[float, float, float]:
         """Return energies: with mean J per element, of varying J, twice varying F. Collective."""
@@ -117,9 +126,17 @@ class LockingWarning(ElementWarning):
         look = self.stepper.coupling.equilibrium.evaluate()
         logarithm, F = np.log(look.jacobians), look.gradients.reshape(*stiffness.shape, 9)
         inside = quadrature.polynomial_residual(0, logarithm[..., None])[..., 0]
-        matrix = stiffness * (logarithm - inside) ** 2 + shear * (np.square(F).sum(axis=-1) - 3 - 2 * logarithm)
+        matrix = stiffness * (logarithm - inside) ** 2 + shear * (
+            np.square(F).sum(axis=-1) - 3 - 2 * logarithm
+        )
         volume = stiffness * np.square(inside) * self.locks
-        shape = 2 * shear * np.square(quadrature.polynomial_residual(quadrature.element_degree - 1, F)).sum(axis=-1)
+        shape = (
+            2
+            * shear
+            * np.square(quadrature.polynomial_residual(quadrature.element_degree - 1, F)).sum(
+                axis=-1
+            )
+        )
         shape *= self._followed(shape, F)[:, None]
         weights = quadrature.owned(quadrature.volumes) / 2
         local = np.array([float((part * weights).sum()) for part in (matrix, volume, shape)])
@@ -181,13 +198,19 @@ class PressureNoise(ElementWarning):
     @classmethod
     def for_scene(cls, scene: Scene, stepper: Stepper) -> PressureNoise | None:
         remodeling, locks = stepper.remodeling, FORMULATIONS[scene.mesh.formulation].locks
-        turns = remodeling.law.remodels and remodeling.driver.is_stress and not stepper.state.kinematics.homogeneous
+        turns = (
+            remodeling.law.remodels
+            and remodeling.driver.is_stress
+            and not stepper.state.kinematics.homogeneous
+        )
         return cls(stepper, remedy(scene)) if locks and turns else None
 
     def degrees(self) -> float:
         """Return the mean angle between principal tensions with and without noise. Collective."""
         quadrature, stiffness = self.quadrature, self.stiffnesses[0]
-        F, tensor = (values[: stiffness.size] for values in self.stepper.remodeling.driving_tensor())
+        F, tensor = (
+            values[: stiffness.size] for values in self.stepper.remodeling.driving_tensor()
+        )
         J = np.linalg.det(F)
         logarithm = np.log(J).reshape(stiffness.shape)
         noise = quadrature.polynomial_residual(
@@ -197,16 +220,25 @@ class PressureNoise(ElementWarning):
             quiet = tensor - noise * np.linalg.inv(F.swapaxes(1, 2) @ F)
         else:
             quiet = tensor - noise / J[:, None, None] * np.eye(3)
-        with_noise, without = (np.maximum(np.linalg.eigvalsh(stress), 0.0) for stress in (tensor, quiet))
+        with_noise, without = (
+            np.maximum(np.linalg.eigvalsh(stress), 0.0) for stress in (tensor, quiet)
+        )
         lengths = np.linalg.norm(with_noise, axis=1) * np.linalg.norm(without, axis=1)
         # The angle is 0 without tension in both, and 90 degrees without tension in one of them.
-        cosine = np.where(lengths > 0, (with_noise * without).sum(axis=1), (with_noise + without).sum(axis=1) == 0)
-        turned = np.degrees(np.arccos(np.clip(cosine / np.where(lengths > 0, lengths, 1.0), -1.0, 1.0)))
+        cosine = np.where(
+            lengths > 0, (with_noise * without).sum(axis=1), (with_noise + without).sum(axis=1) == 0
+        )
+        turned = np.degrees(
+            np.arccos(np.clip(cosine / np.where(lengths > 0, lengths, 1.0), -1.0, 1.0))
+        )
         return quadrature.integral(turned.reshape(stiffness.shape)) / quadrature.volume
 
     def check(self, step: Step) -> str:
         """Return a warning if the mean angle is large. Collective."""
-        if self.ratio <= min(STIFF_BULK.values()) or (turned := self.degrees()) <= MAX_NOISE_ROTATION_DEGREES:
+        if (
+            self.ratio <= min(STIFF_BULK.values())
+            or (turned := self.degrees()) <= MAX_NOISE_ROTATION_DEGREES
+        ):
             return ""
         return (
             f"pressure oscillations change the principal tensions by {turned:.2g} degrees on "
@@ -236,14 +268,20 @@ class VolumeLoss(WarnsOnce):
     """Warning of a large loss of volume, with a report of the largest loss at the end."""
 
     name = "volume"
-    initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0} | dict.fromkeys("xyz", 0.0)
+    initial = {"mean": 1.0, "mean_time": 0.0, "least": 1.0, "least_time": 0.0} | dict.fromkeys(
+        "xyz", 0.0
+    )
 
     def solved(self, step: Step) -> None:
         """Update the largest loss of volume, also after the warning. Collective."""
         self._measure(step)
         numbers = self._numbers
-        if not self.is_reported and (1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN):
-            self.emit(step, f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)")
+        if not self.is_reported and (
+            1 - numbers["mean"] >= MEAN_LOSS or numbers["least"] < LEAST_JACOBIAN
+        ):
+            self.emit(
+                step, f"{self._in_words()}; set a larger material.lame_lambda (docs/commands.md)"
+            )
         elif step.is_last and 1 - numbers["mean"] >= REPORTED_VOLUME_LOSS:
             step.findings.append((logging.INFO, self._in_words()))
 
@@ -311,7 +349,9 @@ class RadialChains(ShapeWarning):
         """Return a report if the fraction is large. Collective."""
         cells = self.state.cells
         share = self.quadrature.mean(
-            self.shape.radial_share(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+            self.shape.radial_share(
+                cells.dimension_values, cells.axis_values, cells.local_axes.axes
+            )
         )
         if not share > RADIAL_SHARE:
             return ""
@@ -335,7 +375,9 @@ class FrontsInLayers(ShapeWarning):
         if not self.shape.angle_layers:
             return ""
         depths = cells.local_axes.nodal_depth[geometry_dofmap(quadrature.mesh)]
-        angles = self.shape.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+        angles = self.shape.fibre_angle(
+            cells.dimension_values, cells.axis_values, cells.local_axes.axes
+        )
         known, found = ~np.isnan(angles), []
         least = np.where(known, angles, np.inf).min(axis=1)
         most = np.where(known, angles, -np.inf).max(axis=1)
@@ -343,7 +385,9 @@ class FrontsInLayers(ShapeWarning):
         jump = "is a mean over elements in which the angle jumps from"
         for name, depth in self.shape.angle_layers.items():
             layer = (depths.min(axis=1) <= depth + 1e-6) & (depths.max(axis=1) >= depth - 1e-6)
-            share = quadrature.nanmean(np.repeat(has_front[:, None] * 1.0, quadrature.shape[1], axis=1), layer)
+            share = quadrature.nanmean(
+                np.repeat(has_front[:, None] * 1.0, quadrature.shape[1], axis=1), layer
+            )
             if share > FRONT_SHARE:
                 inside = (layer & has_front)[:, None]
                 low = quadrature.minimum(np.where(inside, least[:, None], np.inf))
@@ -352,5 +396,6 @@ class FrontsInLayers(ShapeWarning):
         if not found:
             return ""
         return (
-            f"{'; '.join(found)}. A front lies there, so the mean depends on the mesh; " "set a larger mesh.refinement"
+            f"{'; '.join(found)}. A front lies there, so the mean depends on the mesh; "
+            "set a larger mesh.refinement"
         )

@@ -68,7 +68,9 @@ def test_angle_is_the_closed_form_at_every_step(case: Case, kappa: float, frame:
 @pytest.mark.parametrize("kappa", [0.025, *slowly(0.01, 0.1)])
 def test_stretch_is_that_of_an_independent_scalar_solve(case: Case, kappa: float) -> None:
     result = case(cube_scene(kappa, frame="spatial"))
-    for time, force, stretch in zip(result["time"], result["force"], result["mean_stretch"], strict=True):
+    for time, force, stretch in zip(
+        result["time"], result["force"], result["mean_stretch"], strict=True
+    ):
         s = 1 - np.exp(-kappa * (time - 1.0))
         across = (1 - s) / np.sqrt(3)
         axial, _ = uniaxial_stretches(force, across + s, across)

@@ -16,14 +16,26 @@ import pytest
 from remodel_fenicsx import Scene, SceneError, preset_scene
 from remodel_fenicsx.extend import MATRICES, UnitCell, neo_hookean
 from remodel_fenicsx.model.energy import Tissue
-from remodel_fenicsx.model.residual_stress import ClosedRing, Layer, Loads, Rings, close_ring, cut, principal_stresses
+from remodel_fenicsx.model.residual_stress import (
+    ClosedRing,
+    Layer,
+    Loads,
+    Rings,
+    close_ring,
+    cut,
+    principal_stresses,
+)
 from tests.runs import last_row, made
 
 
 def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any) -> Scene:
     """An artery of isotropic cells whose opening angle is asked for."""
     values = {"cells.initial": "isotropic", "model.kinematics": kinematics, "mesh.degree": 2}
-    values |= {"output.columns": ["opening_angle"], "output.fields": False, "loads.pressure.ramp": [[0, 0], [5, 1]]}
+    values |= {
+        "output.columns": ["opening_angle"],
+        "output.fields": False,
+        "loads.pressure.ramp": [[0, 0], [5, 1]],
+    }
     values |= {"loads.elongation.ramp": [[0, 0], [5, 1]], "time.end": 20.0}
     return preset_scene(preset, "tube").with_values(values | changes)
 
@@ -70,7 +82,12 @@ def test_thin_layers_bend_to_the_closed_form_of_a_strip() -> None:
     natural = np.ones((48, 3))
     natural[radius > 1.0 + thickness / 2, 0] += shorter
     natural[:, [1, 2]] = natural[:, :1]
-    thin = Rings(radius, np.tile(weights, 16) * radius / natural.prod(axis=1), natural, isotropic(tissue)(radius))
+    thin = Rings(
+        radius,
+        np.tile(weights, 16) * radius / natural.prod(axis=1),
+        natural,
+        isotropic(tissue)(radius),
+    )
     poisson = tissue.lame_lambda / (2 * (tissue.lame_lambda + tissue.lame_mu))
     turns = 1.5 * (1 + poisson) * shorter / (1 + shorter / 2) / thickness
     assert cut(tissue, thin, edges) / 360.0 == pytest.approx(turns, rel=0.02)
@@ -91,13 +108,22 @@ def directed(request: pytest.FixtureRequest) -> Iterator[Scene]:
         for name in ("gasser_ogden_holzapfel", "second_network"):
             runpy.run_path(str(Path(__file__).parents[2] / "demos" / "extensions" / f"{name}.py"))
         yield scene(
-            **{"material.matrix": request.param, "remodeling.law": "none", "remodeling.coupling": "staggered"} | own
+            **{
+                "material.matrix": request.param,
+                "remodeling.law": "none",
+                "remodeling.coupling": "staggered",
+            }
+            | own
         )
 
 
 def test_a_closed_ring_of_a_directed_matrix_is_in_balance(directed: Scene) -> None:
     """Axial force from the energy's own derivative by F along x, y and z, the radius, circumference and length."""
-    unloaded = {"natural.opening_angle": 60.0, "loads.pressure.value": 0.0, "loads.elongation.value": 0.0}
+    unloaded = {
+        "natural.opening_angle": 60.0,
+        "loads.pressure.value": 0.0,
+        "loads.elongation.value": 0.0,
+    }
     columns = {"output.columns": ["opening_angle", "reduced_axial_force"], "mesh.refinement": 2}
     tissue, step = directed.properties()[""].tissue, 1e-30j
     with made(directed.with_values(unloaded | columns)) as simulation:
@@ -106,11 +132,16 @@ def test_a_closed_ring_of_a_directed_matrix_is_in_balance(directed: Scene) -> No
         first = next(iter(simulation.steps())).row
     around, along, across = np.moveaxis(closed.at_panels(), -1, 0)
     F = np.stack([across, around, along * np.exp(step)], axis=-1)[..., None] * np.eye(3)
-    cell = UnitCell(np.full((*around.shape, 3), tissue.end_to_end_length / 3**0.5), np.broadcast_to(np.eye(3), F.shape))
+    cell = UnitCell(
+        np.full((*around.shape, 3), tissue.end_to_end_length / 3**0.5),
+        np.broadcast_to(np.eye(3), F.shape),
+    )
     stress = np.imag(tissue.strain_energy(F, [cell])) / 1e-30 / (across * around * along)
     assert abs(closed.panels.integral(stress * closed.panels.places)) < 1e-10
     assert start["opening_angle"] == pytest.approx(60.0, abs=1e-6)
-    assert abs(start["reduced_axial_force"]) < 5e-4  # points on both sides of where fibres begin to pull
+    assert (
+        abs(start["reduced_axial_force"]) < 5e-4
+    )  # points on both sides of where fibres begin to pull
     assert first["inner_radius"] == pytest.approx(1.0, abs=2e-5)
 
 
@@ -118,55 +149,88 @@ def test_the_inverse_of_a_directed_matrix_is_the_unloaded_tube(directed: Scene) 
     row = last_row(directed.with_values({"mesh.refinement": 2, "output.columns": []}))
     layer = Layer((row["inner_radius"], row["outer_radius"]), directed.properties()[""].tissue)
     loads = Loads(directed.loads["pressure"].value, None, 1.0 + directed.loads["elongation"].value)
-    assert close_ring([layer], 0.0, loads).natural_radius(np.array(layer.radii)) == pytest.approx(RADII, abs=1e-4)
+    assert close_ring([layer], 0.0, loads).natural_radius(np.array(layer.radii)) == pytest.approx(
+        RADII, abs=1e-4
+    )
 
 
 def test_directions_that_do_not_follow_the_wall_are_refused(directed: Scene) -> None:
     directed.with_values({"model.kinematics": "axisymmetric"})
     for kinematics in ("full", "sector"):
-        with pytest.raises(SceneError, match="material.matrix = '[a-z-]+': has directions along x, y and z"):
+        with pytest.raises(
+            SceneError, match="material.matrix = '[a-z-]+': has directions along x, y and z"
+        ):
             directed.with_values({"model.kinematics": kinematics})
 
 
-def test_an_energy_that_takes_no_complex_numbers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_energy_that_takes_no_complex_numbers_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def of_absolutes(F: Any, lame_lambda: Any, lame_mu: Any) -> Any:
         stretch = F[..., 1, 1] - 1
         return neo_hookean(F, lame_lambda, lame_mu) + lame_mu * (stretch + abs(stretch)) ** 2
 
     monkeypatch.setitem(MATRICES, "of absolutes", of_absolutes)
     of = scene(**{"material.matrix": "of absolutes", "natural.opening_angle": 60.0})
-    with pytest.raises(SceneError, match="material.matrix, chain or repulsion: .* complex numbers"), made(of):
+    with (
+        pytest.raises(SceneError, match="material.matrix, chain or repulsion: .* complex numbers"),
+        made(of),
+    ):
         pass
 
 
 # ---------------------------------------------------------------- what a run shows
 def test_the_angle_converges() -> None:
     """Turnover with residual stress, a wall that grows with layers, and linear elements; with the mesh, to 0.05."""
-    turnover: dict[str, Any] = {"time": 17.0, "deposition_stretch": 1.1, "gain": 2.0, "rates": "cauchy"}
-    whole = {"natural.opening_angle": 120.0, "geometry.outer_radius": 1.3, "time.end": 12.0, "time.step": 1.0}
+    turnover: dict[str, Any] = {
+        "time": 17.0,
+        "deposition_stretch": 1.1,
+        "gain": 2.0,
+        "rates": "cauchy",
+    }
+    whole = {
+        "natural.opening_angle": 120.0,
+        "geometry.outer_radius": 1.3,
+        "time.end": 12.0,
+        "time.step": 1.0,
+    }
     whole |= {"loads.pressure.value": 1.2, "remodeling.turnover": turnover}
     growing = {"remodeling.turnover": turnover | {"volume": 0.3, "rates": "tension"}}
     growing |= {"natural.layers": [{"from": 0.5, "prestretch": {"axial": 0.93}}]}
     for changes in (whole, whole | growing, whole | {"mesh.degree": 1}):
-        coarse, fine = (angles(scene(**changes | {"mesh.refinement": number}))[-1] for number in (2, 4))
+        coarse, fine = (
+            angles(scene(**changes | {"mesh.refinement": number}))[-1] for number in (2, 4)
+        )
         assert coarse == pytest.approx(fine, abs=0.05) and abs(fine - 120.0) > 0.3
 
 
 @pytest.mark.parametrize("preset", ["kuhl-holzapfel-2007", "consistent"])
 def test_the_tangent_of_stresses_is_their_derivative(preset: str) -> None:
     """By logarithms of the stretches, of points whose cells differ; with turnover as arrays over the points."""
-    tissue = replace(scene(preset).properties()[""].tissue, content=np.array([1.0, 1.5]), natural_length=np.array(1.1))
-    stretches, cells = np.array([[1.2, 0.9, 0.95], [1.0, 1.3, 0.8]]), np.array([[0.6, 0.5, 0.6], [0.3, 0.9, 0.2]])
+    tissue = replace(
+        scene(preset).properties()[""].tissue,
+        content=np.array([1.0, 1.5]),
+        natural_length=np.array(1.1),
+    )
+    stretches, cells = np.array([[1.2, 0.9, 0.95], [1.0, 1.3, 0.8]]), np.array(
+        [[0.6, 0.5, 0.6], [0.3, 0.9, 0.2]]
+    )
     _, tangents = principal_stresses(tissue, stretches, cells)
     for axis, way in enumerate(1e-4 * np.eye(3)):
-        ahead, behind = (principal_stresses(tissue, stretches * np.exp(side * way), cells)[0] for side in (1, -1))
-        np.testing.assert_allclose(tangents[..., axis], (ahead - behind) / 2e-4, rtol=1e-4, atol=1e-4)
+        ahead, behind = (
+            principal_stresses(tissue, stretches * np.exp(side * way), cells)[0] for side in (1, -1)
+        )
+        np.testing.assert_allclose(
+            tangents[..., axis], (ahead - behind) / 2e-4, rtol=1e-4, atol=1e-4
+        )
 
 
 def test_tensor_and_log_leave_the_angle_as_it_was() -> None:
     """F_e = 1 is free of stress for every structure tensor: a cut of the remodeled tube opens by what was given."""
     for opening_angle in (0.0, 120.0):
-        found = angles(scene(**{"natural.opening_angle": opening_angle, "time.end": 40.0, "time.step": 2.5}))
+        found = angles(
+            scene(**{"natural.opening_angle": opening_angle, "time.end": 40.0, "time.step": 2.5})
+        )
         assert found == pytest.approx([opening_angle] * len(found), abs=1e-5)
 
 
@@ -183,7 +247,9 @@ def test_a_stiffer_inside_changes_the_cut() -> None:
 
     def cells(share: Any) -> Any:
         inside = 0.9 - 0.85 * share
-        return tissue.end_to_end_length**2 * np.stack([inside, 0.95 - inside, np.full_like(share, 0.05)], axis=1)
+        return tissue.end_to_end_length**2 * np.stack(
+            [inside, 0.95 - inside, np.full_like(share, 0.05)], axis=1
+        )
 
     axes_repulsion = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
     assert cut(tissue, rings(closed, cells), EDGES, closed) == pytest.approx(120.0, abs=1e-6)
@@ -191,7 +257,9 @@ def test_a_stiffer_inside_changes_the_cut() -> None:
     assert cut(axes_repulsion, fewer, EDGES, closed) != pytest.approx(120.0, abs=0.05)
 
 
-def test_no_equilibrium_of_the_cut_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_no_equilibrium_of_the_cut_is_said(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     def fails(*parts: Any) -> None:
         raise ArithmeticError("out of balance by 0.1")
 

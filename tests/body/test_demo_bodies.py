@@ -16,11 +16,21 @@ from remodel_fenicsx import cli
 DEMOS = Path(__file__).parents[2] / "demos"
 
 
-def test_the_bent_vessel_says_nothing_at_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_bent_vessel_says_nothing_at_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     line = [sys.executable, str(DEMOS / "bent_vessel" / "mesh.py"), str(tmp_path / "vessel.msh")]
     subprocess.run(line, check=True, capture_output=True, timeout=120)
-    path, few = shutil.copy(DEMOS / "bent_vessel" / "scene.toml", tmp_path), ["--set", "time.end=1", "-q"]
-    assert cli.main(["validate", path]) == cli.main(["run", path, "-o", str(tmp_path / "run"), *few]) == 0
+    path, few = shutil.copy(DEMOS / "bent_vessel" / "scene.toml", tmp_path), [
+        "--set",
+        "time.end=1",
+        "-q",
+    ]
+    assert (
+        cli.main(["validate", path])
+        == cli.main(["run", path, "-o", str(tmp_path / "run"), *few])
+        == 0
+    )
     said = capsys.readouterr()
     assert "WARNING" not in said.out + said.err + (tmp_path / "run" / "run.log").read_text()
 

@@ -18,7 +18,12 @@ from remodel_fenicsx.parts import Tube
 from tests.runs import rows_of, simulated
 
 FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
-ELASTIC = {"remodeling.law": "none", "remodeling.coupling": "staggered", "material.chain_density": 0.0, "time.end": 4.0}
+ELASTIC = {
+    "remodeling.law": "none",
+    "remodeling.coupling": "staggered",
+    "material.chain_density": 0.0,
+    "time.end": 4.0,
+}
 
 
 @pytest.fixture
@@ -42,14 +47,21 @@ def test_each_is_short() -> None:
 
 def test_a_turned_tube_has_the_shear_of_torsion(scene: Any) -> None:
     """sigma_ca = mu r theta / length, of an elastic tube that is turned by one degree; its end turns as a whole."""
-    changes = {**ELASTIC, "loads.torsion.value": 1.0, "loads.pressure.value": 0.0, "loads.elongation.value": 0.0}
+    changes = {
+        **ELASTIC,
+        "loads.torsion.value": 1.0,
+        "loads.pressure.value": 0.0,
+        "loads.elongation.value": 0.0,
+    }
     turned = scene("torsion").with_values(changes)
     with simulated(turned) as (simulation, rows):
         moved = simulation.unknown.x.array.reshape(-1, 3)
         nodes = simulation.unknown.function_space.tabulate_dof_coordinates()
         assert len(simulation.domain.mesh.geometry.x) == len(nodes)
     radius = 2 / 3 * (2.0**3 - 1.0**3) / (2.0**2 - 1.0**2)  # the mean over the wall
-    assert rows[-1]["shear_stress"] == pytest.approx(turned.material.lame_mu * radius * np.radians(1.0) / 3.0, rel=0.02)
+    assert rows[-1]["shear_stress"] == pytest.approx(
+        turned.material.lame_mu * radius * np.radians(1.0) / 3.0, rel=0.02
+    )
     top = nodes[:, 2] > 3.0 - 1e-9
     angle = np.angle((nodes + moved)[top] @ [1, 1j, 0]) - np.angle(nodes[top] @ [1, 1j, 0])
     np.testing.assert_allclose(np.degrees((angle + np.pi) % (2 * np.pi) - np.pi), 1.0, atol=1e-9)
@@ -63,7 +75,9 @@ def test_torsion_stands_beside_elongation_and_turns_the_collagen(scene: Any) -> 
     rows = rows_of(turned)
     assert rows[-1]["axial_elongation"] == pytest.approx(0.05) and rows[-1]["torsion"] == 20.0
     assert rows[-1]["shear_stress"] > 0.5 and rows[-1]["fibre_angle_inner"] < 44.0
-    with pytest.raises(SceneError, match="model.kinematics = 'radial': loads.torsion would have to be applied"):
+    with pytest.raises(
+        SceneError, match="model.kinematics = 'radial': loads.torsion would have to be applied"
+    ):
         turned.with_values({"model.kinematics": "radial"})
 
 
@@ -73,7 +87,10 @@ FIBRES = {
     "material.lame_lambda": 3e4, "material.fibre_stiffness": 5.0, "material.fibre_exponent": 2.0,
     "material.dispersion": 0.1, "material.family_angle": 40.0, "time.step": 1.0, **ELASTIC, "time.end": 3.0,
 }  # fmt: skip
-LOADS = ["loads.pressure={value=3.0,ramp=[[0.0,0.0],[3.0,1.0]]}", "loads.elongation.ramp=[[0.0,0.0],[1.0,1.0]]"]
+LOADS = [
+    "loads.pressure={value=3.0,ramp=[[0.0,0.0],[3.0,1.0]]}",
+    "loads.elongation.ramp=[[0.0,0.0],[1.0,1.0]]",
+]
 
 
 def test_fibres_that_stay_bear_a_tube_as_pymecht_says(tmp_path: Path) -> None:
@@ -84,7 +101,17 @@ def test_fibres_that_stay_bear_a_tube_as_pymecht_says(tmp_path: Path) -> None:
         for name, regions in (("one", {}), ("layers", layers)):
             words = [*(f"{key}={toml(value)}" for key, value in (FIBRES | regions).items()), *LOADS]
             asked = [part for word in words for part in ("--set", word)]
-            line = ["run", str(demo), "--with", str(script), *asked, "-q", "--no-report", "-o", str(tmp_path / name)]
+            line = [
+                "run",
+                str(demo),
+                "--with",
+                str(script),
+                *asked,
+                "-q",
+                "--no-report",
+                "-o",
+                str(tmp_path / name),
+            ]
             assert cli.main(line) == 0
             radii = Recording(tmp_path / name).history["inner_radius"]
             np.testing.assert_allclose(radii[1:], [1.23184606, 1.42517281, 1.52797886], rtol=1e-5)
@@ -100,15 +127,22 @@ def toml(value: Any) -> str:
 def test_lost_collagen_is_a_network_of_that_density(scene: Any) -> None:
     """At each time the cube is as long as one whose chain density is exp(-rate t) of the whole."""
     runpy.run_path(str(FOLDER / "decaying_collagen.py"))
-    cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"model.kinematics": "point", "time.end": 4.0})
+    cube = preset_scene("kuhl-holzapfel-2007", "cube").with_values(
+        {"model.kinematics": "point", "time.end": 4.0}
+    )
     still = {"remodeling.law": "none"}
     decaying = cube.with_values({**still, "remodeling.decay.rate": 0.3})
     assert decaying.remodeling.decay.rate == 0.3 and not cube.remodeling.decay.is_on  # type: ignore[attr-defined]
     assert Scene(**tomllib.loads(decaying.to_toml())) == decaying
     found = [row["mean_stretch"] for row in rows_of(decaying)]
     for number, stretch in enumerate(found, start=1):
-        less = {**still, "material.chain_density": cube.material.chain_density * np.exp(-0.3 * number)}
-        assert stretch == pytest.approx(rows_of(cube.with_values(less))[number - 1]["mean_stretch"], rel=1e-9)
+        less = {
+            **still,
+            "material.chain_density": cube.material.chain_density * np.exp(-0.3 * number),
+        }
+        assert stretch == pytest.approx(
+            rows_of(cube.with_values(less))[number - 1]["mean_stretch"], rel=1e-9
+        )
     remodeled = cube.with_values({"remodeling.decay.rate": 0.3})
     assert rows_of(remodeled)[-1]["mean_fibre_angle"] < 54.0  # the cells remodel beside it
     with pytest.raises(SceneError, match=r"remodeling\.decay\.rate = -1.0: must be .* at least 0"):

@@ -27,7 +27,9 @@ BODIES = {
 }
 
 
-def error(body: KnownBody, counts: tuple[int, int, int], kind: str, number: int) -> tuple[float, float]:
+def error(
+    body: KnownBody, counts: tuple[int, int, int], kind: str, number: int
+) -> tuple[float, float]:
     """Root of the mean square and largest error of c (0) or a (1), degrees."""
     made, quadrature = found(ring(body.place, counts, kind))
     off = apart(made.axes[..., number, :], body.directions(quadrature.coordinates)[number])
@@ -74,7 +76,9 @@ def test_depth_station_and_thickness_of_the_papers_wall(kind: str, most: float) 
     nodes = domain.mesh.geometry.x
     np.testing.assert_allclose(local.nodal_depth, body.depth(nodes), atol=1.5 * most)
     on_faces = np.isclose(body.depth(nodes) % 1.0, 0.0)
-    np.testing.assert_allclose(local.nodal_depth[on_faces], np.round(body.depth(nodes)[on_faces]), atol=1e-12)
+    np.testing.assert_allclose(
+        local.nodal_depth[on_faces], np.round(body.depth(nodes)[on_faces]), atol=1e-12
+    )
 
 
 def test_station_is_a_share_of_the_length_of_a_bend() -> None:
@@ -86,7 +90,9 @@ def test_station_is_a_share_of_the_length_of_a_bend() -> None:
 
 @pytest.mark.parametrize("kind, rms", [("hexahedron", 0.01), ("tetrahedron", 0.6)])
 def test_curved_elements_of_degree_two(kind: str, rms: float) -> None:
-    domain = parts.tube(element=kind, degree=2, divisions=(16, 2, 2), length=2.0, comm=MPI.COMM_SELF)
+    domain = parts.tube(
+        element=kind, degree=2, divisions=(16, 2, 2), length=2.0, comm=MPI.COMM_SELF
+    )
     domain.faces.update(inlet=domain.faces["bottom"], outlet=domain.faces["top"])
     made, quadrature = found(domain, 2)
     x, (body, _) = quadrature.coordinates, BODIES["straight"]
@@ -99,14 +105,22 @@ def test_curved_elements_of_degree_two(kind: str, rms: float) -> None:
 
 def test_axes_are_a_right_handed_frame_and_a_turned_body_has_turned_ones() -> None:
     """Also shifted, and with as many units of length as one likes."""
-    turn, shift = parts.random_rotations(np.random.default_rng(1), 1)[0], np.array([50.0, -30.0, 110.0])
+    turn, shift = parts.random_rotations(np.random.default_rng(1), 1)[0], np.array(
+        [50.0, -30.0, 110.0]
+    )
     body, counts = own_bodies.LEGS, (8, 2, 12)
     first, _ = found(ring(body.place, counts, "tetrahedron"))
-    moved = ring(lambda *shares: 1000.0 * body.place(*shares) @ turn.T + shift, counts, "tetrahedron")
+    moved = ring(
+        lambda *shares: 1000.0 * body.place(*shares) @ turn.T + shift, counts, "tetrahedron"
+    )
     second, _ = found(moved)
     axes = first.axes
-    np.testing.assert_allclose(axes @ np.swapaxes(axes, -1, -2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-12)
-    np.testing.assert_allclose(np.cross(axes[..., 0, :], axes[..., 1, :]), axes[..., 2, :], atol=1e-12)
+    np.testing.assert_allclose(
+        axes @ np.swapaxes(axes, -1, -2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.cross(axes[..., 0, :], axes[..., 1, :]), axes[..., 2, :], atol=1e-12
+    )
     np.testing.assert_allclose(second.axes, axes @ turn.T, atol=1e-6)
     np.testing.assert_allclose(second.depth, first.depth, atol=1e-6)
     np.testing.assert_allclose(second.station, first.station, atol=1e-6)
@@ -143,7 +157,9 @@ def test_a_fork_has_the_directions_of_its_branches_and_few_points_without() -> N
     places, known = x.reshape(-1, 3), ~made.undefined.ravel()
     rows = axes.reshape(-1, 3, 3)
     for point in np.flatnonzero(~known):
-        nearest = np.flatnonzero(known)[np.linalg.norm(places[known] - places[point], axis=1).argmin()]
+        nearest = np.flatnonzero(known)[
+            np.linalg.norm(places[known] - places[point], axis=1).argmin()
+        ]
         np.testing.assert_array_equal(rows[point], rows[nearest])
 
 
@@ -153,9 +169,16 @@ def test_an_inner_face_that_is_also_outside_is_refused_with_a_place() -> None:
     domain = ring(straight(1.0, 1.2, 8.0).place, (16, 1, 12), "tetrahedron")
     tags = domain.facet_tags
     upper = dolfinx.mesh.compute_midpoints(domain.mesh, 2, tags.indices)[:, 2] > 4.0
-    values = np.where((tags.values == domain.faces["outer"]) & upper, domain.faces["inner"], tags.values)
-    wrong = replace(domain, facet_tags=dolfinx.mesh.meshtags(domain.mesh, 2, tags.indices, values.astype(np.int32)))
-    with pytest.raises(UndefinedAxes, match=r"undefined in \d+ % of the wall, first at \(") as refused:
+    values = np.where(
+        (tags.values == domain.faces["outer"]) & upper, domain.faces["inner"], tags.values
+    )
+    wrong = replace(
+        domain,
+        facet_tags=dolfinx.mesh.meshtags(domain.mesh, 2, tags.indices, values.astype(np.int32)),
+    )
+    with pytest.raises(
+        UndefinedAxes, match=r"undefined in \d+ % of the wall, first at \("
+    ) as refused:
         found(wrong)
     text = re.search(r"first at \((.*)\);", str(refused.value))
     assert text is not None and float(text[1].split(",")[2]) > 3.0

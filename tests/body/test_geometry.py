@@ -26,7 +26,9 @@ _built = {}
 def domain_of(shape, element="hexahedron", degree=1, refinement=1):
     key = shape, element, degree, refinement
     if key not in _built:
-        _built[key] = BUILDERS[shape](element=element, degree=degree, refinement=refinement, comm=MPI.COMM_SELF)
+        _built[key] = BUILDERS[shape](
+            element=element, degree=degree, refinement=refinement, comm=MPI.COMM_SELF
+        )
     return _built[key]
 
 
@@ -49,19 +51,26 @@ def area(domain, face):
     facets = domain.facet_tags.find(domain.faces[face])
     one = dolfinx.mesh.meshtags(mesh, 2, facets, np.ones(len(facets), dtype=np.int32))
     measure = ufl.Measure("ds", domain=mesh, subdomain_data=one, metadata={"quadrature_degree": 8})
-    return dolfinx.fem.assemble_scalar(dolfinx.fem.form(dolfinx.fem.Constant(mesh, 1.0) * measure(1)))
+    return dolfinx.fem.assemble_scalar(
+        dolfinx.fem.form(dolfinx.fem.Constant(mesh, 1.0) * measure(1))
+    )
 
 
 # ---------------------------------------------------------------- counts
 @pytest.mark.parametrize(
-    ("shape", "cells", "nodes"), [("cube", 1, 8), ("tendon", 480, 57 * 11), ("tube", 1536, 16 * 9 * 13)]
+    ("shape", "cells", "nodes"),
+    [("cube", 1, 8), ("tendon", 480, 57 * 11), ("tube", 1536, 16 * 9 * 13)],
 )
 @pytest.mark.parametrize("refinement", [1, 2])
-def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(shape, cells, nodes, refinement):
+def test_hexahedra_are_the_papers_times_the_refinement_in_every_direction(
+    shape, cells, nodes, refinement
+):
     domain = domain_of(shape, refinement=refinement)
     assert domain.number_of_elements == cells * refinement**3
     tables = {"cube": Cube, "tendon": Tendon, "tube": Tube}
-    assert tables[shape].number_of_elements == cells  # by which a scene refuses a mesh before it is made
+    assert (
+        tables[shape].number_of_elements == cells
+    )  # by which a scene refuses a mesh before it is made
     refined = {"cube": 27, "tendon": (81 + 4 * 32) * 21, "tube": 32 * 17 * 25}
     assert domain.number_of_nodes == (nodes if refinement == 1 else refined[shape])
     assert domain.mesh.topology.cell_name() == "hexahedron"
@@ -77,14 +86,22 @@ def test_volumes_and_jacobians(shape, element, degree):
     assert np.min(inside / np.mean(inside, axis=1, keepdims=True)) > 0.5
     assert np.min(corners / np.mean(inside, axis=1, keepdims=True)) > 0.4
     polygon = 16 / 2 * np.sin(np.pi / 8)
-    exact = {"cube": 1.0, "tendon": 100.0, "tube": (polygon if degree == 1 else np.pi) * (9 - 1) * 8}[shape]
+    exact = {
+        "cube": 1.0,
+        "tendon": 100.0,
+        "tube": (polygon if degree == 1 else np.pi) * (9 - 1) * 8,
+    }[shape]
     tolerance = 1e-4 if (shape, degree) == ("tube", 2) else 1e-12
     assert np.sum(inside * weights) == pytest.approx(exact, rel=tolerance)
 
 
 @pytest.mark.parametrize(
     ("element", "degree", "refinement"),
-    [*((element, degree, 1) for element, degree in KINDS), ("hexahedron", 1, 2), ("hexahedron", 2, 2)],
+    [
+        *((element, degree, 1) for element, degree in KINDS),
+        ("hexahedron", 1, 2),
+        ("hexahedron", 2, 2),
+    ],
 )
 def test_the_area_of_the_meshed_tendon_is_the_scenes(element, degree, refinement):
     domain = domain_of("tendon", element, degree, refinement)
@@ -93,7 +110,9 @@ def test_the_area_of_the_meshed_tendon_is_the_scenes(element, degree, refinement
     assert area(domain, "top") == pytest.approx(10.0, rel=1e-12)
     radius, number = domain.dimensions["radius"], 16 * refinement
     if degree == 1:
-        assert area(domain, "side") == pytest.approx(number * 2 * radius * np.sin(np.pi / number) * 10.0, rel=1e-12)
+        assert area(domain, "side") == pytest.approx(
+            number * 2 * radius * np.sin(np.pi / number) * 10.0, rel=1e-12
+        )
         assert radius > np.sqrt(10.0 / np.pi)
     else:
         assert area(domain, "side") == pytest.approx(2 * np.sqrt(np.pi * 10.0) * 10.0, rel=1e-4)
@@ -123,7 +142,9 @@ def test_bodies_of_extreme_proportions_are_meshed(shape, lengths, unit):
     """At the limits that are allowed no two nodes become one, in any unit of length."""
     powers = (1, 2) if shape == "tendon" else (1, 1, 1)
     scaled = [length * unit**power for length, power in zip(lengths, powers, strict=False)]
-    domain, ordinary = BUILDERS[shape](*scaled, refinement=2, comm=MPI.COMM_SELF), domain_of(shape, refinement=2)
+    domain, ordinary = BUILDERS[shape](*scaled, refinement=2, comm=MPI.COMM_SELF), domain_of(
+        shape, refinement=2
+    )
     assert domain.number_of_elements == ordinary.number_of_elements
     assert domain.number_of_nodes == ordinary.number_of_nodes
 
@@ -135,7 +156,9 @@ def test_gmsh_is_left_as_it_was(capfd):
     handler = signal.getsignal(signal.SIGINT)
     cube(comm=MPI.COMM_SELF)
     assert not gmsh.isInitialized() and signal.getsignal(signal.SIGINT) is handler
-    gmsh.initialize(interruptible=False)  # else Gmsh would leave Ctrl-C deadly for all tests that follow
+    gmsh.initialize(
+        interruptible=False
+    )  # else Gmsh would leave Ctrl-C deadly for all tests that follow
     try:
         gmsh.model.add("somebody's")
         gmsh.model.geo.addPoint(0.0, 0.0, 0.0, tag=7)
@@ -157,4 +180,6 @@ def test_the_script_makes_the_mesh_files_again(tmp_path):
     script["make"](tmp_path)
     for name in script["MESHES"]:
         old, new = read_mesh(ROOT / "meshes" / name), read_mesh(tmp_path / name)
-        assert np.abs(old.points - new.points).max() < 1e-12 and np.array_equal(old.cells, new.cells)
+        assert np.abs(old.points - new.points).max() < 1e-12 and np.array_equal(
+            old.cells, new.cells
+        )

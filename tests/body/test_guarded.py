@@ -27,9 +27,15 @@ POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
 
 def good(path: Path) -> Path:
     """A tetrahedron with its number."""
-    meshio.Mesh(POINTS, [("tetra", [[0, 1, 2, 3]])], cell_data={"medit:ref": [np.array([1])]}).write(
+    meshio.Mesh(
+        POINTS, [("tetra", [[0, 1, 2, 3]])], cell_data={"medit:ref": [np.array([1])]}
+    ).write(
         path,
-        **({"binary": False} if path.suffix == ".vtu" else {"data_format": "XML"} if path.suffix == ".xdmf" else {}),
+        **(
+            {"binary": False}
+            if path.suffix == ".vtu"
+            else {"data_format": "XML"} if path.suffix == ".xdmf" else {}
+        ),
     )
     return path
 
@@ -50,7 +56,10 @@ def in_hdf5(path: Path) -> None:
         file["points"] = POINTS
     text = path.read_text()
     start, end = text.index("<DataItem"), text.index("</DataItem>")
-    item = '<DataItem DataType="Float" Dimensions="4 3" Format="HDF" Precision="8">' + f"{path.stem}.h5:/points"
+    item = (
+        '<DataItem DataType="Float" Dimensions="4 3" Format="HDF" Precision="8">'
+        + f"{path.stem}.h5:/points"
+    )
     path.write_bytes((text[:start] + item + text[end:]).encode("utf-16"))
 
 
@@ -58,18 +67,24 @@ def pipe(path: Path) -> None:
     os.mkfifo(path.with_name("pipe"))
     in_hdf5(path)
     path.write_text(
-        path.read_text("utf-16").replace(f"{path.stem}.h5", "pipe").replace('Format="HDF"', "Format='Binary'")
+        path.read_text("utf-16")
+        .replace(f"{path.stem}.h5", "pipe")
+        .replace('Format="HDF"', "Format='Binary'")
     )
 
 
 def block_size(path: Path) -> None:
     """Of compressed values: -8."""
     head = base64.b64encode(struct.pack("<qqq", -8, 8, 8)).decode()
-    vtk = '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="%s" '
+    vtk = (
+        '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="%s" '
+    )
     vtk += 'compressor="vtkZLibDataCompressor">'
     body = '<UnstructuredGrid><Piece NumberOfPoints="4" NumberOfCells="1"><Points>'
     body += '<DataArray type="Float64" NumberOfComponents="3" format="binary">'
-    path.write_text(f"{vtk % 'Int64'}{body}{head}</DataArray></Points></Piece></UnstructuredGrid></VTKFile>")
+    path.write_text(
+        f"{vtk % 'Int64'}{body}{head}</DataArray></Points></Piece></UnstructuredGrid></VTKFile>"
+    )
 
 
 def endless(path: Path) -> None:
@@ -82,7 +97,9 @@ def bomb(path: Path) -> None:
     """6 MB that unfold to 6 GiB."""
     size = 6 * 2**30 // 96
     packed = zlib.compress(bytes(size), 9)
-    head = base64.b64encode(struct.pack("<Q", 96) + struct.pack("<QQ", size, 0) + struct.pack("<Q", len(packed)) * 96)
+    head = base64.b64encode(
+        struct.pack("<Q", 96) + struct.pack("<QQ", size, 0) + struct.pack("<Q", len(packed)) * 96
+    )
     data = base64.b64encode(packed * 96)
     block_size(path)
     text = path.read_text().replace("Int64", "UInt64")
@@ -97,7 +114,11 @@ def pieces(path: Path) -> None:
 
 
 def included(path: Path) -> None:
-    changed(path, "<Domain>", '<Domain><xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>')
+    changed(
+        path,
+        "<Domain>",
+        '<Domain><xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>',
+    )
 
 
 def of_type(number: int) -> Callable[[Path], None]:
@@ -129,7 +150,9 @@ CASES: dict[str, tuple[str, Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_is_refused_in_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_refused_in_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each by its own rule: what the library would say of it is another matter."""
     if name in ("utf-16", "a bomb"):  # whose memory is looked at
         monkeypatch.setattr(guarded, "subprocess", subprocess)
@@ -180,7 +203,9 @@ READERS = {
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_a_new_reader_has_the_limits(reader: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_reader_has_the_limits(
+    reader: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if reader in ("never_ends", "takes_memory"):
         monkeypatch.setattr(guarded, "subprocess", subprocess)
     monkeypatch.setattr(guarded, "SECONDS", 1.0 if reader == "never_ends" else 2.0)

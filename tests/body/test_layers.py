@@ -24,9 +24,16 @@ from tests.values import isotropic, ramped
 SELF = MPI.COMM_SELF
 INTERFACE, END = 1.5, 12.0
 MEDIA = {"chain_density": 1.5e21, "lame_mu": 2.0, "contour_length": 1.7}
-ADVENTITIA = {"chain_density": 4.0e21, "lame_lambda": 40.0, "temperature": 320.0, "persistence_length": 1.2}
+ADVENTITIA = {
+    "chain_density": 4.0e21,
+    "lame_lambda": 40.0,
+    "temperature": 320.0,
+    "persistence_length": 1.2,
+}
 # pressure and elongation; those of laws whose cells jump where principal values cross let none cross
-LOADS = dict.fromkeys(("explicit", "tensor"), (3.0, 0.3)) | dict.fromkeys(("rate", "relaxation"), (4.8, 0.1))
+LOADS = dict.fromkeys(("explicit", "tensor"), (3.0, 0.3)) | dict.fromkeys(
+    ("rate", "relaxation"), (4.8, 0.1)
+)
 LENGTHS, R0 = [0.63, 0.63, 0.63], 0.63 * 3**0.5  # initial cells of the adventitia
 KAPPA = {"media": 0.06, "adventitia": 0.02}
 LAYERS: dict[str, Any] = {
@@ -76,7 +83,10 @@ def held_against(law: str, simulation: Simulation) -> tuple[float, float, float]
     radii = np.array([[step.row["inner_radius"], step.row["outer_radius"]] for step in steps])
     error = np.abs(radii / np.stack([exact.inner_radii, exact.outer_radii], axis=1) - 1).max()
     angle, domain = Measurement(simulation.observer, steps[-1]).fibre_angle, simulation.domain
-    means = [simulation.quadrature.nanmean(angle, domain.element_region == domain.regions[n]) for n in LAYERS]
+    means = [
+        simulation.quadrature.nanmean(angle, domain.element_region == domain.regions[n])
+        for n in LAYERS
+    ]
     known = exact.mean_fibre_angle(1.0, INTERFACE), exact.mean_fibre_angle(INTERFACE, 3.0)
     simulation.close()
     return float(error), *(abs(found - right) for found, right in zip(means, known, strict=True))
@@ -85,7 +95,9 @@ def held_against(law: str, simulation: Simulation) -> tuple[float, float, float]
 @pytest.mark.parametrize("law", ["explicit", "rate", "relaxation", "tensor"])
 def test_two_layers_on_one_radius_are_those_of_the_reference(law: str) -> None:
     """Parameters, kappa and initial cells by layer; 0.2 degrees and 0.3 % are asked for."""
-    radius, media, adventitia = held_against(law, Simulation(scene(law=law, **{"mesh.refinement": 4}), SELF))
+    radius, media, adventitia = held_against(
+        law, Simulation(scene(law=law, **{"mesh.refinement": 4}), SELF)
+    )
     print(law, radius, media, adventitia)
     assert radius < 3e-4 and media < 0.1 and adventitia < 0.1
 
@@ -95,7 +107,9 @@ def test_extrapolated_steps_come_to_the_limit_of_short_steps() -> None:
     known = []
     for short in (0.1, 0.05):
         exact = reference("tensor", short, 40)
-        known.append([exact.mean_fibre_angle(1.0, INTERFACE, -2), exact.mean_fibre_angle(INTERFACE, 3.0, -2)])
+        known.append(
+            [exact.mean_fibre_angle(1.0, INTERFACE, -2), exact.mean_fibre_angle(INTERFACE, 3.0, -2)]
+        )
     limit = 2 * np.array(known[1]) - np.array(known[0])
     changes = {"remodeling.coupling": "extrapolated", "time.step": 0.5, "material.repulsion": "log"}
     row = last_row(scene(law="tensor", **changes, **{"mesh.refinement": 2}))
@@ -112,9 +126,13 @@ def test_two_layers_in_three_dimensions_are_those_of_the_reference() -> None:
     assert radius < 3e-3 and media < 0.2 and adventitia < 0.2
 
 
-def write_layers(path: Path, radii: Any = (1.0, INTERFACE, 3.0), turn: Any = None, around: int = 12) -> Path:
+def write_layers(
+    path: Path, radii: Any = (1.0, INTERFACE, 3.0), turn: Any = None, around: int = 12
+) -> Path:
     """The same tube as a mesh file by the script of a demo, whose numbers are set and whose bend is left out."""
-    script: Any = runpy.run_path(str(Path(__file__).parents[2] / "demos" / "bent_vessel" / "mesh.py"))
+    script: Any = runpy.run_path(
+        str(Path(__file__).parents[2] / "demos" / "bent_vessel" / "mesh.py")
+    )
     numbers = {"RADII": radii, "LENGTH": 0.5, "AROUND": around, "THROUGH": 2, "ALONG": 1}
     script["straight"].__globals__.update(numbers)
     with gmsh_model("layers") as gmsh:
@@ -138,7 +156,9 @@ def test_two_layers_of_a_mesh_file_are_those_of_the_reference(tmp_path: Path) ->
         "output": {"fields": False, "columns": ["outer_area"]}, "mesh": {"formulation": "displacement"}, "model": {},
         "cells": {"initial": "isotropic"},
     }  # fmt: skip
-    values["regions"] = {name: {k: v for k, v in r.items() if k != "outer_radius"} for name, r in LAYERS.items()}
+    values["regions"] = {
+        name: {k: v for k, v in r.items() if k != "outer_radius"} for name, r in LAYERS.items()
+    }
     simulation, exact = Simulation(scene_from_dict(values), SELF), reference("explicit")
     steps = list(simulation.steps())
     length = np.array([0.5 * (1 + step.row["axial_elongation"]) for step in steps])
@@ -180,10 +200,14 @@ def test_initial_cells_of_a_region_are_drawn_as_those_of_the_body() -> None:
     """The same seed and element: the same cell; elsewhere what the region says."""
     made = scene({"media": {"outer_radius": 2.0, "cells": {"initial": "random"}}, "adventitia": {}},
                  **{"model.kinematics": "full", "mesh.degree": 1})  # fmt: skip
-    whole = Simulation(scene({}, **{"model.kinematics": "full", "mesh.degree": 1, "cells.initial": "random"}), SELF)
+    whole = Simulation(
+        scene({}, **{"model.kinematics": "full", "mesh.degree": 1, "cells.initial": "random"}), SELF
+    )
     layered = Simulation(made, SELF)
     media = layered.domain.element_region == layered.domain.regions["media"]
-    assert np.array_equal(layered.cells.dimension_values[media], whole.cells.dimension_values[media])
+    assert np.array_equal(
+        layered.cells.dimension_values[media], whole.cells.dimension_values[media]
+    )
     assert np.ptp(layered.cells.dimension_values[~media]) == 0.0
     for simulation in (whole, layered):
         simulation.close()

@@ -22,7 +22,12 @@ from tests.runs import last_row, made, simulated
 from tests.values import isotropic, ramped
 
 SELF = MPI.COMM_SELF
-LOADED = {"geometry.is": "loaded", "geometry.inner_radius": 1.4, "geometry.outer_radius": 3.05, "geometry.length": 2.2}
+LOADED = {
+    "geometry.is": "loaded",
+    "geometry.inner_radius": 1.4,
+    "geometry.outer_radius": 3.05,
+    "geometry.length": 2.2,
+}
 VIRGIN = {"remodeling.law": "none", "time.end": 25.0, "natural.opening_angle": 0.0}
 
 
@@ -62,8 +67,16 @@ def test_a_tube_comes_back_to_its_loaded_radii_and_length(
 
 def test_the_scan_of_a_tube_that_has_remodeled() -> None:
     """`natural.cells = "equilibrium"`: its unloaded radii by an independent solver, and back to the given ones."""
-    changes = {"natural.opening_angle": 0.0, "natural.cells": "equilibrium", "time.end": "equilibrium"}
-    changes |= {"remodeling.law": "tensor", "remodeling.coupling": "extrapolated", "material.repulsion": "log"}
+    changes = {
+        "natural.opening_angle": 0.0,
+        "natural.cells": "equilibrium",
+        "time.end": "equilibrium",
+    }
+    changes |= {
+        "remodeling.law": "tensor",
+        "remodeling.coupling": "extrapolated",
+        "material.repulsion": "log",
+    }
     found = unloaded(scene("radial", **(LOADED | {"geometry.length": 2.0} | changes)), SELF)
     shape: Any = found.geometry
     assert shape.inner_radius == pytest.approx(0.99114, abs=2e-4)
@@ -105,14 +118,20 @@ def test_every_node_of_an_own_body_comes_back(
     of = own_scene(tmp_path)
     assert cli.main(["unload", str(of), "-o", str(tmp_path / "found")]) == 0
     said = capsys.readouterr()
-    assert "nodes, largest movement 0.3647" in said.err and "unloaded: iteration 1, 100 % of the load" in said.err
+    assert (
+        "nodes, largest movement 0.3647" in said.err
+        and "unloaded: iteration 1, 100 % of the load" in said.err
+    )
     found = read_scene(tmp_path / "found" / "scene.toml")
     given = read_mesh(tmp_path / "loaded.msh").points
     np.testing.assert_allclose(nodes_of(found), given, rtol=0, atol=1e-9)
     refused("unload", of, "-o", tmp_path / "found")
     with RunLock(tmp_path / "other.part"):  # as another process does
         assert f"process {os.getpid()} on" in refused("unload", of, "-o", tmp_path / "other")
-    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == ["scene.toml", "unloaded.msh"]
+    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == [
+        "scene.toml",
+        "unloaded.msh",
+    ]
     assert cli.main(["run", str(of), "-o", str(tmp_path / "run"), "-q"]) == 0
     same = [read_mesh(tmp_path / name / "unloaded.msh").points for name in ("found", "run")]
     np.testing.assert_allclose(*same, rtol=0, atol=1e-11)
@@ -130,25 +149,35 @@ def test_two_ranks_find_the_same(cases: Cases) -> None:
     """Nodes of the body, and where its points lie before."""
     (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
     for name in ("x", "u"):
-        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-8)  # the solves have a tolerance of 1e-10
+        np.testing.assert_allclose(
+            two[name], one[name], rtol=0, atol=1e-8
+        )  # the solves have a tolerance of 1e-10
 
 
-def test_what_has_no_unloaded_shape_says_at_which_share(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_has_no_unloaded_shape_says_at_which_share(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Exit code 3, and nothing is left behind; from Python an exception."""
     thin = LOADED | VIRGIN | {"geometry.inner_radius": 3.0, "loads.pressure.value": 30.0}
     with pytest.raises(
-        NoUnloadedShape, match=r"no unloaded configuration at [\d.]+ % of the loads \(last converged: [\d.]+ %\)"
+        NoUnloadedShape,
+        match=r"no unloaded configuration at [\d.]+ % of the loads \(last converged: [\d.]+ %\)",
     ):
         unloaded(scene("radial", **thin), SELF)
     of = own_scene(tmp_path, pressure=500.0)
     assert cli.main(["run", str(of), "-o", str(tmp_path / "run"), "-q"]) == 3
-    assert "no unloaded configuration at" in capsys.readouterr().err and not (tmp_path / "run").exists()
+    assert (
+        "no unloaded configuration at" in capsys.readouterr().err
+        and not (tmp_path / "run").exists()
+    )
 
 
 def test_a_loaded_shape_that_turning_cells_leave_is_warned_of(tmp_path: Path) -> None:
     """By scene and run; the way out that the line names has a row with the given radii."""
     ramp = {f"loads.{name}.ramp": [[0.0, 1.0]] for name in ("pressure", "elongation")}
-    turning = scene("radial", **(LOADED | {"natural.opening_angle": 0.0, "loads.pressure.value": 1.2, **ramp}))
+    turning = scene(
+        "radial", **(LOADED | {"natural.opening_angle": 0.0, "loads.pressure.value": 1.2, **ramp})
+    )
     turning = turning.with_values({"time.end": 8.0, "time.step": 1.0})
     (line,) = (line for line in turning.warnings() if line.startswith("geometry.is = 'loaded': "))
     assert "natural.cells = 'equilibrium'" in line and "first step" in line
@@ -161,5 +190,7 @@ def test_a_loaded_shape_that_turning_cells_leave_is_warned_of(tmp_path: Path) ->
 
 
 def test_a_simulation_asks_for_the_unloaded_body() -> None:
-    with pytest.raises(SceneError, match="needs the unloaded body, from .*remodel-fenicsx unload SCENE"):
+    with pytest.raises(
+        SceneError, match="needs the unloaded body, from .*remodel-fenicsx unload SCENE"
+    ):
         Simulation(scene("radial", **(LOADED | VIRGIN)), SELF)

@@ -20,7 +20,9 @@ RADIUS, LENGTH, AROUND, ALONG = 1.0, 4.0, 48, 24
 Triangles = NDArray[np.int64]
 
 
-def tube(bend: float = 0.0, around: int = AROUND, along: int = ALONG) -> tuple[NDArray[np.float64], Triangles]:
+def tube(
+    bend: float = 0.0, around: int = AROUND, along: int = ALONG
+) -> tuple[NDArray[np.float64], Triangles]:
     """A grid of triangles around the z axis, perhaps along an arc, open at its ends, normals outwards."""
     z, turn = np.meshgrid(np.linspace(0, LENGTH, along + 1), 2 * np.pi * np.arange(around) / around)
     x, y = RADIUS * np.cos(turn), RADIUS * np.sin(turn)
@@ -68,7 +70,9 @@ def wall(*words: Any) -> int:
 @pytest.mark.parametrize(
     ("ending", "inwards"), [("stl", 0), ("STL", 1), ("ply", 1), ("obj", 0), ("vtp", 0), ("vtp", 1)]
 )
-def test_layers_have_their_volumes_whatever_the_file(ending: str, inwards: int, tmp_path: Path) -> None:
+def test_layers_have_their_volumes_whatever_the_file(
+    ending: str, inwards: int, tmp_path: Path
+) -> None:
     """Of a straight tube, whichever way its triangles look; one in three looks the other way."""
     points, triangles = tube()
     turned = triangles[:, ::-1] if inwards else triangles.copy()
@@ -85,7 +89,10 @@ def test_its_faces_lie_where_they_belong_and_a_scene_takes_it(tmp_path: Path) ->
     """Bent by a right angle: ends stay flat; the thickness comes from an array of the file."""
     points, triangles = tube(bend=np.pi / 2)
     thick = np.where(points[:, 1] > 0, 0.6, 0.3)
-    file, path = written(tmp_path / "lumen.vtp", points, triangles, wall=thick), tmp_path / "vessel.msh"
+    file, path = (
+        written(tmp_path / "lumen.vtp", points, triangles, wall=thick),
+        tmp_path / "vessel.msh",
+    )
     assert wall(file, "--thickness", "wall", "--size", 0.5, "--through", 3, "-o", path) == 0
     mesh = meshio.read(path)
     tags = mesh.get_cell_data("gmsh:physical", "triangle6")
@@ -98,22 +105,38 @@ def test_its_faces_lie_where_they_belong_and_a_scene_takes_it(tmp_path: Path) ->
     assert np.abs(places["inlet"][:, 2]).max() < 1e-9
     centre = -LENGTH / (np.pi / 2)
     assert np.abs(places["outlet_1"][:, 0] - centre).max() < 1e-6
-    distance = np.hypot(np.hypot(places["outer"][:, 0] - centre, places["outer"][:, 2]) + centre, places["outer"][:, 1])
-    assert distance.max() == pytest.approx(1.6, abs=0.05) and distance.min() == pytest.approx(1.3, abs=0.05)
-    geometry = {"shape": "mesh", "file": str(path), "length_unit": "mm", "faces": {"outlet": "outlet_1"}}
-    checked: Any = scene_from_dict({"geometry": geometry, "time": {"end": 1.0, "step": 1.0}}).geometry
+    distance = np.hypot(
+        np.hypot(places["outer"][:, 0] - centre, places["outer"][:, 2]) + centre,
+        places["outer"][:, 1],
+    )
+    assert distance.max() == pytest.approx(1.6, abs=0.05) and distance.min() == pytest.approx(
+        1.3, abs=0.05
+    )
+    geometry = {
+        "shape": "mesh",
+        "file": str(path),
+        "length_unit": "mm",
+        "faces": {"outlet": "outlet_1"},
+    }
+    checked: Any = scene_from_dict(
+        {"geometry": geometry, "time": {"end": 1.0, "step": 1.0}}
+    ).geometry
     assert checked.checked() is not None
 
 
 def test_a_branch_is_taken_and_its_ends_are_counted(tmp_path: Path) -> None:
     file, path = Path(__file__).with_name("files") / "branch.stl", tmp_path / "vessel.msh"
     assert wall(file, "--thickness", 0.3, "--size", 0.4, "-o", path) == 0
-    names = {name for name, (_, dimension) in meshio.read(path).field_data.items() if dimension == 2}
+    names = {
+        name for name, (_, dimension) in meshio.read(path).field_data.items() if dimension == 2
+    }
     assert names == {"inner", "outer", "inlet", "outlet_1", "outlet_2"}
     assert min(volumes(path).values()) > 0
 
 
-def with_words(points: Any, cells: Any, face: str = "vertex_indices", header: str = "", tail: str = "") -> str:
+def with_words(
+    points: Any, cells: Any, face: str = "vertex_indices", header: str = "", tail: str = ""
+) -> str:
     """A PLY file as text; polygons have a number of corners each."""
     lines = [
         "ply",
@@ -121,8 +144,15 @@ def with_words(points: Any, cells: Any, face: str = "vertex_indices", header: st
         f"element vertex {len(points)}",
         *(f"property float {c}" for c in ["x", "y", "z"]),
     ]
-    lines += [f"element face {len(cells)}", f"property list uchar int {face}", f"{header}end_header"]
-    rows = [" ".join(map(str, row)) for row in [*points.tolist(), *([len(c), *c] for c in cells.tolist())]]
+    lines += [
+        f"element face {len(cells)}",
+        f"property list uchar int {face}",
+        f"{header}end_header",
+    ]
+    rows = [
+        " ".join(map(str, row))
+        for row in [*points.tolist(), *([len(c), *c] for c in cells.tolist())]
+    ]
     return "\n".join([*lines, *rows, tail])
 
 
@@ -133,18 +163,22 @@ def as_programs_write(points: Any, triangles: Any) -> dict[str, bytes]:
     quads = np.stack([a, b, b + 1, a + 1], axis=-1).reshape(-1, 4)
     corners = ["vertex {:.6e} {:.6e} {:.6e}".format(*place) for place in points[triangles.ravel()]]
     facets = (
-        "\n".join(["facet normal 0 0 0", "outer loop", *c, "endloop", "endfacet"]) for c in zip(*[iter(corners)] * 3)
+        "\n".join(["facet normal 0 0 0", "outer loop", *c, "endloop", "endfacet"])
+        for c in zip(*[iter(corners)] * 3)
     )
     text = "\n".join(["solid lumen", *facets, "endsolid lumen\n"])
     places = "".join("v {} {} {}\n".format(*place) for place in points)
     coloured = places.replace("\n", " 0.5 0.5 0.5\n")
 
     def faces(form: str, cells: Any) -> str:
-        return "".join("f " + " ".join(form.format(k + 1, k % 2 + 1) for k in cell) + "\n" for cell in cells)
+        return "".join(
+            "f " + " ".join(form.format(k + 1, k % 2 + 1) for k in cell) + "\n" for cell in cells
+        )
 
     binary = ["ply", "format binary_big_endian 1.0", f"element vertex {len(points)}"]
     binary += [
-        f"property {kind} {c}" for kind, c in [("double", "x"), ("float", "y"), ("double", "z"), ("uchar", "red")]
+        f"property {kind} {c}"
+        for kind, c in [("double", "x"), ("float", "y"), ("double", "z"), ("uchar", "red")]
     ]
     binary += [
         f"element face {len(quads)}",
@@ -161,7 +195,10 @@ def as_programs_write(points: Any, triangles: Any) -> dict[str, bytes]:
         "capitals.stl": text.upper().encode(),
         "commas.stl": text.replace(".", ",").encode(),
         "texture.obj": (
-            "mtllib a.mtl\nvt 0 0\nvt 1 1\nvn 0 0 1\n" + places + "usemtl a\n" + faces("{}/{}/1", quads)
+            "mtllib a.mtl\nvt 0 0\nvt 1 1\nvn 0 0 1\n"
+            + places
+            + "usemtl a\n"
+            + faces("{}/{}/1", quads)
         ).encode(),
         "normals.obj": ("vn 0 0 1\n" + coloured + "l 1 2\n" + faces("{}//1", triangles)).encode(),
         "index.ply": with_words(points, triangles, "vertex_index").encode(),
@@ -170,7 +207,9 @@ def as_programs_write(points: Any, triangles: Any) -> dict[str, bytes]:
     }
 
 
-def test_files_of_many_programs_are_the_same_surface(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_of_many_programs_are_the_same_surface(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     points, triangles = tube()
     files = as_programs_write(points, triangles)
     named = dict.fromkeys(["triangles", "points", "file"], points[:, 2])
@@ -179,7 +218,10 @@ def test_files_of_many_programs_are_the_same_surface(tmp_path: Path, capsys: pyt
     for name, text in files.items():
         (tmp_path / name).write_bytes(text)
     for name in ("arrays.vtp", "arrays.ply", *files):
-        assert wall(tmp_path / name, "--thickness", 0.3, "--size", 0.5, "-o", tmp_path / f"{name}.msh") == 0
+        assert (
+            wall(tmp_path / name, "--thickness", 0.3, "--size", 0.5, "-o", tmp_path / f"{name}.msh")
+            == 0
+        )
         flat = 0.5 * AROUND * np.sin(2 * np.pi / AROUND) * RADIUS**2 * LENGTH
         assert f"triangles in {name} {flat:.4g}" in capsys.readouterr().out, name
 
@@ -190,15 +232,23 @@ def test_elements_bend_as_the_smooth_lumen(
 ) -> None:
     """Of an ellipse, whose curvature is nine times its mean at its tips, and of a torus."""
     points, triangles = tube(bend)
-    file, path = written(tmp_path / "lumen.ply", points * [wide, 1, 1], triangles), tmp_path / "vessel.msh"
+    file, path = (
+        written(tmp_path / "lumen.ply", points * [wide, 1, 1], triangles),
+        tmp_path / "vessel.msh",
+    )
     assert wall(file, "--thickness", 0.5, "--size", 0.5, "-o", path) == 0
     said = re.search(r"thickness ([\d.]+) to 0.5 at the nodes", capsys.readouterr().out)
     assert said is not None and float(said[1]) > 0.48
     mesh = meshio.read(path)
     face = mesh.get_cells_type("triangle6")[mesh.get_cell_data("gmsh:physical", "triangle6") == 1]
-    u, v = (np.array(each) for each in zip(*[(i / 16, j / 16) for i in range(17) for j in range(17 - i)], strict=True))
+    u, v = (
+        np.array(each)
+        for each in zip(*[(i / 16, j / 16) for i in range(17) for j in range(17 - i)], strict=True)
+    )
     w = 1 - u - v
-    shapes = np.array([w * (2 * w - 1), u * (2 * u - 1), v * (2 * v - 1), 4 * u * w, 4 * u * v, 4 * v * w])
+    shapes = np.array(
+        [w * (2 * w - 1), u * (2 * u - 1), v * (2 * v - 1), 4 * u * w, 4 * u * v, 4 * v * w]
+    )
     x, y, z = np.moveaxis(np.einsum("np,fnd->fpd", shapes, mesh.points[face]), 2, 0)
     if bend:
         x = np.hypot(x + LENGTH / bend, z) - LENGTH / bend
@@ -218,12 +268,16 @@ def closed() -> tuple[Any, Any]:
 
 def two() -> tuple[Any, Any]:
     points, triangles = tube()
-    return np.vstack([points, points + [5.0, 0, 0]]), np.vstack([triangles, triangles + len(points)])
+    return np.vstack([points, points + [5.0, 0, 0]]), np.vstack(
+        [triangles, triangles + len(points)]
+    )
 
 
 def of_three() -> tuple[Any, Any]:
     points, triangles = tube()
-    return np.vstack([points, [[2.0, 0, 2.0]]]), np.vstack([triangles, [[*triangles[7, :2], len(points)]]])
+    return np.vstack([points, [[2.0, 0, 2.0]]]), np.vstack(
+        [triangles, [[*triangles[7, :2], len(points)]]]
+    )
 
 
 def flat() -> tuple[Any, Any]:
@@ -249,7 +303,9 @@ def test_what_is_no_lumen_is_refused_in_one_line(
 ) -> None:
     file = written(tmp_path / "lumen.stl", *SURFACES[made]())
     size = [] if "--size" in words else ["--size", 0.5]
-    assert re.search(said, refused("wall", file, *words.split(), *size, "-o", tmp_path / "vessel.msh"))
+    assert re.search(
+        said, refused("wall", file, *words.split(), *size, "-o", tmp_path / "vessel.msh")
+    )
     assert list(tmp_path.iterdir()) == [file]
 
 
@@ -269,7 +325,9 @@ CUT = WORDS[: len(WORDS) * 3 // 4].encode()
         ("lumen.step", b""), ("lumen.vtp", b"<VTKFile type='PolyData'><xi:include href='/etc/passwd'/></VTKFile>"),
     ],
 )  # fmt: skip
-def test_files_that_are_none_are_refused_in_one_line(name: str, text: bytes, tmp_path: Path, refused: Refused) -> None:
+def test_files_that_are_none_are_refused_in_one_line(
+    name: str, text: bytes, tmp_path: Path, refused: Refused
+) -> None:
     (tmp_path / name).write_bytes(text)
     words = ("--thickness", 1, "--size", 1, "-o", tmp_path / "vessel.msh")
     said = refused("wall", tmp_path / name, *words)

@@ -26,7 +26,10 @@ from tests.conftest import mpirun
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import simulated
 
-LOADS = {name: {"value": value, "ramp": [[0, 0], [2, 1]]} for name, value in (("pressure", 2.0), ("elongation", 0.1))}
+LOADS = {
+    name: {"value": value, "ramp": [[0, 0], [2, 1]]}
+    for name, value in (("pressure", 2.0), ("elongation", 0.1))
+}
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 SHIFT = np.array([10.0, -3.0, 7.0])
 FREE = {"kind": "free"}
@@ -45,7 +48,11 @@ def solved(scene: Any, domain: Any = None) -> tuple[dict[str, float], Any, Any]:
     """The last row, displacement of the nodes and their places, in the order of the file."""
     with simulated(scene, domain) as (simulation, rows):
         displacement = simulation.state.gathered_displacement()
-        return rows[-1], displacement, simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x)
+        return (
+            rows[-1],
+            displacement,
+            simulation.domain.gather_nodes(simulation.domain.mesh.geometry.x),
+        )
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +67,9 @@ def of_the_file(tube: Path) -> tuple[dict[str, float], Any, Any]:
 
 def test_elements_of_a_file_are_those_of_a_body_that_is_drawn(tube: Path) -> None:
     """To the letter, which names their kernels in the cache."""
-    drawn = whole_tube(Tube(inner_radius=RADII[0], outer_radius=RADII[1], length=LENGTH), COUNTS, "hexahedron", 1)
+    drawn = whole_tube(
+        Tube(inner_radius=RADII[0], outer_radius=RADII[1], length=LENGTH), COUNTS, "hexahedron", 1
+    )
     own = Simulation(scene_of(tube), MPI.COMM_WORLD).domain
     one, other = (repr(body.mesh.ufl_domain().ufl_coordinate_element()) for body in (own, drawn))
     assert one == other
@@ -69,7 +78,9 @@ def test_elements_of_a_file_are_those_of_a_body_that_is_drawn(tube: Path) -> Non
 def test_a_tube_as_a_file_is_the_tube(of_the_file: Any) -> None:
     shape = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
     scene = scene_of(Path("none.msh"), geometry=shape, model={"kinematics": "full"})
-    made = whole_tube(Tube(inner_radius=RADII[0], outer_radius=RADII[1], length=LENGTH), COUNTS, "hexahedron", 1)
+    made = whole_tube(
+        Tube(inner_radius=RADII[0], outer_radius=RADII[1], length=LENGTH), COUNTS, "hexahedron", 1
+    )
     row, displacement, places = solved(scene, made)
     own, own_displacement, own_places = of_the_file
     order, other = np.lexsort(np.round(places, 6).T), np.lexsort(np.round(own_places, 6).T)
@@ -77,7 +88,10 @@ def test_a_tube_as_a_file_is_the_tube(of_the_file: Any) -> None:
     # ends are guided by springs, not exactly
     radii, own_radii = (
         np.hypot(*(x + u)[:, :2].T)
-        for x, u in ((places[order], displacement[order]), (own_places[other], own_displacement[other]))
+        for x, u in (
+            (places[order], displacement[order]),
+            (own_places[other], own_displacement[other]),
+        )
     )
     np.testing.assert_allclose(own_radii, radii, rtol=1e-4)
     np.testing.assert_allclose(own_displacement[other], displacement[order], atol=2e-4)
@@ -92,9 +106,13 @@ def test_a_tube_as_a_file_is_the_tube(of_the_file: Any) -> None:
 
 
 @pytest.mark.parametrize("shift", [SHIFT, (1.2e6, -8.5e5, 3.4e6)])
-def test_a_turned_and_shifted_file_has_the_same_rows(tmp_path: Path, of_the_file: Any, shift: Any) -> None:
+def test_a_turned_and_shifted_file_has_the_same_rows(
+    tmp_path: Path, of_the_file: Any, shift: Any
+) -> None:
     """Also a million of its radii away, as in the coordinates of a scanner."""
-    row, displacement, _ = solved(scene_of(write_tube(tmp_path / "turned.msh", turn=TURN, shift=shift)))
+    row, displacement, _ = solved(
+        scene_of(write_tube(tmp_path / "turned.msh", turn=TURN, shift=shift))
+    )
     own, own_displacement, _ = of_the_file
     np.testing.assert_allclose(displacement, own_displacement @ TURN.T, atol=1e-6)
     for name in set(row) - {"seconds", "newton_iterations", "linear_iterations"}:
@@ -108,9 +126,13 @@ def test_the_file_of_another_unit(tmp_path: Path, of_the_file: Any) -> None:
     assert row["lumen_volume"] == pytest.approx(of_the_file[0]["lumen_volume"], rel=1e-8)
 
 
-@pytest.mark.parametrize(("element", "degree"), [("tetrahedron", 1), ("hexahedron", 2), ("tetrahedron", 2)])
+@pytest.mark.parametrize(
+    ("element", "degree"), [("tetrahedron", 1), ("hexahedron", 2), ("tetrahedron", 2)]
+)
 @pytest.mark.parametrize("version", [2.2, 4.1])
-def test_element_and_degree_are_those_of_the_file(tmp_path: Path, element: str, degree: int, version: float) -> None:
+def test_element_and_degree_are_those_of_the_file(
+    tmp_path: Path, element: str, degree: int, version: float
+) -> None:
     scene = scene_of(write_tube(tmp_path / "tube.msh", element, degree, version))
     assert (scene.mesh.element, scene.mesh.degree) == (element, degree)
     domain = scene.geometry.build(scene.mesh, MPI.COMM_SELF)
@@ -123,10 +145,14 @@ def test_element_and_degree_are_those_of_the_file(tmp_path: Path, element: str, 
 
 def test_held_ends_move_as_they_are_told(tube: Path) -> None:
     supports = {"inlet": {"kind": "held"}, "outlet": {"kind": "held"}}
-    _, displacement, places = solved(scene_of(tube, supports=supports, time={"end": 1.0, "step": 1.0}))
+    _, displacement, places = solved(
+        scene_of(tube, supports=supports, time={"end": 1.0, "step": 1.0})
+    )
     np.testing.assert_allclose(displacement[places[:, 2] < 1e-9], 0.0, atol=1e-12)
     np.testing.assert_allclose(
-        displacement[places[:, 2] > LENGTH - 1e-9], np.tile([0, 0, 0.05 * LENGTH], (24, 1)), atol=1e-12
+        displacement[places[:, 2] > LENGTH - 1e-9],
+        np.tile([0, 0, 0.05 * LENGTH], (24, 1)),
+        atol=1e-12,
     )
 
 
@@ -146,7 +172,9 @@ SPRINGS = {"kind": "elastic", "stiffness": 1.0}
 def test_every_free_rigid_motion_counts(tube: Path, supports: Any, free: int) -> None:
     scene = scene_of(tube)
     parts = scene.geometry.build(scene.mesh, MPI.COMM_SELF).boundary.faces
-    chosen = {"inlet": Support(), "outlet": Support()} | {name: Support(**one) for name, one in supports.items()}
+    chosen = {"inlet": Support(), "outlet": Support()} | {
+        name: Support(**one) for name, one in supports.items()
+    }
     assert free_motions(parts, chosen) == free
 
 
@@ -195,7 +223,11 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
     scene = tmp_path / "vessel.toml"
     scene.write_text(RUN)
     folders = {name: str(tmp_path / name) for name in ("whole", "three", "one")}
-    begin, go_on = (lambda name: ["run", str(scene), "-o", folders[name]]), ["--no-report", "--set", "time.end=1"]
+    begin, go_on = (lambda name: ["run", str(scene), "-o", folders[name]]), [
+        "--no-report",
+        "--set",
+        "time.end=1",
+    ]
     assert run(*begin("whole"), "--no-report").returncode == 0
     assert run(*begin("one"), *go_on).returncode == 0
     commands = {
@@ -205,13 +237,21 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
     (tmp_path / "commands.json").write_text(json.dumps(commands))
     program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(tmp_path)]
     done = subprocess.run(mpirun(3, *program), capture_output=True, text=True, timeout=300)
-    assert json.loads((tmp_path / "codes.json").read_text()) == {"three": [0] * 3, "one": [0] * 3}, done.stderr
+    assert json.loads((tmp_path / "codes.json").read_text()) == {
+        "three": [0] * 3,
+        "one": [0] * 3,
+    }, done.stderr
     copy = tmp_path / "three" / "tube.msh"
     assert copy.read_bytes() == file.read_bytes()
     file.unlink()  # the run has its own
     for name in ("three", "one"):
-        assert run("run", "--resume", folders[name], "--set", "time.end=3", "--no-report").returncode == 0
-        np.testing.assert_allclose(_history(tmp_path / name), _history(tmp_path / "whole"), rtol=1e-8, atol=1e-10)
+        assert (
+            run("run", "--resume", folders[name], "--set", "time.end=3", "--no-report").returncode
+            == 0
+        )
+        np.testing.assert_allclose(
+            _history(tmp_path / name), _history(tmp_path / "whole"), rtol=1e-8, atol=1e-10
+        )
     copy.write_text(copy.read_text() + "\n")
     refused = run("run", "--resume", folders["three"], "--set", "time.end=5")
     assert refused.returncode == 2
@@ -275,10 +315,17 @@ def test_a_bend_with_sliding_ends_carries_the_force_of_a_closed_tube(tmp_path: P
     half_way = np.abs(np.arctan2(places[..., 2], places[..., 0] + bend) - np.pi / 4) < np.pi / 10
     beside = np.abs(np.degrees(np.arctan2(np.abs(y), x)) - 90) < 180 / counts[0]
     shape = {"shape": "tube", "inner_radius": inner, "outer_radius": outer, "length": length}
-    closed = {"supports": {"ends": "closed"}, "model": {"kinematics": "radial"}, "mesh": {"degree": 2, "refinement": 2}}
+    closed = {
+        "supports": {"ends": "closed"},
+        "model": {"kinematics": "radial"},
+        "mesh": {"degree": 2, "refinement": 2},
+    }
     straight = Simulation(scene_of(Path(), geometry=shape, **closed, **tables), MPI.COMM_SELF)
     step = list(straight.steps())[-1]
-    known, radius = Measurement(straight.observer, step).fibre_angle, straight.cells.local_axes.coordinates[..., 0]
+    known, radius = (
+        Measurement(straight.observer, step).fibre_angle,
+        straight.cells.local_axes.coordinates[..., 0],
+    )
     straight.close()
     order = np.argsort(radius, axis=None)
     straight_share = (radius.ravel()[order] - inner) / (outer - inner)
@@ -287,7 +334,9 @@ def test_a_bend_with_sliding_ends_carries_the_force_of_a_closed_tube(tmp_path: P
     for low in np.arange(3) / 3:
         band = (depth >= low) & (depth < low + 1 / 3) & half_way
         spread.append(float(np.ptp(angle[band] - expected[band])))
-        assert angle[band & beside].mean() == pytest.approx(expected[band & beside].mean(), abs=1.0), low
+        assert angle[band & beside].mean() == pytest.approx(
+            expected[band & beside].mean(), abs=1.0
+        ), low
     assert min(spread) > 2.0  # and around the section they differ, as a bend's do
 
 
@@ -303,6 +352,9 @@ def test_a_flat_inner_face_encloses_no_lumen(tmp_path: Path) -> None:
         gmsh.model.mesh.generate(3)
         gmsh.write(str(tmp_path / "strip.msh"))
     geometry = {"shape": "mesh", "file": str(tmp_path / "strip.msh"), "open_boundary": True}
-    tables: Any = {"loads": LOADS | {"pressure": LOADS["pressure"] | {"value": 0.0}}, "remodeling": {}}
+    tables: Any = {
+        "loads": LOADS | {"pressure": LOADS["pressure"] | {"value": 0.0}},
+        "remodeling": {},
+    }
     row, _, _ = solved(scene_of(tmp_path / "strip.msh", geometry=geometry, **tables))
     assert np.isnan(row["lumen_volume"]) and row["fibre_angle_inner"] > 45.0

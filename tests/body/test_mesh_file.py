@@ -22,14 +22,19 @@ SCENE = '[geometry]\nshape = "mesh"\nfile = "{}"\n[time]\nend = 1.0\nstep = 1.0\
 
 def refusal(file: Path, **geometry: Any) -> str:
     """What is said of a file."""
-    values = {"geometry": {"shape": "mesh", "file": str(file), **geometry}, "time": {"end": 1.0, "step": 1.0}}
+    values = {
+        "geometry": {"shape": "mesh", "file": str(file), **geometry},
+        "time": {"end": 1.0, "step": 1.0},
+    }
     with pytest.raises(SceneError) as error:
         scene_from_dict(values).geometry.checked()
     return str(error.value)
 
 
 @pytest.mark.parametrize(("damage", "old", "new", "words"), rows(__file__, "damaged_meshes.txt"))
-def test_a_damaged_file_is_refused(tmp_path: Path, damage: str, old: str, new: str, words: str) -> None:
+def test_a_damaged_file_is_refused(
+    tmp_path: Path, damage: str, old: str, new: str, words: str
+) -> None:
     said = refusal(changed(tmp_path / "bad.msh", (unescaped(old), unescaped(new))))
     assert re.search(words, said) and "\n" not in said, said
 
@@ -51,7 +56,9 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(version: float, tmp_path: Pa
 
 @pytest.mark.parametrize("more", ["1 2 x", "1 2 3"])
 @pytest.mark.parametrize("section", ["Nodes", "Elements", "Entities"])
-def test_more_lines_than_announced_in_format_4_are_refused(tmp_path: Path, section: str, more: str) -> None:
+def test_more_lines_than_announced_in_format_4_are_refused(
+    tmp_path: Path, section: str, more: str
+) -> None:
     source = write_tube(tmp_path / "tube.msh")
     end = (f"$End{section}", f"{more}\n$End{section}")
     said = refusal(changed(tmp_path / "bad.msh", end, source=source))
@@ -79,30 +86,44 @@ def test_faces_that_the_file_has_not(geometry: str, words: str) -> None:
     assert words in refusal(TUBE, **values(geometry))
 
 
-@pytest.mark.parametrize("file", ["lumen.stl", "vessel.inp", "vessel.pvtu", "vessel.msh.gz", "vessel", "", "a/b.txt"])
+@pytest.mark.parametrize(
+    "file", ["lumen.stl", "vessel.inp", "vessel.pvtu", "vessel.msh.gz", "vessel", "", "a/b.txt"]
+)
 @pytest.mark.parametrize("known", [{}, {"element": "hexahedron", "degree": 1}])
-def test_another_ending_is_refused_by_key_and_value(tmp_path: Path, file: str, known: dict[str, Any]) -> None:
+def test_another_ending_is_refused_by_key_and_value(
+    tmp_path: Path, file: str, known: dict[str, Any]
+) -> None:
     """As the scene has it, whether or not element and degree have to be read from the file."""
     (tmp_path / "scene.toml").write_text(SCENE.format(file))
     settings = [f"mesh.{key}={value}" for key, value in known.items()]
     with pytest.raises(SceneError) as error:
         read_scene(tmp_path / "scene.toml", settings)
-    assert str(error.value).startswith(f"geometry.file = {file!r}: must be the path of a mesh (.msh, ")
+    assert str(error.value).startswith(
+        f"geometry.file = {file!r}: must be the path of a mesh (.msh, "
+    )
 
 
 def test_a_body_of_another_unit_is_refused(tmp_path: Path) -> None:
     large = write_tube(tmp_path / "large.msh", turn=1e3 * np.eye(3))
     said = refusal(large, file_unit="m", length_unit="um")
-    assert "the body is 4e+09 long in the scene's unit; must be 1e-06 to 1e+06 (geometry.file_unit" in said
+    assert (
+        "the body is 4e+09 long in the scene's unit; must be 1e-06 to 1e+06 (geometry.file_unit"
+        in said
+    )
 
 
 def test_an_open_boundary_is_allowed_when_asked(tmp_path: Path) -> None:
     bad = changed(tmp_path / "open.msh", ("\n23 3 2 3 61 2 55 53 3\n", "\n23 15 2 3 61 2\n"))
-    values = {"geometry": {"shape": "mesh", "file": str(bad), "open_boundary": True}, "time": {"end": 1.0, "step": 1.0}}
+    values = {
+        "geometry": {"shape": "mesh", "file": str(bad), "open_boundary": True},
+        "time": {"end": 1.0, "step": 1.0},
+    }
     assert scene_from_dict(values).geometry.checked()
 
 
-def test_a_wall_of_one_element_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wall_of_one_element_is_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     thin = write_tube(tmp_path / "thin.msh", counts=(8, 1, 2))
     values = {"geometry": {"shape": "mesh", "file": str(thin)}, "time": {"end": 1.0, "step": 1.0}}
     scene_from_dict(values).geometry.checked()
@@ -127,7 +148,10 @@ def test_a_partitioned_mesh_is_the_whole_one(tmp_path: Path) -> None:
         gmsh.write(str(files["parametric"]))
     for file in files.values():
         found = read_mesh(file)
-        assert found.names == whole.names and (np.sort(found.cell_groups) == np.sort(whole.cell_groups)).all()
+        assert (
+            found.names == whole.names
+            and (np.sort(found.cell_groups) == np.sort(whole.cell_groups)).all()
+        )
         for number in whole.names[2].values():
             assert (found.facet_groups == number).sum() == (whole.facet_groups == number).sum()
 
@@ -139,10 +163,14 @@ def test_elements_are_in_the_order_of_the_file(version: float, tmp_path: Path) -
     if version == 2.2:
         lines = file.read_text().splitlines()
         solid = [number for number, line in enumerate(lines) if re.match(r"\d+ 4 2 5 ", line)]
-        for place, number in enumerate(solid[::-1]):  # other numbers, and every other element in a group of its own
+        for place, number in enumerate(
+            solid[::-1]
+        ):  # other numbers, and every other element in a group of its own
             _, *words = lines[number].split()
             lines[number] = " ".join([str(10**6 + place), *words[:2], "56"[place % 2], *words[3:]])
         file.write_text("\n".join(lines) + "\n")
     mesh, found = meshio.read(file), read_mesh(file)
-    np.testing.assert_array_equal(mesh.points[mesh.get_cells_type("tetra")], found.points[found.cells])
+    np.testing.assert_array_equal(
+        mesh.points[mesh.get_cells_type("tetra")], found.points[found.cells]
+    )
     np.testing.assert_array_equal(mesh.get_cell_data("gmsh:physical", "tetra"), found.cell_groups)

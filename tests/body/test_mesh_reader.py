@@ -39,7 +39,11 @@ def converted(source: Path, ending: str, **arrays: Any) -> Path:
 
 
 def numbers_of(source: Path) -> dict[str, int]:
-    return {name: int(number) for name, (number, dimension) in meshio.read(source).field_data.items() if dimension == 2}
+    return {
+        name: int(number)
+        for name, (number, dimension) in meshio.read(source).field_data.items()
+        if dimension == 2
+    }
 
 
 def sorted_rows(table: Any) -> Any:
@@ -55,20 +59,29 @@ def test_the_mesh_is_that_of_gmsh(tmp_path: Path, ending: str, element: str, deg
     source = write_tube(tmp_path / "tube.msh", element, degree)
     one, other = read_mesh(source), read_mesh(converted(source, ending))
     assert (other.kind, other.degree) == (element, degree)
-    places = [sorted_rows(file.points[file.cells].reshape(len(file.cells), -1)) for file in (one, other)]
+    places = [
+        sorted_rows(file.points[file.cells].reshape(len(file.cells), -1)) for file in (one, other)
+    ]
     assert np.abs(places[0] - places[1]).max() < 1e-12
     assert jacobian_determinants(other).min() > 0 or jacobian_determinants(other).max() < 0
     for number in mesh_file.unique_in_order(one.facet_groups):
-        sides = [file.points[file.facets[file.facet_groups == number]].mean(axis=1) for file in (one, other)]
+        sides = [
+            file.points[file.facets[file.facet_groups == number]].mean(axis=1)
+            for file in (one, other)
+        ]
         assert np.abs(sorted_rows(sides[0].round(9)) - sorted_rows(sides[1].round(9))).max() < 1e-8
 
 
 PACKED = [
-    ("vtu", mode, packer) for mode in ("Ascii", "Binary", "Appended", "raw") for packer in ("None", "LZ4", "LZMA")
+    ("vtu", mode, packer)
+    for mode in ("Ascii", "Binary", "Appended", "raw")
+    for packer in ("None", "LZ4", "LZMA")
 ]
 
 
-@pytest.mark.parametrize(("ending", "mode", "packer"), [*PACKED, ("vtk", "Ascii", ""), ("vtk", "Binary", "")])
+@pytest.mark.parametrize(
+    ("ending", "mode", "packer"), [*PACKED, ("vtk", "Ascii", ""), ("vtk", "Binary", "")]
+)
 def test_what_vtk_writes_is_read(tmp_path: Path, ending: str, mode: str, packer: str) -> None:
     """In each of the ways in which its writers, and so ParaView and PyVista, pack numbers."""
     io = pytest.importorskip("vtkmodules.vtkIOXML" if ending == "vtu" else "vtkmodules.vtkIOLegacy")
@@ -76,7 +89,9 @@ def test_what_vtk_writes_is_read(tmp_path: Path, ending: str, mode: str, packer:
     reader = pytest.importorskip("vtkmodules.vtkIOXML").vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(source))
     reader.Update()
-    writer = getattr(io, "vtkXMLUnstructuredGridWriter" if ending == "vtu" else "vtkUnstructuredGridWriter")()
+    writer = getattr(
+        io, "vtkXMLUnstructuredGridWriter" if ending == "vtu" else "vtkUnstructuredGridWriter"
+    )()
     writer.SetInputData(reader.GetOutput())
     writer.SetFileName(str(tmp_path / f"packed.{ending}"))
     if ending == "vtu":
@@ -92,7 +107,9 @@ def test_what_vtk_writes_is_read(tmp_path: Path, ending: str, mode: str, packer:
     np.testing.assert_array_equal(one.facet_groups, other.facet_groups)
 
 
-def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_wedges_are_split_into_tetrahedra_that_fit_each_other(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """A wall of prisms, as boundary layers are; its volume, and no facet but those of its faces."""
     points, triangles = tube()
     size, levels = len(points), [1.0, 1.2, 1.5]
@@ -100,23 +117,35 @@ def test_wedges_are_split_into_tetrahedra_that_fit_each_other(tmp_path: Path, ca
     order = rng.permutation(3 * size)  # any corner may be the smallest
     whole = np.empty((3 * size, 3))
     whole[order] = np.concatenate([points * [level, level, 1.0] for level in levels])
-    wedges = np.concatenate([np.hstack([triangles + k * size, triangles + (k + 1) * size]) for k in range(2)])
+    wedges = np.concatenate(
+        [np.hstack([triangles + k * size, triangles + (k + 1) * size]) for k in range(2)]
+    )
     quads = [
-        np.concatenate([np.hstack([rim + k * size, rim[:, ::-1] + (k + 1) * size]) for k in range(2)])
+        np.concatenate(
+            [np.hstack([rim + k * size, rim[:, ::-1] + (k + 1) * size]) for k in range(2)]
+        )
         for rim in rims(triangles)
     ]
     cells = [("wedge", wedges), ("triangle", triangles), ("triangle", triangles + 2 * size)]
     cells += [("quad", quad) for quad in quads]
     tags = [np.full(len(rows), number) for number, (_, rows) in enumerate(cells)]
-    mesh = meshio.Mesh(whole, [(kind, order[rows]) for kind, rows in cells], cell_data={"medit:ref": tags})
+    mesh = meshio.Mesh(
+        whole, [(kind, order[rows]) for kind, rows in cells], cell_data={"medit:ref": tags}
+    )
     mesh.write(tmp_path / "wall.vtu")
     faces = {"inner": 1, "outer": 2, "inlet": 3, "outlet": 4}
     caplog.set_level("INFO")
     file, boundary, _ = scene_of(tmp_path / "wall.vtu", faces=faces).geometry.checked()
-    assert file.kind == "tetrahedron" and len(file.cells) == 3 * len(wedges) and "each wedge is split" in caplog.text
+    assert (
+        file.kind == "tetrahedron"
+        and len(file.cells) == 3 * len(wedges)
+        and "each wedge is split" in caplog.text
+    )
     sides = file.points[file.cells[:, 1:]] - file.points[file.cells[:, :1]]
     volumes = np.linalg.det(sides) / 6
-    assert volumes.min() > 0 and volumes.sum() == pytest.approx(np.pi * (1.5**2 - 1.0) * 4.0, rel=0.01)
+    assert volumes.min() > 0 and volumes.sum() == pytest.approx(
+        np.pi * (1.5**2 - 1.0) * 4.0, rel=0.01
+    )
 
 
 def scene_of(file: Path, **geometry: Any) -> Any:
@@ -140,15 +169,21 @@ def test_a_med_file_is_converted_as_the_docs_say(tmp_path: Path, sign: int) -> N
     subprocess.run(shlex.split(command[1]), cwd=tmp_path, check=True)
     faces = {name: sign * number for name, number in numbers_of(source).items()}
     _, boundary, _ = scene_of(tmp_path / "b.vtu", faces=faces, tags="cell_tags").geometry.checked()
-    assert boundary.area("inner") == pytest.approx(scene_of(source).geometry.checked()[1].area("inner"))
+    assert boundary.area("inner") == pytest.approx(
+        scene_of(source).geometry.checked()[1].area("inner")
+    )
 
 
 def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
     source = write_tube(tmp_path / "tube.msh")
     file, names = converted(source, ".vtu"), numbers_of(source)
-    with pytest.raises(SceneError, match=r"geometry.faces.inner = 'inner': the file has no such face; it has \d"):
+    with pytest.raises(
+        SceneError, match=r"geometry.faces.inner = 'inner': the file has no such face; it has \d"
+    ):
         scene_of(file).geometry.checked()
-    with pytest.raises(SceneError, match="geometry.regions.media = 99: the file has no such volume; it has"):
+    with pytest.raises(
+        SceneError, match="geometry.regions.media = 99: the file has no such volume; it has"
+    ):
         scene_of(file, faces=names, regions={"media": 99}).geometry.checked()
     with pytest.raises(SceneError, match="has no array 'parts' with the numbers of faces"):
         scene_of(file, faces=names, tags="parts")
@@ -156,7 +191,9 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
         read_mesh(tmp_path / "other.vtu")
     half = tmp_path / "half.vtu"
     half.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(UnreadableFile, match="cannot be read: .*; save it as VTU with data mode ASCII"):
+    with pytest.raises(
+        UnreadableFile, match="cannot be read: .*; save it as VTU with data mode ASCII"
+    ):
         read_mesh(half)
 
 
@@ -170,10 +207,14 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
     ],
 )
 def test_other_meshes_are_refused(tmp_path: Path, cells: Any, tags: Any, words: str) -> None:
-    places = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]])
+    places = np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]
+    )
     arrays = {"medit:ref": [np.array(values) for values in tags]}
     mesh = meshio.Mesh(
-        places, [(kind, np.array([list(row) for row in rows])) for kind, rows in cells], cell_data=arrays
+        places,
+        [(kind, np.array([list(row) for row in rows])) for kind, rows in cells],
+        cell_data=arrays,
     )
     mesh.write(tmp_path / "one.vtu")
     with pytest.raises(UnreadableFile, match=words):
@@ -185,11 +226,17 @@ def test_other_meshes_are_refused(tmp_path: Path, cells: Any, tags: Any, words: 
 
 @pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize(("refinement", "degree"), [(2, 1), (1, 2), (2, 2), (4, 1)])
-def test_refined_it_is_the_same_body(tmp_path: Path, element: str, refinement: int, degree: int) -> None:
+def test_refined_it_is_the_same_body(
+    tmp_path: Path, element: str, refinement: int, degree: int
+) -> None:
     """As many elements as halves make; volume and faces as before."""
     source = read_mesh(write_tube(tmp_path / "tube.msh", element))
     found = refined(source, refinement, degree)
-    assert (found.kind, found.degree, len(found.cells)) == (element, degree, len(source.cells) * refinement**3)
+    assert (found.kind, found.degree, len(found.cells)) == (
+        element,
+        degree,
+        len(source.cells) * refinement**3,
+    )
     assert found.sha256 == source.sha256 and found.names == source.names
     groups = {name: (number,) for name, number in source.names[2].items()}
     one, other = boundary_of(source, groups, False), boundary_of(found, groups, False)
@@ -197,7 +244,9 @@ def test_refined_it_is_the_same_body(tmp_path: Path, element: str, refinement: i
     for name in groups:
         assert other.area(name) == pytest.approx(one.area(name), rel=1e-12)
         assert len(other.faces) == len(one.faces)
-    assert mesh_file.unique_in_order(found.cell_groups) == mesh_file.unique_in_order(source.cell_groups)
+    assert mesh_file.unique_in_order(found.cell_groups) == mesh_file.unique_in_order(
+        source.cell_groups
+    )
 
 
 def test_a_refined_run_is_nearer_to_a_finer_file(tmp_path: Path) -> None:
@@ -212,5 +261,8 @@ def test_a_refined_run_is_nearer_to_a_finer_file(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="mesh.refinement = 3: must be a power of 2"):
         scene_of(source).with_values({"mesh.refinement": 3})
     curved = write_tube(tmp_path / "curved.msh", degree=2)
-    with pytest.raises(SceneError, match="mesh.refinement = 2, mesh.degree = 2: curved.msh has elements of degree 2"):
+    with pytest.raises(
+        SceneError,
+        match="mesh.refinement = 2, mesh.degree = 2: curved.msh has elements of degree 2",
+    ):
         last_row(scene_of(curved).with_values({"mesh.refinement": 2}))

@@ -18,8 +18,14 @@ RADII = (1.0, 1.3)
 
 def scene(kinematics: str, **changes: Any) -> Scene:
     """The paper's artery with an opening angle of 120 degrees."""
-    values = {"cells.initial": "isotropic", "model.kinematics": kinematics, "natural.opening_angle": 120.0}
-    return preset_scene("kuhl-holzapfel-2007", "tube").with_values(values | {"mesh.degree": 2} | changes)
+    values = {
+        "cells.initial": "isotropic",
+        "model.kinematics": kinematics,
+        "natural.opening_angle": 120.0,
+    }
+    return preset_scene("kuhl-holzapfel-2007", "tube").with_values(
+        values | {"mesh.degree": 2} | changes
+    )
 
 
 def incompressible_radius(opening_angle: float) -> float:
@@ -60,13 +66,17 @@ def test_the_sector_of_a_neo_hookean_tube_tends_to_the_incompressible_one() -> N
     tissue = preset_scene("kuhl-holzapfel-2007", "tube").properties()[""].tissue
     expected, errors = incompressible_radius(160.0), []
     for ratio in (100.0, 1000.0):
-        found = close_ring([Layer(RADII, replace(tissue, chain=None, lame_lambda=ratio, lame_mu=1.0))], 160.0)
+        found = close_ring(
+            [Layer(RADII, replace(tissue, chain=None, lame_lambda=ratio, lame_mu=1.0))], 160.0
+        )
         errors.append(abs(float(found.natural_radius(np.array(1.0))) - expected))
     assert errors[0] < 1e-3
     assert errors[1] < 0.2 * errors[0]
 
 
-@pytest.mark.parametrize(("ratio", "angle", "axial"), [(20.0, 179.0, 1.0439205), (10.0, 179.0, None)])
+@pytest.mark.parametrize(
+    ("ratio", "angle", "axial"), [(20.0, 179.0, 1.0439205), (10.0, 179.0, None)]
+)
 def test_the_closing_of_a_thick_wall_follows_its_own_error(
     monkeypatch: pytest.MonkeyPatch, ratio: float, angle: float, axial: float | None
 ) -> None:
@@ -80,7 +90,9 @@ def test_the_closing_of_a_thick_wall_follows_its_own_error(
     again = close_ring(layers, angle)
     assert found.axial == pytest.approx(again.axial, abs=1e-7)
     places = np.geomspace(1.0, ratio, 9)
-    np.testing.assert_allclose(found.natural_radius(places), again.natural_radius(places), rtol=5e-6)
+    np.testing.assert_allclose(
+        found.natural_radius(places), again.natural_radius(places), rtol=5e-6
+    )
     np.testing.assert_allclose(found.stretches(places), again.stretches(places), rtol=5e-5)
 
 
@@ -110,7 +122,9 @@ TABLE = {  # radii and mean angles of the outer eighth of the wall of an indepen
 @pytest.mark.parametrize("angle", sorted(TABLE))
 def test_the_paper_artery_with_residual_stress(angle: float) -> None:
     """Radii to 0.004, the angle outside to 1.5 degrees: the residual stress takes most of the paper's turn."""
-    row = last_row(scene("radial", **{"natural.opening_angle": angle, "time.end": 150.0, "time.step": 2.5}))
+    row = last_row(
+        scene("radial", **{"natural.opening_angle": angle, "time.end": 150.0, "time.step": 2.5})
+    )
     inner, outer, turned = TABLE[angle]
     assert row["inner_radius"] == pytest.approx(inner, abs=0.004)
     assert row["outer_radius"] == pytest.approx(outer, abs=0.004)
@@ -129,7 +143,11 @@ def test_couplings_see_the_residual_stress() -> None:
         rows(**{"remodeling.coupling": coupling, "time.step": step, "time.end": 40.0})[-1]
         for coupling, step in (("staggered", 0.25), ("extrapolated", 1.0))
     )
-    for column, close in (("inner_radius", 3e-3), ("fibre_angle_inner", 0.25), ("fibre_angle_outer", 0.15)):
+    for column, close in (
+        ("inner_radius", 3e-3),
+        ("fibre_angle_inner", 0.25),
+        ("fibre_angle_outer", 0.15),
+    ):
         assert staggered[column] == pytest.approx(extrapolated[column], abs=close), column
 
 
@@ -138,7 +156,11 @@ def test_the_equilibrium_is_the_end_of_time() -> None:
     common = {"remodeling.coupling": "extrapolated"}
     limit = rows(**common, **{"time.end": "equilibrium"})[-1]
     march = rows(**common, **{"time.end": 1000.0, "time.step": 25.0})[-1]
-    for column, close in (("inner_radius", 1e-4), ("outer_radius", 1e-4), ("fibre_angle_outer", 0.05)):
+    for column, close in (
+        ("inner_radius", 1e-4),
+        ("outer_radius", 1e-4),
+        ("fibre_angle_outer", 0.05),
+    ):
         assert limit[column] == pytest.approx(march[column], abs=close), column
 
 
@@ -149,7 +171,10 @@ def test_a_rotation_of_the_natural_state_changes_nothing() -> None:
     """
     changes = {"remodeling.law": "none", "time.end": 25.0, "material.repulsion": "log"}
     with simulated(scene("radial", **changes)) as (simulation, _):
-        equilibrium, function = simulation.stepper.coupling.equilibrium, simulation.state.kinematics.gradient
+        equilibrium, function = (
+            simulation.stepper.coupling.equilibrium,
+            simulation.state.kinematics.gradient,
+        )
         before = equilibrium.stored_energy()
         values = simulation.quadrature.values(function, (3, 3))
         turn = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
@@ -165,15 +190,25 @@ def test_a_rotation_of_the_natural_state_changes_nothing() -> None:
 def layers(*parts: tuple[Any, dict[str, float]]) -> list[dict[str, Any]]:
     """`natural.layers` of (region or where it begins, prestretch)."""
     return [
-        {**({"region": where} if isinstance(where, str) else {"from": where}), "prestretch": prestretch}
+        {
+            **({"region": where} if isinstance(where, str) else {"from": where}),
+            "prestretch": prestretch,
+        }
         for where, prestretch in parts
     ]
 
 
 def test_a_tube_of_stretched_layers_keeps_its_shape_without_loads() -> None:
     """Radii, and no axial force; the stretched layer is pulled along, the other pressed."""
-    changes: dict[str, Any] = {"loads.pressure.value": 0.0, "loads.elongation.value": 0.0, "time.end": 1.0}
-    changes |= {"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": ["reduced_axial_force"]}
+    changes: dict[str, Any] = {
+        "loads.pressure.value": 0.0,
+        "loads.elongation.value": 0.0,
+        "time.end": 1.0,
+    }
+    changes |= {
+        "natural.layers": layers((0.5, {"axial": 1.1})),
+        "output.columns": ["reduced_axial_force"],
+    }
     changes |= {"mesh.refinement": 2}
     with made(scene("radial", **changes)) as simulation:
         row = next(iter(simulation.steps())).row
@@ -187,10 +222,20 @@ def test_a_tube_of_stretched_layers_keeps_its_shape_without_loads() -> None:
 
 def ends_of_layers(axial: float, **more: Any) -> tuple[float, float]:
     """Angles where the inner two thirds of a thin wall end and where its outer third begins, t = 150."""
-    changes = {"natural.opening_angle": 0.0, "natural.layers": layers((2 / 3, {"axial": axial})), "time.end": 150.0}
+    changes = {
+        "natural.opening_angle": 0.0,
+        "natural.layers": layers((2 / 3, {"axial": axial})),
+        "time.end": 150.0,
+    }
     thin = {"geometry.outer_radius": 1.3, "loads.pressure.value": 1.2, "mesh.refinement": 3}
     with made(
-        scene("radial", **changes, **thin, **more, **{"remodeling.law": "tensor", "material.repulsion": "log"})
+        scene(
+            "radial",
+            **changes,
+            **thin,
+            **more,
+            **{"remodeling.law": "tensor", "material.repulsion": "log"},
+        )
     ) as simulation:
         last = list(simulation.steps())[-1]
         angle = Measurement(simulation.observer, last).fibre_angle.ravel()
@@ -221,18 +266,33 @@ def test_stretched_layers_make_a_step_of_the_angle(monkeypatch: pytest.MonkeyPat
 
 def test_thin_layers_close_as_far_as_rounding_lets_them() -> None:
     """Circumferential, axial and radial stretch at the lumen, as an independent program integrates it by shooting."""
-    common = {"lame_mu": 1.37, "chain_density": 1.111e21, "locking_stretch": 1.25, "persistence_length": 0.4959}
+    common = {
+        "lame_mu": 1.37,
+        "chain_density": 1.111e21,
+        "locking_stretch": 1.25,
+        "persistence_length": 0.4959,
+    }
     parts: dict[str, dict[str, float]] = {"a": {}, "b": {"lame_mu": 4.11, "lame_lambda": 14.47}}
     parts["c"] = {"lame_lambda": 24.12, "locking_stretch": 1.8, "chain_density": 1.333e21}
     regions: dict[str, Any] = {name: {"material": own} for name, own in parts.items()}
     regions["a"]["outer_radius"], regions["b"]["outer_radius"] = 1.146, 1.153
-    geometry = {"geometry.inner_radius": 1.139, "geometry.outer_radius": 1.196, "geometry.length": 1.426}
+    geometry = {
+        "geometry.inner_radius": 1.139,
+        "geometry.outer_radius": 1.196,
+        "geometry.length": 1.426,
+    }
     of = preset_scene("consistent", "tube").with_values(
-        {"cells.initial": "isotropic", "material.lame_lambda": 12.06, "natural.opening_angle": 120.0}
+        {
+            "cells.initial": "isotropic",
+            "material.lame_lambda": 12.06,
+            "natural.opening_angle": 120.0,
+        }
         | {f"material.{key}": value for key, value in common.items()}
         | geometry
         | {"regions": regions}
     )
     tissues = {name: properties.tissue for name, properties in of.properties().items()}
     found = close_ring(of.geometry.layers_of_tissue(of.natural, of.regions, tissues), 120.0)
-    assert found.stretches(np.array([1.139]))[0] == pytest.approx([0.99350, 0.99985, 1.00423], abs=1e-5)
+    assert found.stretches(np.array([1.139]))[0] == pytest.approx(
+        [0.99350, 0.99985, 1.00423], abs=1e-5
+    )

@@ -25,25 +25,37 @@ TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 MEDIA, ADVENTITIA = {"circumferential": 1.05, "axial": 0.95}, {"axial": 1.1}
 
 
-@pytest.mark.parametrize(("law", "kinematics"), [("explicit", ["axisymmetric"]), ("none", ["sector", "full"])])
+@pytest.mark.parametrize(
+    ("law", "kinematics"), [("explicit", ["axisymmetric"]), ("none", ["sector", "full"])]
+)
 def test_all_kinematics_agree_with_one_radius(law: str, kinematics: list[str]) -> None:
     """Radii and stresses, within the facets of their elements. Cells turn where kernels compile faster."""
-    few = {"time.end": 6.0, "loads.pressure.ramp": [[0, 0], [5, 1]], "loads.elongation.ramp": [[0, 0], [5, 1]]}
+    few = {
+        "time.end": 6.0,
+        "loads.pressure.ramp": [[0, 0], [5, 1]],
+        "loads.elongation.ramp": [[0, 0], [5, 1]],
+    }
     names = ["inner_radius", "outer_radius", "fibre_angle_outer", "mean_hoop_stress", *NAMES]
     ends = []
     for name in ("radial", *kinematics):
         of = scene(name, **few, **{"remodeling.law": law, "output.columns": names})
-        domain = whole_tube(of.geometry, (16, 8, 1), "hexahedron", 2, SELF) if name == "full" else None
+        domain = (
+            whole_tube(of.geometry, (16, 8, 1), "hexahedron", 2, SELF) if name == "full" else None
+        )
         ends.append(last_row(of, domain))
     for row in ends[1:]:
-        assert [row[name] for name in names] == pytest.approx([ends[0][name] for name in names], rel=1e-4, abs=1e-5)
+        assert [row[name] for name in names] == pytest.approx(
+            [ends[0][name] for name in names], rel=1e-4, abs=1e-5
+        )
 
 
 def test_a_wall_thinner_than_its_elements_are_flat_is_refused() -> None:
     """Points outside of the wall would have no stretches: the first row had J below zero."""
     thin = {"geometry.outer_radius": 1.008, "geometry.length": 1.0, "mesh.degree": 1}
     thin |= {"natural.opening_angle": 111.0, "time.end": 1.0}
-    with pytest.raises(SceneError, match="natural.opening_angle = 111: must be smaller, or mesh.refinement larger"):
+    with pytest.raises(
+        SceneError, match="natural.opening_angle = 111: must be smaller, or mesh.refinement larger"
+    ):
         Simulation(scene("full", **thin), SELF)
 
 
@@ -65,7 +77,9 @@ def own_body(file: Path, elongation: float, **tables: Any) -> Any:
     return scene_from_dict(values | tables)
 
 
-def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(two_layers: Path, tmp_path: Path) -> None:
+def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(
+    two_layers: Path, tmp_path: Path
+) -> None:
     """The ring to which two stretched layers close, from elements and from one radius; the same for a turned body."""
     ring = (1.0, 1.5, 3.0)
     tissue = own_body(two_layers, 0.0).properties()[""].tissue
@@ -81,7 +95,9 @@ def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(two_layers:
     length = 0.5 * closed.axial
     assert np.sqrt(row["lumen_volume"] / np.pi / length) == pytest.approx(ring[0], abs=1e-3)
     assert row["outer_area"] / (2 * np.pi * length) == pytest.approx(ring[-1], abs=1e-3)
-    turned = last_row(own_body(write_layers(tmp_path / "turned.msh", free, TURN), closed.axial - 1.0))
+    turned = last_row(
+        own_body(write_layers(tmp_path / "turned.msh", free, TURN), closed.axial - 1.0)
+    )
     for column in ("lumen_volume", "outer_area", "stored_energy"):
         assert turned[column] == pytest.approx(row[column], rel=1e-6), column
 
@@ -91,19 +107,33 @@ def test_a_prestretch_that_is_given_back_leaves_no_stress(two_layers: Path) -> N
     whole = {"natural": {"layers": [{"prestretch": {"axial": 1.1}}]}}
     row = last_row(own_body(two_layers, 1 / 1.1 - 1.0, **whole))
     held = last_row(own_body(two_layers, 0.0, **whole))
-    assert abs(row["stored_energy"] - last_row(own_body(two_layers, 0.0, natural={}))["stored_energy"]) < 1e-4
+    assert (
+        abs(row["stored_energy"] - last_row(own_body(two_layers, 0.0, natural={}))["stored_energy"])
+        < 1e-4
+    )
     assert held["stored_energy"] > 0.1
-    assert np.sqrt(row["lumen_volume"] / (np.pi * 0.5 / 1.1)) == pytest.approx(np.sqrt(1.1), abs=2e-3)
+    assert np.sqrt(row["lumen_volume"] / (np.pi * 0.5 / 1.1)) == pytest.approx(
+        np.sqrt(1.1), abs=2e-3
+    )
 
 
-def test_an_own_body_begins_in_balance_without_loads(two_layers: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_own_body_begins_in_balance_without_loads(
+    two_layers: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """The row of t = 0 is the one that a step without loads has, also where the prestretch comes in parts."""
-    strong = {"natural": {"layers": layers(("media", {"circumferential": 1.3}), ("adventitia", {"axial": 1.2}))}}
+    strong = {
+        "natural": {
+            "layers": layers(("media", {"circumferential": 1.3}), ("adventitia", {"axial": 1.2}))
+        }
+    }
     few: dict[str, Any] = {"method": "direct", "maximum_iterations": 3}
     columns = {"output": {"fields": False, "columns": ["outer_area", *NAMES]}}
     for tables, parts in (({}, 1), (strong | {"solver": few}, 2)):
         caplog.clear()
-        with caplog.at_level(logging.INFO), made(own_body(two_layers, 0.0, **columns, **tables)) as simulation:
+        with (
+            caplog.at_level(logging.INFO),
+            made(own_body(two_layers, 0.0, **columns, **tables)) as simulation,
+        ):
             start = simulation.stepper.start(simulation.watchers)
             row = next(iter(simulation.steps())).row
         for name in ("lumen_volume", "outer_area", *NAMES):
@@ -121,8 +151,14 @@ def test_bad_layers_get_one_line(table: str, words: str, two_layers: Path) -> No
 def test_a_run_with_residual_stress_goes_on(tmp_path: Path) -> None:
     """Its scene as run has the layers, and it knows all three angles."""
     names = [f"fibre_angle_{of}outer" for of in ("", "unloaded_", "deformed_")]
-    asked = scene("radial", **{"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": names})
-    found = goes_on(asked.with_values({"output.fields": ["fibre_angle_unloaded"], "time.end": 4.0}), tmp_path, 2.0)
+    asked = scene(
+        "radial", **{"natural.layers": layers((0.5, {"axial": 1.1})), "output.columns": names}
+    )
+    found = goes_on(
+        asked.with_values({"output.fields": ["fibre_angle_unloaded"], "time.end": 4.0}),
+        tmp_path,
+        2.0,
+    )
     assert "[[natural.layers]]" in (found.path / "scene.toml").read_text()
     angles = [float(found.history[name][-1]) for name in names]
     assert np.ptp(angles) > 1.0 and len({round(angle, 3) for angle in angles}) == 3

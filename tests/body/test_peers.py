@@ -29,14 +29,19 @@ def passive(**changes: Any) -> Any:
 def test_a_thick_tube_is_that_of_pymecht() -> None:
     rows = passive(**FORCES)
     np.testing.assert_allclose([row["pressure"] for row in rows], PRESSURES)
-    np.testing.assert_allclose([row["inner_radius"] for row in rows], [1.16158, 1.49517, 1.96467, 2.25815], rtol=1e-4)
+    np.testing.assert_allclose(
+        [row["inner_radius"] for row in rows], [1.16158, 1.49517, 1.96467, 2.25815], rtol=1e-4
+    )
     assert rows[-1]["axial_force"] == pytest.approx(62.867, rel=5e-4)
 
 
 @pytest.mark.parametrize(
-    ("angle", "radius", "force"), [(60.0, 2.43220, None), (120.0, 2.54422, 68.039), (160.0, 2.57366, 68.651)]
+    ("angle", "radius", "force"),
+    [(60.0, 2.43220, None), (120.0, 2.54422, 68.039), (160.0, 2.57366, 68.651)],
 )
-def test_so_is_one_that_was_closed_from_a_sector(angle: float, radius: float, force: float | None) -> None:
+def test_so_is_one_that_was_closed_from_a_sector(
+    angle: float, radius: float, force: float | None
+) -> None:
     row = passive(**{**FORCES, "natural.opening_angle": angle})[-1]
     assert row["inner_radius"] == pytest.approx(radius, rel=1e-4)
     assert force is None or row["axial_force"] == pytest.approx(force, rel=5e-4)

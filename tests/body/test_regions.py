@@ -21,7 +21,11 @@ from remodel_fenicsx.simulation import Simulation
 
 SELF = MPI.COMM_SELF
 WALL = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 2.0}
-LAYERS = {"adventitia": {}, "media": {"outer_radius": 1.7}, "intima": {"outer_radius": 1.02}}  # in any order
+LAYERS = {
+    "adventitia": {},
+    "media": {"outer_radius": 1.7},
+    "intima": {"outer_radius": 1.02},
+}  # in any order
 
 
 def layered(regions: dict[str, Any] = LAYERS, **tables: Any) -> Scene:
@@ -46,14 +50,18 @@ def test_no_element_is_in_two_layers(kinematics: str, element: str, degree: int)
     """Elements of a thin layer are thin, all layers together are the wall; as many elements as without them."""
     mesh = {"element": element, "degree": degree}
     scene = layered(mesh=mesh, model={"kinematics": kinematics})
-    domain, whole = mesh_of(scene, SELF), mesh_of(layered({}, mesh=mesh, model={"kinematics": kinematics}), SELF)
+    domain, whole = mesh_of(scene, SELF), mesh_of(
+        layered({}, mesh=mesh, model={"kinematics": kinematics}), SELF
+    )
     assert domain.number_of_elements == whole.number_of_elements and set(whole.regions) == {"body"}
     assert list(domain.regions) == ["intima", "media", "adventitia"], "from the lumen outwards"
     radii, ends = radii_of(domain), (1.0, 1.02, 1.7, 3.0)
     for name, inner, outer in zip(domain.regions, ends[:-1], ends[1:], strict=True):
         own = radii[domain.element_region == domain.regions[name]]
         assert (
-            len(own) and own.min() == pytest.approx(inner, rel=1e-12) and own.max() == pytest.approx(outer, rel=1e-12)
+            len(own)
+            and own.min() == pytest.approx(inner, rel=1e-12)
+            and own.max() == pytest.approx(outer, rel=1e-12)
         )
     assert set(domain.element_region) == set(domain.regions.values())
 
@@ -62,7 +70,9 @@ def test_no_element_is_in_two_layers(kinematics: str, element: str, degree: int)
     ([1.0, 1.0], 8, (4, 4)), ([0.01, 2.0], 8, (1, 7)), ([1.0, 3.0], 8, (2, 6)), ([0.1, 0.1, 0.1], 3, (1, 1, 1)),
     ([2.0], 8, (8,)),
 ])  # fmt: skip
-def test_elements_are_shared_out_by_thickness(thicknesses: list[float], elements: int, counts: tuple[int, ...]) -> None:
+def test_elements_are_shared_out_by_thickness(
+    thicknesses: list[float], elements: int, counts: tuple[int, ...]
+) -> None:
     assert shared_out(thicknesses, elements) == counts
 
 
@@ -82,7 +92,9 @@ def test_an_outer_radius_where_no_layer_is_is_refused() -> None:
     mesh = SHAPES["mesh"](file="vessel.msh")
     assert isinstance(mesh, WithRegions)
     mesh.check_regions({"core": Region()}, Mesh())
-    with pytest.raises(PydanticCustomError, match="the mesh defines the regions of a mesh; only a tube has"):
+    with pytest.raises(
+        PydanticCustomError, match="the mesh defines the regions of a mesh; only a tube has"
+    ):
         mesh.check_regions({"core": Region(outer_radius=1.0)}, Mesh())
 
 
@@ -96,7 +108,12 @@ def test_radii_of_layers_take_units_and_are_read_back(tmp_path: Any) -> None:
     from remodel_fenicsx import read_scene
 
     assert read_scene(tmp_path / "scene.toml") == scene
-    assert read_scene(tmp_path / "scene.toml", ["regions.media.outer_radius=1.5"]).regions["media"].outer_radius == 1.5
+    assert (
+        read_scene(tmp_path / "scene.toml", ["regions.media.outer_radius=1.5"])
+        .regions["media"]
+        .outer_radius
+        == 1.5
+    )
 
 
 def test_a_mesh_without_the_scenes_regions_is_refused() -> None:
@@ -104,8 +121,12 @@ def test_a_mesh_without_the_scenes_regions_is_refused() -> None:
     tube = Tube(**WALL)
     regions = {"media": Region(outer_radius=1.7), "adventitia": Region()}
     scene, mesh = layered({"media": {"outer_radius": 1.7}, "adventitia": {}}), Mesh()
-    checked_domain(tube.build_with(regions, mesh, SELF), scene.with_values({"model.kinematics": "full"}))
-    with pytest.raises(SceneError, match="^regions.media: the mesh has no such region; it has body$"):
+    checked_domain(
+        tube.build_with(regions, mesh, SELF), scene.with_values({"model.kinematics": "full"})
+    )
+    with pytest.raises(
+        SceneError, match="^regions.media: the mesh has no such region; it has body$"
+    ):
         Simulation(scene.with_values({"model.kinematics": "full"}), SELF, tube.build(mesh, SELF))
 
 
@@ -135,10 +156,14 @@ def boxes(*groups: dict[str, list[int]], numbers: bool = False) -> Any:
 @pytest.mark.parametrize("numbers", [False, True])
 def test_named_volumes_become_regions(numbers: bool) -> None:
     """As a mesh file has them; where they have no names, their numbers are names."""
-    domain = build_domain(boxes({"lower": [1], "upper": [2]}, numbers=numbers), "cube", {"side": 1.0}, SELF)
+    domain = build_domain(
+        boxes({"lower": [1], "upper": [2]}, numbers=numbers), "cube", {"side": 1.0}, SELF
+    )
     assert domain.regions == ({"11": 11, "12": 12} if numbers else {"lower": 11, "upper": 12})
     middle = domain.mesh.geometry.x[domain.mesh.geometry.dofmap].mean(axis=1)[:, 2]
-    assert np.array_equal(domain.element_region == 12, middle > 1.0) and set(domain.element_region) == {11, 12}
+    assert np.array_equal(domain.element_region == 12, middle > 1.0) and set(
+        domain.element_region
+    ) == {11, 12}
 
 
 @pytest.mark.parametrize("groups, line", [
@@ -146,6 +171,8 @@ def test_named_volumes_become_regions(numbers: bool) -> None:
     ({"lower": [1, 2], "upper": [2]}, "volume 2 is in 'lower' and 'upper'; each must be in one named volume"),
     ({}, "0 named volumes, 1 types of elements, 1 named faces"),
 ])  # fmt: skip
-def test_volumes_that_are_not_shared_out_are_refused(groups: dict[str, list[int]], line: str) -> None:
+def test_volumes_that_are_not_shared_out_are_refused(
+    groups: dict[str, list[int]], line: str
+) -> None:
     with pytest.raises(GeometryError, match=f"^Gmsh could not mesh the cube: {line}$"):
         build_domain(boxes(groups), "cube", {"side": 1.0}, SELF)

@@ -22,7 +22,10 @@ STIFF = {"lame_lambda": 31030.0, "lame_mu": 3.103, "repulsion": "log"}
 
 def sheet(loads: dict[str, float], **tables: Any) -> Scene:
     """Of 2 x 4 x 0.5, as it is before it remodels."""
-    rest: dict[str, Any] = {"cells": {"initial": "isotropic"}, "remodeling": {"law": "none"}} | tables
+    rest: dict[str, Any] = {
+        "cells": {"initial": "isotropic"},
+        "remodeling": {"law": "none"},
+    } | tables
     return Scene(
         geometry={"shape": "sheet", "length_x": 2.0, "length_y": 4.0, "thickness": 0.5},
         loads=ramped(4.0, **loads),
@@ -32,7 +35,9 @@ def sheet(loads: dict[str, float], **tables: Any) -> Scene:
     )
 
 
-@pytest.mark.parametrize("material", [{"repulsion": "log"}, STIFF], ids=["soft", "nearly incompressible"])
+@pytest.mark.parametrize(
+    "material", [{"repulsion": "log"}, STIFF], ids=["soft", "nearly incompressible"]
+)
 @pytest.mark.parametrize("cells", ["isotropic", [0.6, 0.8, 0.0]], ids=["isotropic", "in plane"])
 @pytest.mark.parametrize(
     "loads",
@@ -46,7 +51,9 @@ def sheet(loads: dict[str, float], **tables: Any) -> Scene:
     ],
     ids=" ".join,
 )
-def test_stresses_are_those_of_a_point_typed_by_hand(loads: dict[str, float], cells: Any, material: Any) -> None:
+def test_stresses_are_those_of_a_point_typed_by_hand(
+    loads: dict[str, float], cells: Any, material: Any
+) -> None:
     row = last_row(sheet(loads, cells={"initial": cells}, material=material))
     F = np.diag([1 + row["elongation_x"], 1 + row["elongation_y"], row["thickness_stretch"]])
     F[0, 1] = row["shear"]
@@ -62,9 +69,13 @@ def test_stresses_are_those_of_a_point_typed_by_hand(loads: dict[str, float], ce
     assert row["nominal_stress_yx"] == pytest.approx(nominal[1, 0], **close)
     assert sigma[2, 2] == pytest.approx(0.0, abs=close["abs"])
     for axis, area, k in (("x", 4.0 * 0.5, 0), ("y", 2.0 * 0.5, 1)):
-        assert row[f"force_{axis}"] == pytest.approx(nominal[k, k] * area, rel=1e-7, abs=close["abs"])
+        assert row[f"force_{axis}"] == pytest.approx(
+            nominal[k, k] * area, rel=1e-7, abs=close["abs"]
+        )
         if f"elongation_{axis}" in loads:
-            assert row[f"elongation_{axis}"] == pytest.approx(loads[f"elongation_{axis}"], abs=1e-12)
+            assert row[f"elongation_{axis}"] == pytest.approx(
+                loads[f"elongation_{axis}"], abs=1e-12
+            )
         else:
             assert row[f"force_{axis}"] == pytest.approx(loads.get(f"force_{axis}", 0.0), abs=1e-6)
     assert row["shear"] == loads.get("shear", 0.0)
@@ -73,9 +84,13 @@ def test_stresses_are_those_of_a_point_typed_by_hand(loads: dict[str, float], ce
 @pytest.mark.parametrize("forces", [(0.4, 0.2), (0.4, 0.4), (0.4, 0.1), (0.1, 0.3)])
 def test_at_rest_the_collagen_lies_where_the_stresses_say(forces: tuple[float, float]) -> None:
     """tan(angle) = sigma_y / sigma_x: l_I goes with the principal stresses, eq. (9)."""
-    changes = {f"loads.force_{axis}.value": f"{force} N" for axis, force in zip("xy", forces, strict=True)}
+    changes = {
+        f"loads.force_{axis}.value": f"{force} N" for axis, force in zip("xy", forces, strict=True)
+    }
     scene = read_scene(DEMOS / "sheet.toml").with_values({**changes, "remodeling.half_life": 2.0})
-    assert scene.time.end == 100.0 and scene.loads["force_x"].value == pytest.approx(1000 * forces[0])
+    assert scene.time.end == 100.0 and scene.loads["force_x"].value == pytest.approx(
+        1000 * forces[0]
+    )
     row = last_row(scene)
     expected = np.degrees(np.arctan2(row["cauchy_stress_y"], row["cauchy_stress_x"]))
     assert row["fibre_angle"] == pytest.approx(expected, abs=1e-5)
@@ -92,7 +107,9 @@ def test_the_mesh_finds_what_the_point_finds() -> None:
 
 
 @pytest.mark.parametrize(("loads", "tables", "words"), rows(__file__, "bad_sheets.txt"))
-def test_what_a_sheet_cannot_have_is_refused_by_its_key(loads: str, tables: str, words: str) -> None:
+def test_what_a_sheet_cannot_have_is_refused_by_its_key(
+    loads: str, tables: str, words: str
+) -> None:
     with pytest.raises(SceneError, match=f"{words}.*$"):
         sheet(values(loads), **values(tables))
 
@@ -101,9 +118,13 @@ def test_protocols_are_read_as_they_are_published(tmp_path: Path) -> None:
     """Strains are prescribed and stresses compared, or forces drive: the rows of one test give those of the other."""
     scene = sheet({"force_x": 1.0}, material={"repulsion": "log"})
     (tmp_path / "scene.toml").write_text(scene.to_toml())
-    strained = "stretch_x;stretch_y;nominal_stress_x;nominal_stress_y\n1,05;1,02;0;0\n1,1;1,04;0;0\n"
+    strained = (
+        "stretch_x;stretch_y;nominal_stress_x;nominal_stress_y\n1,05;1,02;0;0\n1,1;1,04;0;0\n"
+    )
     (tmp_path / "strained.csv").write_text(strained)
-    text = '[unknowns]\n"material.lame_mu" = {{ start = 3.0 }}\n[[measured]]\nfile = "{0}.csv"\n{1}\n'
+    text = (
+        '[unknowns]\n"material.lame_mu" = {{ start = 3.0 }}\n[[measured]]\nfile = "{0}.csv"\n{1}\n'
+    )
     sd = "sd = { nominal_stress_x = 1.0, nominal_stress_y = 1.0 }"
     (tmp_path / "data.toml").write_text(text.format("strained", sd))
     _, (table,) = read_measurements(tmp_path / "data.toml", scene)
@@ -121,6 +142,11 @@ def test_protocols_are_read_as_they_are_published(tmp_path: Path) -> None:
     (tmp_path / "data.toml").write_text(text.format("driven", sd.replace("force_y", "shear")))
     with pytest.raises(SceneError, match=r"measured\[0\].drive = 'shear': allowed are"):
         read_measurements(tmp_path / "data.toml", scene)
-    (tmp_path / "data.toml").write_text(text.format("driven", "sd = { force_x = 1.0, force_y = 1.0 }"))
+    (tmp_path / "data.toml").write_text(
+        text.format("driven", "sd = { force_x = 1.0, force_y = 1.0 }")
+    )
     _, (table,) = read_measurements(tmp_path / "data.toml", scene)
-    assert table.loads == ("elongation_x", "elongation_y")  # of a force and a strain along one axis the strain
+    assert table.loads == (
+        "elongation_x",
+        "elongation_y",
+    )  # of a force and a strain along one axis the strain

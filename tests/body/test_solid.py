@@ -31,7 +31,9 @@ def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for _, surface in gmsh.model.getEntities(2):
             centre = np.array(gmsh.model.occ.getCenterOfMass(2, surface))
             axis = int(np.abs(centre - 0.5).argmax())
-            gmsh.model.addPhysicalGroup(2, [surface], name=f"{'xyz'[axis]}{int(centre[axis] > 0.5)}")
+            gmsh.model.addPhysicalGroup(
+                2, [surface], name=f"{'xyz'[axis]}{int(centre[axis] > 0.5)}"
+            )
         gmsh.model.addPhysicalGroup(3, [1], name="block")
         gmsh.option.setNumber("Mesh.MeshSizeMax", 0.6)
         gmsh.model.mesh.generate(3)
@@ -76,7 +78,9 @@ def test_two_faces_are_moved_and_a_third_is_pressed(block: Path) -> None:
     loads = {name: load.model_dump(exclude_none=True) for name, load in moved.loads.items()}
     row = last_row(moved.with_values({"loads": loads | press}))
     assert (row["to_z1"], row["to_x1"], row["press"]) == (0.2, -0.1, 0.1)
-    assert row["cauchy_stress_z"] * row["volume"] / 1.2 == pytest.approx(row["support_force_z0"], rel=1e-3)
+    assert row["cauchy_stress_z"] * row["volume"] / 1.2 == pytest.approx(
+        row["support_force_z0"], rel=1e-3
+    )
 
 
 def test_a_run_goes_on(block: Path, tmp_path: Path) -> None:

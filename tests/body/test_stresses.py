@@ -13,7 +13,14 @@ from remodel_fenicsx import Scene, SceneError, preset_scene
 from remodel_fenicsx.extend import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from tests.mesh_files import LENGTH, RADII, write_tube
-from tests.reference.radial import AXIAL, CIRCUMFERENTIAL, RADIAL, RadialMaterial, cauchy_stress, solve_radial
+from tests.reference.radial import (
+    AXIAL,
+    CIRCUMFERENTIAL,
+    RADIAL,
+    RadialMaterial,
+    cauchy_stress,
+    solve_radial,
+)
 from tests.parts import rotation, tube
 from tests.runs import last_row, simulated
 from tests.values import ramped
@@ -21,12 +28,19 @@ from tests.values import ramped
 ELEMENTS, END = 8, 30.0
 MIDDLE = slice(9, 15)  # three Gauss points of each of the two elements at the middle radius
 OF_REFERENCE = {"hoop": CIRCUMFERENTIAL, "axial": AXIAL, "radial": RADIAL}
-NAMES = [f"{name}_stress_{where}" for name in OF_REFERENCE for where in ("inner", "middle", "outer")]
+NAMES = [
+    f"{name}_stress_{where}" for name in OF_REFERENCE for where in ("inner", "middle", "outer")
+]
 
 
 def artery(**changes: Any) -> Scene:
     """The paper's, of isotropic cells, on elements of degree 2 in its plane of symmetry."""
-    values = {"cells.initial": "isotropic", "mesh.degree": 2, "model.kinematics": "radial", "time.end": END}
+    values = {
+        "cells.initial": "isotropic",
+        "mesh.degree": 2,
+        "model.kinematics": "radial",
+        "time.end": END,
+    }
     columns = {"output.columns": [*NAMES, "mean_hoop_stress", "inner_radius", "outer_radius"]}
     return preset_scene("kuhl-holzapfel-2007", "tube").with_values(values | columns | changes)
 
@@ -40,12 +54,19 @@ def test_they_are_those_of_the_reference_while_it_remodels() -> None:
         assert row[f"{name}_stress_middle"] == pytest.approx(expected, rel=1e-6), name
         for where, point in (("inner", 0), ("outer", -1)):  # 0.0011 from the face
             expected = finer.cauchy[-1][point, component]
-            assert row[f"{name}_stress_{where}"] == pytest.approx(expected, rel=0.05, abs=0.05), (name, where)
+            assert row[f"{name}_stress_{where}"] == pytest.approx(expected, rel=0.05, abs=0.05), (
+                name,
+                where,
+            )
 
 
 def test_at_the_faces_they_converge_to_the_traction_and_the_closed_form() -> None:
     """Across: minus the pressure and zero. Around: the law at the stretches of the face, whose radial one balances."""
-    short = {"remodeling.law": "none", "time.end": 5.0, "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]]}
+    short = {
+        "remodeling.law": "none",
+        "time.end": 5.0,
+        "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]],
+    }
     short |= {"loads.elongation.ramp": short["loads.pressure.ramp"]}
     fine = solve_radial(end=5.0, ramp_time=5.0, law="none")
     squares, material = np.full((1, 3), 1 / 3), RadialMaterial()
@@ -54,16 +75,27 @@ def test_at_the_faces_they_converge_to_the_traction_and_the_closed_form() -> Non
     def stresses(radial: float) -> np.ndarray:
         return cauchy_stress(np.where([False, False, True], radial, at_face), squares, material)[0]
 
-    hoop = stresses(brentq(lambda radial: stresses(radial)[RADIAL] + 4.8, 0.2, 1.0))[CIRCUMFERENTIAL]
-    rows = [last_row(artery(**short, **{"mesh.refinement": refinement})) for refinement in (1, 2, 4)]
+    hoop = stresses(brentq(lambda radial: stresses(radial)[RADIAL] + 4.8, 0.2, 1.0))[
+        CIRCUMFERENTIAL
+    ]
+    rows = [
+        last_row(artery(**short, **{"mesh.refinement": refinement})) for refinement in (1, 2, 4)
+    ]
     errors = np.array(
-        [[abs(row["hoop_stress_inner"] / hoop - 1), abs(row["radial_stress_inner"] / 4.8 + 1)] for row in rows]
+        [
+            [abs(row["hoop_stress_inner"] / hoop - 1), abs(row["radial_stress_inner"] / 4.8 + 1)]
+            for row in rows
+        ]
     )
-    assert (errors < [[0.02, 0.015], [0.01, 0.005], [0.005, 0.001]]).all()  # means of elements: 62, 46 and 31 % off
+    assert (
+        errors < [[0.02, 0.015], [0.01, 0.005], [0.005, 0.001]]
+    ).all()  # means of elements: 62, 46 and 31 % off
     assert all(abs(row["radial_stress_outer"]) < 1e-3 for row in rows)
     linear = last_row(artery(**short, **{"mesh.degree": 1}))
     assert linear["radial_stress_inner"] == pytest.approx(-4.8, rel=0.05)
-    assert "linear elements are 0.25 inner radii thick" in artery(**{"mesh.degree": 1}).warnings()[0]
+    assert (
+        "linear elements are 0.25 inner radii thick" in artery(**{"mesh.degree": 1}).warnings()[0]
+    )
     for fine in (artery(), artery(**{"mesh.degree": 1, "geometry.outer_radius": 1.3})):
         assert not [line for line in fine.warnings() if "linear elements" in line]
 
@@ -72,14 +104,23 @@ def test_at_the_faces_they_converge_to_the_traction_and_the_closed_form() -> Non
 def test_the_mean_around_is_that_of_the_law_of_laplace(changes: dict[str, Any]) -> None:
     row = last_row(artery(**changes, **{"loads.pressure.value": 1.0}))
     thickness = row["outer_radius"] - row["inner_radius"]
-    assert row["mean_hoop_stress"] == pytest.approx(row["pressure"] * row["inner_radius"] / thickness, rel=1e-6)
+    assert row["mean_hoop_stress"] == pytest.approx(
+        row["pressure"] * row["inner_radius"] / thickness, rel=1e-6
+    )
 
 
 def test_a_half_plane_has_the_same() -> None:
     """The sector and the whole tube too: tests/body/test_natural_bodies.py."""
-    short = {"time.end": 3.0, "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "loads.pressure.value": 1.5}
+    short = {
+        "time.end": 3.0,
+        "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]],
+        "loads.pressure.value": 1.5,
+    }
     short |= {"remodeling.law": "none"}
-    one, other = (last_row(artery(**short, **{"model.kinematics": name})) for name in ("radial", "axisymmetric"))
+    one, other = (
+        last_row(artery(**short, **{"model.kinematics": name}))
+        for name in ("radial", "axisymmetric")
+    )
     for name in (*NAMES, "mean_hoop_stress"):
         assert other[name] == pytest.approx(one[name], rel=1e-6, abs=1e-6), name
 
@@ -91,11 +132,18 @@ def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:
         "loads": ramped(2.0, pressure=1.0),
     }  # fmt: skip
     names = ["hoop_stress_inner", "hoop_stress_middle", "radial_stress_inner"]
-    round_tube = {"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
+    round_tube = {
+        "shape": "tube",
+        "inner_radius": RADII[0],
+        "outer_radius": RADII[1],
+        "length": LENGTH,
+    }
     regions = {"media": {"outer_radius": 1.5}, "adventitia": {}}
     wall = [f"{name}_stress_{layer}" for name in ("hoop", "radial") for layer in regions]
     mesh = {"degree": 2}
-    exact = scene_from_dict({"geometry": round_tube, "mesh": mesh, "output": {"columns": names}, **tables})
+    exact = scene_from_dict(
+        {"geometry": round_tube, "mesh": mesh, "output": {"columns": names}, **tables}
+    )
     layered = exact.with_values({"regions": regions, "output.columns": [*wall, "mean_hoop_stress"]})
     row = last_row(layered)
     assert row["hoop_stress_media"] > row["mean_hoop_stress"] > row["hoop_stress_adventitia"] > 0.0
@@ -103,7 +151,9 @@ def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:
     file = write_tube(tmp_path / "tube.msh", degree=2, counts=(16, 8, 1))
     own = {"shape": "mesh", "file": str(file), "length_unit": "mm"}
     supports = {face: {"kind": "guided"} for face in ("inlet", "outlet")}
-    found = scene_from_dict({"geometry": own, "supports": supports, "output": {"columns": names}, **tables})
+    found = scene_from_dict(
+        {"geometry": own, "supports": supports, "output": {"columns": names}, **tables}
+    )
     one, other = last_row(exact), last_row(found)
     for name in names:
         assert other[name] == pytest.approx(one[name], rel=0.02), name

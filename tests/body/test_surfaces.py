@@ -25,7 +25,9 @@ FACES = {"inner": "lumen", "outer": "wall_outer", "inlet": "cap_in", "outlet": "
 def write_all(folder: Path, element: str = "tetrahedron", degree: int = 1) -> dict[str, Path]:
     """volume.vtu without a number of any face, and a .vtp of each face with numbers of all nodes; by names."""
     mesh = read_mesh(write_tube(folder / "tube.msh", element, degree))
-    kind = {("tetrahedron", 1): "tetra", ("tetrahedron", 2): "tetra10"}.get((element, degree), "hexahedron")
+    kind = {("tetrahedron", 1): "tetra", ("tetrahedron", 2): "tetra10"}.get(
+        (element, degree), "hexahedron"
+    )
     arrays = {"ModelRegionID": [np.ones(len(mesh.cells), dtype=np.int32)]}
     cells = meshio.read(folder / "tube.msh").get_cells_type(kind)
     points = meshio.read(folder / "tube.msh").points
@@ -53,7 +55,10 @@ def scene(geometry: dict[str, Any], **tables: Any) -> Scene:
 
 def in_faces(files: dict[str, Path]) -> dict[str, Any]:
     """A table of faces with a file each."""
-    return {"file": str(files["volume"]), "faces": {face: {"file": str(files[face])} for face in FACES}}
+    return {
+        "file": str(files["volume"]),
+        "faces": {face: {"file": str(files[face])} for face in FACES},
+    }
 
 
 @pytest.mark.parametrize("degree", [1, 2])
@@ -64,7 +69,9 @@ def test_it_is_the_body_of_one_file(degree: int, tmp_path: Path) -> None:
     found = [scene(one) for one in ({"file": str(files["msh"])}, listed, in_faces(files))]
     assert found[1] == found[2] and found[1].mesh.degree == degree
     for one in found[1:]:
-        (file, boundary, regions), (of_one, as_one, _) = (some.geometry.checked() for some in (one, found[0]))
+        (file, boundary, regions), (of_one, as_one, _) = (
+            some.geometry.checked() for some in (one, found[0])
+        )
         assert regions == {"body": 0} and len(file.cells) == len(of_one.cells)
         for face in FACES:
             assert boundary.area(face) == pytest.approx(as_one.area(face), rel=1e-12)
@@ -84,17 +91,23 @@ def test_a_scene_beside_them_is_run_with_copies_and_goes_on(tmp_path: Path) -> N
         "pressure = { value = 0.5, ramp = [[0, 0], [2, 1]] }\nelongation = { value = 0.05, ramp = [[0, 0], [2, 1]] }\n"
     )
     folder = run(read_scene(tmp_path / "scene.toml"), tmp_path / "run", SELF)
-    assert {"volume.vtu", *(f"{name}.vtp" for name in FACES.values())} <= {path.name for path in folder.iterdir()}
+    assert {"volume.vtu", *(f"{name}.vtp" for name in FACES.values())} <= {
+        path.name for path in folder.iterdir()
+    }
     assert read_scene(folder / "scene.toml").geometry.file[0].endswith("run/volume.vtu")
     assert len(Recording(resume(folder, ["time.end=3"], SELF)).history["time"]) == 4
     (folder / "lumen.vtp").write_bytes((folder / "wall_outer.vtp").read_bytes())
-    with pytest.raises(SceneError, match="geometry.file = 'volume.vtu': has changed: its SHA-256 was"):
+    with pytest.raises(
+        SceneError, match="geometry.file = 'volume.vtu': has changed: its SHA-256 was"
+    ):
         resume(folder, ["time.end=4"], SELF)
 
 
 def test_numbers_of_regions_are_read_beside_them(tmp_path: Path) -> None:
     geometry = in_faces(write_all(tmp_path)) | {"tags": "ModelRegionID", "regions": {"wall": 1}}
-    assert scene(geometry, regions={"wall": {"remodeling": {"kappa": 0.1}}}).geometry.checked()[2] == {"wall": 1}
+    assert scene(geometry, regions={"wall": {"remodeling": {"kappa": 0.1}}}).geometry.checked()[
+        2
+    ] == {"wall": 1}
 
 
 def shifted(files: dict[str, Path]) -> None:
@@ -123,7 +136,9 @@ def inside(files: dict[str, Path]) -> None:
     (lambda files: files["inner"].unlink(), "no such file: .*lumen.vtp"),
     (lambda files: [files["inner"].unlink(), files["inner"].mkdir()], "is a folder; a mesh is a file"),
 ])  # fmt: skip
-def test_a_surface_of_another_body_is_refused(change: Callable[[Any], Any], line: str, tmp_path: Path) -> None:
+def test_a_surface_of_another_body_is_refused(
+    change: Callable[[Any], Any], line: str, tmp_path: Path
+) -> None:
     files = write_all(tmp_path)
     change(files)
     with pytest.raises(SceneError) as refused:
@@ -135,7 +150,9 @@ def test_a_surface_of_another_body_is_refused(change: Callable[[Any], Any], line
 def test_triangles_inside_of_the_body_are_no_face(tmp_path: Path) -> None:
     files = write_all(tmp_path)
     inside(files)
-    with pytest.raises(SceneError, match="geometry.faces.inner = 'lumen': has facets inside the body, the first at"):
+    with pytest.raises(
+        SceneError, match="geometry.faces.inner = 'lumen': has facets inside the body, the first at"
+    ):
         scene(in_faces(files)).geometry.checked()
 
 
@@ -145,18 +162,32 @@ def test_what_is_no_list_of_a_mesh_and_surfaces_is_refused(tmp_path: Path) -> No
     twice.parent.mkdir()
     twice.write_bytes(Path(files["inner"]).read_bytes())
     for geometry, line in (
-        ({"file": [files["inner"], files["volume"]]}, "geometry.file = .*: must be the path of a mesh"),
+        (
+            {"file": [files["inner"], files["volume"]]},
+            "geometry.file = .*: must be the path of a mesh",
+        ),
         ({"file": []}, "geometry.file = \\[\\]: must be the path of a mesh"),
-        ({"file": [files["volume"], files["msh"]]}, "geometry.file = .*or a list of it and paths of its su"),
+        (
+            {"file": [files["volume"], files["msh"]]},
+            "geometry.file = .*or a list of it and paths of its su",
+        ),
         (
             {"file": [files["volume"], files["inner"], str(twice)]},
             "geometry.file = .*: .*lumen.vtp: face .lumen. already exists",
         ),
-        ({"file": files["msh"], "faces": {"inner": {"file": "lumen.txt"}}}, "geometry.f.*name or a number in the fi"),
-        ({"file": files["volume"]}, "geometry.file = 'volume.vtu': has no array 'gmsh:physical' or"),
+        (
+            {"file": files["msh"], "faces": {"inner": {"file": "lumen.txt"}}},
+            "geometry.f.*name or a number in the fi",
+        ),
+        (
+            {"file": files["volume"]},
+            "geometry.file = 'volume.vtu': has no array 'gmsh:physical' or",
+        ),
     ):
         with pytest.raises(SceneError, match=f"^{line}"):
             scene(geometry).geometry.checked()
     hexahedra = write_all(tmp_path, "hexahedron")
-    with pytest.raises(SceneError, match="lumen.vtp: a surface of triangles needs a mesh of tetrahedra"):
+    with pytest.raises(
+        SceneError, match="lumen.vtp: a surface of triangles needs a mesh of tetrahedra"
+    ):
         scene(in_faces(hexahedra))

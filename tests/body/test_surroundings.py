@@ -17,7 +17,9 @@ from tests.runs import last_row, made
 SELF = MPI.COMM_SELF
 
 
-def surrounded(stiffness: float, kinematics: str = "radial", tangential: float = 0.0, **changes: Any) -> Scene:
+def surrounded(
+    stiffness: float, kinematics: str = "radial", tangential: float = 0.0, **changes: Any
+) -> Scene:
     springs = {"kind": "elastic", "stiffness": stiffness, "tangential": tangential}
     values: dict[str, Any] = {"natural.opening_angle": 0.0}
     values |= {"supports": {"outer": springs}} if stiffness else {}
@@ -26,7 +28,11 @@ def surrounded(stiffness: float, kinematics: str = "radial", tangential: float =
 
 def test_a_stiffer_surrounding_turns_the_outside_further() -> None:
     """The paper's artery at its equilibrium, of an independent solver: outer eighth of the wall, and inner radius."""
-    law = {"remodeling.law": "tensor", "remodeling.coupling": "extrapolated", "material.repulsion": "log"}
+    law = {
+        "remodeling.law": "tensor",
+        "remodeling.coupling": "extrapolated",
+        "material.repulsion": "log",
+    }
     law |= {"time.end": "equilibrium", "mesh.refinement": 2, "output.columns": []}
     for stiffness, angle, radius in ((0.0, 75.2, 1.413), (0.5, 75.8, None), (2.0, 77.2, 1.409)):
         with made(surrounded(stiffness, **law)) as simulation:
@@ -44,22 +50,38 @@ def test_a_stiffer_surrounding_turns_the_outside_further() -> None:
 
 def test_kinematics_agree_on_springs() -> None:
     """Of fixed direction, square to the face: on one radius, a half-plane, a quarter and the whole tube."""
-    few = {"time.end": 6.0, "loads.pressure.ramp": [[0, 0], [5, 1]], "loads.elongation.ramp": [[0, 0], [5, 1]]}
-    ends = {name: last_row(surrounded(2.0, name, **few)) for name in ("radial", "axisymmetric", "sector")}
+    few = {
+        "time.end": 6.0,
+        "loads.pressure.ramp": [[0, 0], [5, 1]],
+        "loads.elongation.ramp": [[0, 0], [5, 1]],
+    }
+    ends = {
+        name: last_row(surrounded(2.0, name, **few))
+        for name in ("radial", "axisymmetric", "sector")
+    }
     without = last_row(surrounded(0.0, "radial", **few))
     assert without["outer_radius"] - ends["radial"]["outer_radius"] > 0.02
     for name in ("axisymmetric", "sector"):
         for column in ("inner_radius", "outer_radius"):
-            assert ends[name][column] == pytest.approx(ends["radial"][column], abs=2e-3), (name, column)
+            assert ends[name][column] == pytest.approx(ends["radial"][column], abs=2e-3), (
+                name,
+                column,
+            )
 
 
 def test_springs_along_the_wall_need_what_shows_them() -> None:
     """Sections do not stay plane: the half-plane and the whole tube agree, one radius is refused, with its reason."""
-    few = {"time.end": 2.0, "loads.pressure.ramp": [[0, 0], [2, 1]], "loads.elongation.ramp": [[0, 0], [2, 1]]}
+    few = {
+        "time.end": 2.0,
+        "loads.pressure.ramp": [[0, 0], [2, 1]],
+        "loads.elongation.ramp": [[0, 0], [2, 1]],
+    }
     few |= {"time.step": 1.0}
     assert choice(surrounded(2.0, "auto", 1.0)).name == "axisymmetric"
     assert choice(surrounded(2.0, "auto", 0.0)).name == "radial"
-    with pytest.raises(SceneError, match="supports.outer.tangential is above 0: sections do not stay plane"):
+    with pytest.raises(
+        SceneError, match="supports.outer.tangential is above 0: sections do not stay plane"
+    ):
         surrounded(2.0, "radial", 1.0)
     half = last_row(surrounded(2.0, "axisymmetric", 1.0, **few))
     whole = surrounded(2.0, "full", 1.0, **few)

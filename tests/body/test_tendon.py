@@ -28,7 +28,10 @@ LAYERS = 2  # of elements along the axis, each of length 1
 
 def slice_of(scene: dict, layers: int = LAYERS) -> dict[str, Any]:
     """Arguments of `case` for a short piece of the tendon with elements like the whole one's."""
-    return {"scene": {**scene, "geometry": {"shape": "tendon", "length": layers}}, "divisions": (16, 4, layers)}
+    return {
+        "scene": {**scene, "geometry": {"shape": "tendon", "length": layers}},
+        "divisions": (16, 4, layers),
+    }
 
 
 @pytest.fixture(scope="module", params=["slice", *slowly(1, 2, 3)])
@@ -105,5 +108,7 @@ def test_isotropic_cells_stay_homogeneous_and_follow_the_point_solution(case: Ca
         row = int(np.flatnonzero(result["time"] == time)[0])
         s = 1 - np.exp(-KAPPA * (time - 1.0))
         across = (1 - s) / np.sqrt(3)
-        expected = point_stretch(result["force"][row] / 10.0, np.array([across + s, across, across]))
+        expected = point_stretch(
+            result["force"][row] / 10.0, np.array([across + s, across, across])
+        )
         assert result["mean_stretch"][row] == pytest.approx(expected, abs=1e-8), f"t = {time}"

@@ -31,7 +31,9 @@ RENAMED = {"bottom": "inlet", "top": "outlet", "inner": "inner", "outer": "outer
 class WalledTube(WalledMesh):
     """The paper's tube, two long, that says nothing of its axes."""
 
-    loads: ClassVar[dict[str, LoadKind]] = {name: Tube.loads[name] for name in ("pressure", "elongation")}
+    loads: ClassVar[dict[str, LoadKind]] = {
+        name: Tube.loads[name] for name in ("pressure", "elongation")
+    }
     number_of_elements: ClassVar[int] = 128
     face_names: ClassVar[tuple[str, ...]] = ("inner", "outer", "inlet", "outlet")
 
@@ -42,7 +44,9 @@ class WalledTube(WalledMesh):
         """The tube's mesh with other names."""
         tube = Tube(inner_radius=1.0, outer_radius=3.0, length=self.length)
         made = whole_tube(tube, COUNTS, mesh.element, mesh.degree, comm)
-        return replace(made, faces={RENAMED[face]: tag for face, tag in made.faces.items()}, shape="walled")
+        return replace(
+            made, faces={RENAMED[face]: tag for face, tag in made.faces.items()}, shape="walled"
+        )
 
     def hold(self, loading: Any) -> None:
         """As the tube."""
@@ -68,7 +72,10 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def scene(shape: str, end: float = 3.0, **tables: Any) -> Scene:
     """Pressed and pulled, with isotropic cells."""
     radii = {"inner_radius": 1.0, "outer_radius": 3.0} if shape == "tube" else {}
-    values = {"geometry": {"shape": shape, "length": 2.0, **radii}, "loads": ramped(2.0, pressure=2.0, elongation=0.1)}
+    values = {
+        "geometry": {"shape": shape, "length": 2.0, **radii},
+        "loads": ramped(2.0, pressure=2.0, elongation=0.1),
+    }
     values |= {"time": {"end": end}, "solver": {"method": "direct"}, "output": {}}
     return Scene(**isotropic(None, "full", **values | tables))
 
@@ -97,7 +104,9 @@ def test_columns_of_tetrahedra_have_elements_in_every_mesh() -> None:
 
 def test_recorded_fields_and_layers_of_pictures(tmp_path: Path) -> None:
     """Local axes without being asked for, and a picture that knows the layers by the recorded depth."""
-    recording = Recording(run(scene("walled", 1.0, output={"fields": True}), tmp_path / "run", MPI.COMM_SELF))
+    recording = Recording(
+        run(scene("walled", 1.0, output={"fields": True}), tmp_path / "run", MPI.COMM_SELF)
+    )
     fields = recording.fields(1.0)
     assert {*CONSTANT_FIELDS} <= set(fields)
     body = WholeBody(recording)
@@ -110,4 +119,6 @@ def test_a_missing_end_is_refused() -> None:
     faces = {name: tag for name, tag in whole.faces.items() if name != "outlet"}
     walled = replace(whole, faces=faces)
     with pytest.raises(SceneError, match="^geometry.faces: the local axes need a face 'outlet'$"):
-        WalledTube().local_axes(walled, Simulation(scene("walled"), MPI.COMM_SELF, whole).quadrature)
+        WalledTube().local_axes(
+            walled, Simulation(scene("walled"), MPI.COMM_SELF, whole).quadrature
+        )

@@ -22,7 +22,13 @@ AXES = ("axis_c", "axis_a", "axis_r")
 def scene(kinematics: str = "full", **output: object) -> Scene:
     """A short tube, hardly loaded."""
     loads, shape = ramped(2.0, pressure=0.5, elongation=0.02), {"shape": "tube", "length": 2.0}
-    own = {"name": "short", "geometry": shape, "loads": loads, "time": {"end": 2.0}, "output": output}
+    own = {
+        "name": "short",
+        "geometry": shape,
+        "loads": loads,
+        "time": {"end": 2.0},
+        "output": output,
+    }
     return Scene(**isotropic(kinematics=kinematics, **own))
 
 
@@ -35,7 +41,10 @@ def check_cylindrical(fields: dict[str, np.ndarray], centres: np.ndarray, atol: 
 
 
 def test_the_file_of_the_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, refused: Refused
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    refused: Refused,
 ) -> None:
     """Read by meshio; a file that is there stays, and the default name is the scene's."""
     monkeypatch.chdir(tmp_path)
@@ -50,7 +59,9 @@ def test_the_file_of_the_command(
     np.testing.assert_allclose(fields["station"], centres[:, 2] / 2.0, atol=1e-12)
     assert np.unique(np.round(fields["depth"], 9)).size == 8 and 0.0 < fields["depth"].min()
     before = Path("found.vtu").read_bytes()
-    assert "found.vtu: already exists; must be a new file" in refused("axes", "short.toml", "-o", "found.vtu")
+    assert "found.vtu: already exists; must be a new file" in refused(
+        "axes", "short.toml", "-o", "found.vtu"
+    )
     assert Path("found.vtu").read_bytes() == before
     assert cli.main(["axes", "short.toml"]) == 0 and Path("short-axes.vtu").read_bytes() == before
 
@@ -64,7 +75,10 @@ def test_constant_fields_stand_in_the_file_once_and_belong_to_every_time(tmp_pat
         np.testing.assert_array_equal(first[name], last[name])
     check_cylindrical(first, recording.points[recording.elements].mean(axis=1), 1e-6)
     with h5py.File(folder / "fields.vtkhdf") as file:
-        assert len(file["VTKHDF/CellData/axis_c"]) == 1536 and len(file["VTKHDF/CellData/fibre_angle"]) == 3 * 1536
+        assert (
+            len(file["VTKHDF/CellData/axis_c"]) == 1536
+            and len(file["VTKHDF/CellData/fibre_angle"]) == 3 * 1536
+        )
 
 
 def test_local_axes_of_a_sector_turn_with_it(tmp_path: Path) -> None:
@@ -75,7 +89,9 @@ def test_local_axes_of_a_sector_turn_with_it(tmp_path: Path) -> None:
         root = file["VTKHDF"]
         number = int(root["NumberOfCells"][0])
         fields = {name: root["CellData"][name][:number] for name in CONSTANT_FIELDS}
-        places = root["Points"][: int(root["NumberOfPoints"][0])][root["Connectivity"][:].reshape(number, -1)]
+        places = root["Points"][: int(root["NumberOfPoints"][0])][
+            root["Connectivity"][:].reshape(number, -1)
+        ]
     # mirrored axes: a direction is one up to its sign
     centres = places.mean(axis=1)
     signs = np.sign(centres[:, 0] * centres[:, 1])[:, None]

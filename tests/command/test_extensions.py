@@ -44,7 +44,16 @@ def place(tmp_path: Path) -> Path:
 def test_the_demo_of_a_column(tmp_path: Path) -> None:
     """Of a cube that is pulled uniformly; both extensions of a line are run, in any place of it."""
     (tmp_path / "other.py").write_text("print('the other one')\n")
-    words = ["--with", DEMO, "run", PROJECT / "demos" / "cube.toml", "-q", "-o", tmp_path / "run", "--set=time.end=2"]
+    words = [
+        "--with",
+        DEMO,
+        "run",
+        PROJECT / "demos" / "cube.toml",
+        "-q",
+        "-o",
+        tmp_path / "run",
+        "--set=time.end=2",
+    ]
     done = run(*words, f"--with={tmp_path / 'other.py'}")
     assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("the other one\n")
     history = read_history(tmp_path / "run")
@@ -54,7 +63,10 @@ def test_the_demo_of_a_column(tmp_path: Path) -> None:
     np.testing.assert_allclose(history["max_shear_strain"], strain, rtol=1e-6, atol=1e-12)
     header = (tmp_path / "run" / "scene.toml").read_text().split("\n\n")[0]
     for path in (DEMO, tmp_path / "other.py"):
-        assert f"# {path.name} sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}\n" in f"{header}\n"
+        assert (
+            f"# {path.name} sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}\n"
+            in f"{header}\n"
+        )
     assert len(DEMO.read_text().splitlines()) < 60
 
 
@@ -62,8 +74,19 @@ def test_every_command_knows_it(place: Path) -> None:
     """By the option or the variable; without it a scene that needs it is refused."""
     assert "remodeling.driver = 'mine'" in refusal_of("validate", "cube.toml", cwd=place)
     variables = {**os.environ, EXTENSIONS: str(place / "mine.py")}
-    assert forked("remodel-fenicsx", "validate", "cube.toml", cwd=place, variables=variables).returncode == 0
-    for words in ("validate cube.toml", "run cube.toml -q -o run", "report run", "picture run -o run.png", "info"):
+    assert (
+        forked(
+            "remodel-fenicsx", "validate", "cube.toml", cwd=place, variables=variables
+        ).returncode
+        == 0
+    )
+    for words in (
+        "validate cube.toml",
+        "run cube.toml -q -o run",
+        "report run",
+        "picture run -o run.png",
+        "info",
+    ):
         program = ["python", WITHOUT_A_BODY] if words.startswith("picture") else ["remodel-fenicsx"]
         done = forked(*program, *words.split(), "--with", "mine.py", cwd=place)
         assert (done.returncode, done.stderr) == (0, ""), words
@@ -87,13 +110,19 @@ def test_both_ranks_know_it(place: Path) -> None:
 
 
 def test_a_run_goes_on_with_it(place: Path) -> None:
-    assert run("run", "cube.toml", "--with", "mine.py", "-q", "-o", "run", cwd=place).returncode == 0
+    assert (
+        run("run", "cube.toml", "--with", "mine.py", "-q", "-o", "run", cwd=place).returncode == 0
+    )
     before = (place / "run" / "scene.toml").read_bytes()
-    assert "extension mine.py" in refusal_of("run", "--resume", "run", "--set=time.end=3", cwd=place)
+    assert "extension mine.py" in refusal_of(
+        "run", "--resume", "run", "--set=time.end=3", cwd=place
+    )
     assert (place / "run" / "scene.toml").read_bytes() == before
     (place / "mine.py").write_text(f"{DRIVER}\n")
     other = run("--with", "mine.py", "run", "--resume", "run", "--set=time.end=3", "-q", cwd=place)
-    assert other.returncode == 0 and re.search(r"resumes with mine.py sha256:\w+, but was started with", other.stderr)
+    assert other.returncode == 0 and re.search(
+        r"resumes with mine.py sha256:\w+, but was started with", other.stderr
+    )
     assert list(read_history(place / "run")["time"]) == [0.0, 1.0, 2.0, 3.0]
 
 
@@ -118,12 +147,18 @@ COLUMN = "from remodel_fenicsx.extend import COLUMNS, Column\nCOLUMNS['a'] = Col
         ("mine", "1 / m.step.time", "bad.py, line 2: ZeroDivisionError"),
     ],
 )
-def test_a_column_that_cannot_be_written_is_refused_by_name(tmp_path: Path, name: str, value: str, said: str) -> None:
+def test_a_column_that_cannot_be_written_is_refused_by_name(
+    tmp_path: Path, name: str, value: str, said: str
+) -> None:
     """In one line: a row that it would spoil is not there."""
     (tmp_path / "bad.py").write_text(COLUMN.format(name, value))
-    line = refusal_of("run", PROJECT / "demos" / "cube.toml", "--with", "bad.py", "-q", "-o", "run", cwd=tmp_path)
+    line = refusal_of(
+        "run", PROJECT / "demos" / "cube.toml", "--with", "bad.py", "-q", "-o", "run", cwd=tmp_path
+    )
     assert said in line
-    assert not (tmp_path / "run" / "history.csv").exists() or not len(read_history(tmp_path / "run")["time"])
+    assert not (tmp_path / "run" / "history.csv").exists() or not len(
+        read_history(tmp_path / "run")["time"]
+    )
 
 
 def test_two_of_one_name_are_refused_and_one_is_run_once(tmp_path: Path) -> None:
@@ -131,5 +166,11 @@ def test_two_of_one_name_are_refused_and_one_is_run_once(tmp_path: Path) -> None
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mine.py").write_text("print('hello')\n")
     done = run("info", "--with", "a/mine.py", "--with", "./a/mine.py", cwd=tmp_path)
-    assert done.returncode == 0 and done.stdout.count("hello") == 1 and "mine.py          sha256:" in done.stdout
-    assert "b/mine.py" in refusal_of("info", "--with", "a/mine.py", "--with", "b/mine.py", cwd=tmp_path)
+    assert (
+        done.returncode == 0
+        and done.stdout.count("hello") == 1
+        and "mine.py          sha256:" in done.stdout
+    )
+    assert "b/mine.py" in refusal_of(
+        "info", "--with", "a/mine.py", "--with", "b/mine.py", cwd=tmp_path
+    )

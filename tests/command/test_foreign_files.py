@@ -74,10 +74,16 @@ OPTIONS = tomllib.loads((Path(__file__).parent / "petsc_options.toml").read_text
 TAKEN = OPTIONS.pop("taken")
 
 
-@pytest.mark.parametrize(("name", "value"), [item for options in OPTIONS.values() for item in options.items()])
+@pytest.mark.parametrize(
+    ("name", "value"), [item for options in OPTIONS.values() for item in options.items()]
+)
 def test_an_option_that_does_more_than_solve_is_refused(name: str, value: Any) -> None:
-    with pytest.raises(SceneError, match=rf"^solver\.petsc_options\.{name} = .*: .*; allowed: ") as refusal:
-        preset_scene("kuhl-holzapfel-2007", "cube").with_values({f"solver.petsc_options.{name}": value})
+    with pytest.raises(
+        SceneError, match=rf"^solver\.petsc_options\.{name} = .*: .*; allowed: "
+    ) as refusal:
+        preset_scene("kuhl-holzapfel-2007", "cube").with_values(
+            {f"solver.petsc_options.{name}": value}
+        )
     assert len(str(refusal.value).splitlines()) == 1
 
 
@@ -93,11 +99,15 @@ REPLACED = "fields.vtkhdf fields_chains.vtkhdf scene.toml.part checkpoint-a.npz.
 
 @pytest.mark.parametrize("kind", ["symbolic", "hard"])
 @pytest.mark.parametrize("names", [*([name] for name in NEVER_THROUGH), REPLACED], ids=" ".join)
-def test_nothing_is_written_through_a_link(names: list[str], kind: str, folder: Path, tmp_path: Path) -> None:
+def test_nothing_is_written_through_a_link(
+    names: list[str], kind: str, folder: Path, tmp_path: Path
+) -> None:
     before = {}
     for name in names:
         path, victim = folder / name, tmp_path / f"victim of {name}"
-        before[victim] = path.read_bytes() if path.exists() else MINE  # a valid one: but it is another file
+        before[victim] = (
+            path.read_bytes() if path.exists() else MINE
+        )  # a valid one: but it is another file
         victim.write_bytes(before[victim])
         path.unlink(missing_ok=True)
         (path.hardlink_to if kind == "hard" else path.symlink_to)(victim)
@@ -144,7 +154,9 @@ def forged(folder: Path, change: Change, compressed: bool = False) -> None:
 
 def put(key: str, value: Any) -> Change:
     """Another entry of the header; with a value that is callable, what it makes of the old one."""
-    return lambda header, arrays: header.update({key: value(header.get(key)) if callable(value) else value})
+    return lambda header, arrays: header.update(
+        {key: value(header.get(key)) if callable(value) else value}
+    )
 
 
 def array(name: str, make: Callable[[Any], Any]) -> Change:
@@ -161,16 +173,35 @@ def without(name: str) -> Change:
     """An entry less, of header or arrays."""
 
     def change(header: dict[str, Any], arrays: dict[str, Any]) -> None:
-        (header if name in header else arrays).pop(name if name != "function" else f"function/{header['functions'][0]}")
+        (header if name in header else arrays).pop(
+            name if name != "function" else f"function/{header['functions'][0]}"
+        )
 
     return change
 
 
-ODD = {"text": "x", "none": None, "list": [1], "table": {"a": 1}, "negative": -1, "true": True, "many": 10**400}
+ODD = {
+    "text": "x",
+    "none": None,
+    "list": [1],
+    "table": {"a": 1},
+    "negative": -1,
+    "true": True,
+    "many": 10**400,
+}
 FORGERIES = {
     **{
         f"{key} {name}": put(key, value)
-        for key in ("time", "number", "scene", "versions", "loads", "numbers", "functions", "format")
+        for key in (
+            "time",
+            "number",
+            "scene",
+            "versions",
+            "loads",
+            "numbers",
+            "functions",
+            "format",
+        )
         for name, value in ODD.items()
         # what is no forgery: a checkpoint that could have been written, or one whose fault is harmless
         if f"{key} {name}" not in ("scene text", "time true", "numbers table")
@@ -239,7 +270,9 @@ def headed(head: bytes) -> bytes:
     """An archive with one array that begins so."""
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w") as archive:
-        archive.writestr("header.npy", b"\x93NUMPY\x02\x00" + len(head).to_bytes(4, "little") + head)
+        archive.writestr(
+            "header.npy", b"\x93NUMPY\x02\x00" + len(head).to_bytes(4, "little") + head
+        )
     return whole.getvalue()
 
 
@@ -279,12 +312,16 @@ def linked(kind: str) -> Callable[[Path, Path], None]:
             del file["VTKHDF/PointData/displacement"]
             group = file["VTKHDF/PointData"]
             if kind == "external link":
-                group["displacement"] = h5py.ExternalLink(str(victim), "/VTKHDF/PointData/displacement")
+                group["displacement"] = h5py.ExternalLink(
+                    str(victim), "/VTKHDF/PointData/displacement"
+                )
             elif kind == "soft link":
                 group["displacement"] = h5py.SoftLink("/VTKHDF/Points")
             elif kind == "external storage":
                 storage = [(str(victim), 0, h5py.h5f.UNLIMITED)]
-                group.create_dataset("displacement", shape, "f4", maxshape=(None, 3), external=storage)
+                group.create_dataset(
+                    "displacement", shape, "f4", maxshape=(None, 3), external=storage
+                )
             else:
                 layout = h5py.VirtualLayout(shape, "f4")
                 layout[:] = h5py.VirtualSource(str(victim), "x", shape)
@@ -304,7 +341,9 @@ def test_fields_that_are_kept_elsewhere_are_refused(kind: str, folder: Path, vic
 
 
 @pytest.mark.parametrize("name", ["fields.vtkhdf", "fields_chains.vtkhdf"])
-def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(name: str, folder: Path) -> None:
+def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(
+    name: str, folder: Path
+) -> None:
     """HDF5's own check sums, and times and offsets, which follow from the numbers of nodes, elements and steps."""
     for place, wrong in (("Steps/Values", -1.0), ("Steps/PointDataOffsets/displacement", 7)):
         copy = shutil.copy(folder / name, folder.with_name("copy.vtkhdf"))
@@ -345,7 +384,10 @@ sys.exit(cli.main(["run", {str(demo("cube"))!r}, "--set", "time.end=5", "-q", "-
 """
     done = forked("python", program)
     assert done.returncode == 5 and done.stdout == "", (done.returncode, done.stdout, done.stderr)
-    assert done.stderr.count("\n") == 1 and "was deleted during the run; lost: the rows of this run" in done.stderr
+    assert (
+        done.stderr.count("\n") == 1
+        and "was deleted during the run; lost: the rows of this run" in done.stderr
+    )
 
 
 def test_a_folder_with_nothing_but_a_dead_lock_is_nobodys(tmp_path: Path) -> None:
@@ -373,9 +415,16 @@ def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> Non
     words = "ensemble scene.toml --seeds 2 --jobs 1 -o out -q".split()
     command = [sys.executable, PROJECT / "bin" / "remodel-fenicsx", *words]
     own = {"PETSC_OPTIONS": "-remodel_snes_monitor ascii:the-users-own::append"}
-    done = subprocess.run(command, cwd=tmp_path, env=os.environ | own, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | own, capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
-    assert {path.name for path in tmp_path.iterdir()} == {*put_there, "scene.toml", "out", "the-users-own"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *put_there,
+        "scene.toml",
+        "out",
+        "the-users-own",
+    }
 
 
 # ---------------------------------------------------------------- without end
@@ -423,7 +472,9 @@ def test_a_scene_has_bounds(tmp_path: Path) -> None:
 def test_numbers_on_the_command_line_have_bounds(words: tuple[str, ...], tmp_path: Path) -> None:
     done = run(words[0], demo("cube"), *words[1:], cwd=tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert "must be an integer from 1 to 10000" in done.stderr or "more than 100 parts" in done.stderr
+    assert (
+        "must be an integer from 1 to 10000" in done.stderr or "more than 100 parts" in done.stderr
+    )
     assert not list(tmp_path.iterdir())
 
 

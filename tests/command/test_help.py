@@ -12,7 +12,9 @@ import pytest
 from remodel_fenicsx import cli
 from remodel_fenicsx.scene.presets import PRESETS, PROFILES
 
-(SUBPARSERS,) = [action for action in cli.parser()._actions if isinstance(action, argparse._SubParsersAction)]
+(SUBPARSERS,) = [
+    action for action in cli.parser()._actions if isinstance(action, argparse._SubParsersAction)
+]
 OF_PROCESSES = {cli.SERVE, cli.PART}
 COMMANDS: dict[str, argparse.ArgumentParser] = {
     name: found for name, found in SUBPARSERS.choices.items() if name not in OF_PROCESSES
@@ -29,7 +31,9 @@ def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_help_of_a_command_has_examples_that_it_takes(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_of_a_command_has_examples_that_it_takes(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as end:
         cli.main([name, "--help"])
     text = capsys.readouterr().out
@@ -37,7 +41,9 @@ def test_the_help_of_a_command_has_examples_that_it_takes(name: str, capsys: pyt
     words = shlex.split(cli.COMMANDS[name].example.split(" > ")[0])
     assert f"  remodel-fenicsx {name}" in text and cli.parser().parse_args(words).command == name
     for action in COMMANDS[name]._actions:
-        assert action.help and (action.dest == "help" or action.help[0].isupper() and action.help.endswith((".", ").")))
+        assert action.help and (
+            action.dest == "help" or action.help[0].isupper() and action.help.endswith((".", ")."))
+        )
 
 
 def test_the_help_names_what_there_is_without_loading_it() -> None:
@@ -50,9 +56,15 @@ def test_the_page_of_commands_has_an_example_and_every_option(name: str) -> None
     """In the section of the command, or in the table of options of most commands."""
     page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
     common = page.split("\n## Run and look\n")[0].split("Most commands")[1]
-    (section,) = re.findall(rf"^### (?:\w+ and )?{name}(?: and \w+)?\n(.*?)(?=^##)", page, re.MULTILINE | re.DOTALL)
+    (section,) = re.findall(
+        rf"^### (?:\w+ and )?{name}(?: and \w+)?\n(.*?)(?=^##)", page, re.MULTILINE | re.DOTALL
+    )
     for line in re.findall(r"^\./with-fenicsx remodel-fenicsx (.*)$", section, re.MULTILINE):
-        assert cli.parser().parse_args(shlex.split(line.split(" > ")[0])).command in (name, "picture", "animate")
+        assert cli.parser().parse_args(shlex.split(line.split(" > ")[0])).command in (
+            name,
+            "picture",
+            "animate",
+        )
     assert f"remodel-fenicsx {name}" in section
     for action in COMMANDS[name]._actions:
         option = next((o for o in action.option_strings if o.startswith("--")), "")

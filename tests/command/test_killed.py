@@ -22,7 +22,16 @@ from remodel_fenicsx.results.run_folder import FolderTaken, History
 from remodel_fenicsx.results.vtkhdf import DeferredErrorFile, TransientGrid
 from remodel_fenicsx.running import resume, run
 from tests.forks import forked
-from tests.results.test_resume import LONGER, SELF, assert_same, first_half, half, rows, scene, whole
+from tests.results.test_resume import (
+    LONGER,
+    SELF,
+    assert_same,
+    first_half,
+    half,
+    rows,
+    scene,
+    whole,
+)
 
 __all__ = ["first_half", "half", "whole"]  # fixtures
 
@@ -81,7 +90,13 @@ class Camera:
         with monkeypatch.context() as patch:
             patch.setattr(DeferredErrorFile, "write", half_and_whole)
             patch.setattr(History, "_write", half_row)
-            for owner, name in ((os, "link"), (os, "fsync"), (Path, "replace"), (Path, "rename"), (Path, "unlink")):
+            for owner, name in (
+                (os, "link"),
+                (os, "fsync"),
+                (Path, "replace"),
+                (Path, "rename"),
+                (Path, "unlink"),
+            ):
                 before(owner, name)
             yield
 
@@ -167,7 +182,10 @@ def test_load_cases_and_turnover_survive_kills(tmp_path: Path) -> None:
     columns = ["content", "natural_length", "inner_radius", "fibre_angle_outer", "seconds"]
     killed_at_random(tmp_path, GROWING.replace("COLUMNS", str(columns)), "remodel-fenicsx", kills=5)
     table = read_history(tmp_path / "expected")
-    assert table["content"][-1] > 1.3 and table["inner_radius@2"][-1] > table["inner_radius"][-1] + 0.05
+    assert (
+        table["content"][-1] > 1.3
+        and table["inner_radius@2"][-1] > table["inner_radius"][-1] + 0.05
+    )
 
 
 # ---------------------------------------------------------------- a full disk
@@ -208,7 +226,9 @@ def test_a_full_disk_loses_nothing(
     what: str, disk: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every finished row is there; with room again the run goes on to its end."""
-    settings = scene(6.0, checkpoint=1).with_values({"time.step": 0.25, "output.fields": what == "fields"})
+    settings = scene(6.0, checkpoint=1).with_values(
+        {"time.step": 0.25, "output.fields": what == "fields"}
+    )
     expected = run(settings, tmp_path / "expected", SELF)
     folder, calls = disk / "run", []
 

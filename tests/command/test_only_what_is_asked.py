@@ -25,7 +25,11 @@ SELF = MPI.COMM_SELF
 
 def scene(**tables: Any) -> Scene:
     """A cube as a point, three steps."""
-    base: dict[str, Any] = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "cube"}, "time": {"end": 3.0}}
+    base: dict[str, Any] = {
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "cube"},
+        "time": {"end": 3.0},
+    }
     return scene_from_dict(base | {"model": {"kinematics": "point"}} | tables)
 
 
@@ -64,14 +68,18 @@ def test_cells_that_never_move_have_no_pass(
     remodeling: dict[str, Any], passes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither a pass nor its kernel; the law of rotation has a time of its own in place of kappa."""
-    calls, kernels = Calls(monkeypatch, RemodelingPass, "apply"), Calls(monkeypatch, jit, "expression")
+    calls, kernels = Calls(monkeypatch, RemodelingPass, "apply"), Calls(
+        monkeypatch, jit, "expression"
+    )
     cells = {"initial": [0.6, 0.0, 0.8]}
     model = {"kinematics": "full" if "rotation" in remodeling.values() else "point"}
     with made(scene(remodeling=remodeling, cells=cells, model=model)) as simulation:
         needed, before = kernels.number, simulation.cells.structure_tensor().copy()
         list(simulation.steps())
         assert calls.number == passes
-        if not remodeling or not passes:  # the axis that the law of rotation turns lies along the load already
+        if (
+            not remodeling or not passes
+        ):  # the axis that the law of rotation turns lies along the load already
             assert np.array_equal(before, simulation.cells.structure_tensor()) == (passes == 0)
     if not passes:
         Simulation(scene(cells=cells), SELF).close()
@@ -89,15 +97,27 @@ def test_columns_that_are_named_are_the_only_ones_measured(monkeypatch: pytest.M
 
 
 def test_fields_that_are_named_are_the_only_ones_written(tmp_path: Path) -> None:
-    asked: dict[str, Any] = {"all": True, "two": ["displacement", "fibre_angle"], "chains": ["chains"], "none": False}
-    folders = {name: run(scene(output={"fields": fields}), tmp_path / name, SELF) for name, fields in asked.items()}
+    asked: dict[str, Any] = {
+        "all": True,
+        "two": ["displacement", "fibre_angle"],
+        "chains": ["chains"],
+        "none": False,
+    }
+    folders = {
+        name: run(scene(output={"fields": fields}), tmp_path / name, SELF)
+        for name, fields in asked.items()
+    }
     whole = Recording(folders["all"]).fields(3.0)
-    absent = "chains region fibre_angle_unloaded natural_gradient content natural_length growth".split()
+    absent = (
+        "chains region fibre_angle_unloaded natural_gradient content natural_length growth".split()
+    )
     assert set(whole) == set(FIELDS_BY_NAME) - {*absent}
     two = Recording(folders["two"]).fields(3.0)
     assert set(two) == {"displacement", "fibre_angle"}
     assert all(np.array_equal(two[name], whole[name]) for name in two)
-    written = {name: {path.name for path in folder.glob("fields*")} for name, folder in folders.items()}
+    written = {
+        name: {path.name for path in folder.glob("fields*")} for name, folder in folders.items()
+    }
     assert written["all"] == written["chains"] == {"fields.vtkhdf", "fields_chains.vtkhdf"}
     assert written["two"] == {"fields.vtkhdf"} and written["none"] == set()
 
@@ -110,9 +130,23 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
         f"run(scene_from_dict(json.loads({json.dumps(text)!r})), {str(tmp_path / 'run')!r})\n"
         "print(*sorted({module.split('.')[0] for module in sys.modules}))"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     imported = set(done.stdout.split())
     assert {"dolfinx", "petsc4py", "ufl"} < imported
-    assert not imported & {"gmsh", "h5py", "rich", "pint", "scipy", "matplotlib", "pyvista", "pandas", "PIL"}
-    assert "gmsh 4" in (tmp_path / "run" / "scene.toml").read_text()  # its version is known all the same
+    assert not imported & {
+        "gmsh",
+        "h5py",
+        "rich",
+        "pint",
+        "scipy",
+        "matplotlib",
+        "pyvista",
+        "pandas",
+        "PIL",
+    }
+    assert (
+        "gmsh 4" in (tmp_path / "run" / "scene.toml").read_text()
+    )  # its version is known all the same

@@ -26,14 +26,18 @@ from tests.forks import forked
 ROOT = Path(__file__).parents[2]
 TUBE = "tutorial_tube"
 OF_PAGES = tomllib.loads((Path(__file__).parent / "pages.toml").read_text(encoding="utf-8"))
-SHORT, LIGHT, NOT_RUN, LEFT_BEHIND = (OF_PAGES[name] for name in ("short", "light", "not_run", "left_behind"))
+SHORT, LIGHT, NOT_RUN, LEFT_BEHIND = (
+    OF_PAGES[name] for name in ("short", "light", "not_run", "left_behind")
+)
 REFUSAL = "loads.force"
 SCRIPT = "import runpy, sys; sys.path.insert(0, '.'); del sys.argv[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
 PAGES = [
     "start",
     "fit",
     "report",
-    *sorted(page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md")),
+    *sorted(
+        page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md")
+    ),
 ]
 
 
@@ -106,7 +110,9 @@ def test_a_reader_gets_through_the_page(
     printed = ""
     for language, text in blocks(page):
         if language == "sh":
-            printed = "".join(obey(line, capsys) for line in text.splitlines() if not is_left_out(line))
+            printed = "".join(
+                obey(line, capsys) for line in text.splitlines() if not is_left_out(line)
+            )
         elif language == "output":
             assert list(printed_as(text, printed))
         elif not keep(text):
@@ -134,10 +140,14 @@ def test_what_is_said_to_be_shortened_or_left_out_is_there() -> None:
     assert all(words in text for words in (*SHORT, *NOT_RUN))
 
 
-def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     (text,) = (text for language, text in blocks("start") if language == "text" and REFUSAL in text)
     command, *shown = text.splitlines()
-    words = [str(ROOT / word) if word.startswith("demos/") else word for word in shlex.split(command)[2:]]
+    words = [
+        str(ROOT / word) if word.startswith("demos/") else word for word in shlex.split(command)[2:]
+    ]
     assert cli.main(words) == 2
     assert capsys.readouterr().err.split() == " ".join(shown).split()
 
@@ -163,15 +173,24 @@ def test_the_examples_of_the_readme_run(
     assert Path("results/artery/report.html").exists() and Path("tube/history.csv").exists()
 
 
-def test_numbers_of_an_experiment_go_into_the_tutorials_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_of_an_experiment_go_into_the_tutorials_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """docs/which_numbers.md: its table in place of the one of `tube.toml`."""
     monkeypatch.chdir(tmp_path)
     for _, text in blocks(TUBE):
         keep(text)
     page = (ROOT / "docs" / "which_numbers.md").read_text(encoding="utf-8")
     (table,) = re.findall(r"^```toml\n(\[material\]\n.*?)^```", page, re.MULTILINE | re.DOTALL)
-    scene = re.sub(r"^\[material\]\n.*?(?=^\[)", "", Path("tube.toml").read_text(), flags=re.MULTILINE | re.DOTALL)
-    scene = re.sub(r"^kappa = .*\n", "", scene, flags=re.MULTILINE) if "half_life" in table else scene
+    scene = re.sub(
+        r"^\[material\]\n.*?(?=^\[)",
+        "",
+        Path("tube.toml").read_text(),
+        flags=re.MULTILINE | re.DOTALL,
+    )
+    scene = (
+        re.sub(r"^kappa = .*\n", "", scene, flags=re.MULTILINE) if "half_life" in table else scene
+    )
     merged, _, remodeling = table.partition("[remodeling]")
     scene = scene.replace("[remodeling]", f"{merged}\n[remodeling]{remodeling}")
     Path("mine.toml").write_text(scene)

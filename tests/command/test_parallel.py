@@ -55,7 +55,9 @@ def compare(one: dict, two: dict, steps: int) -> None:
 # Short pieces of the long ones, the ramp and a little beyond; one layer of an artery is so unstable that rounding grows
 ENDS = {"cube": 16, "tendon": 16, "artery": 28}
 SHORT = {name: scene | {"time": {"end": float(ENDS[name])}} for name, scene in SCENES.items()}
-ON_ONE_AND_TWO_RANKS = [SLICES[name](scene) if name in SLICES else {"scene": scene} for name, scene in SHORT.items()]
+ON_ONE_AND_TWO_RANKS = [
+    SLICES[name](scene) if name in SLICES else {"scene": scene} for name, scene in SHORT.items()
+]
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +68,9 @@ def on_one_and_two_ranks(cases: Cases) -> dict[str, tuple[dict, dict]]:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_one_and_two_ranks_agree(name: str, on_one_and_two_ranks: dict[str, tuple[dict, dict]]) -> None:
+def test_one_and_two_ranks_agree(
+    name: str, on_one_and_two_ranks: dict[str, tuple[dict, dict]]
+) -> None:
     compare(*on_one_and_two_ranks[name], ENDS[name])
 
 

@@ -27,7 +27,9 @@ PROJECT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "remodel_fenicsx.cli"]
 
 
-def run(*arguments: str | Path, ranks: int = 1, **options: object) -> subprocess.CompletedProcess[str]:
+def run(
+    *arguments: str | Path, ranks: int = 1, **options: object
+) -> subprocess.CompletedProcess[str]:
     """remodel-fenicsx ARGUMENTS on so many ranks; a process of its own, imports and all, where a test asks for more."""
     if ranks == 1 and options.keys() <= {"cwd"}:
         return forked("remodel-fenicsx", *arguments, **options)
@@ -75,7 +77,11 @@ def words_on_ranks(name: str, parent: Path) -> tuple[list[str], Path]:
     if name == "taken":
         out.mkdir()
         (out / "mine.txt").write_text("dear")
-    changes = [f"--set={setting.strip()}" for setting in settings.strip().replace("\n", "|").split("|") if setting]
+    changes = [
+        f"--set={setting.strip()}"
+        for setting in settings.strip().replace("\n", "|").split("|")
+        if setting
+    ]
     return ["run", str(demo(scene)), *changes, "-o", str(out)], out
 
 
@@ -84,7 +90,9 @@ def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
     """What tests/commands.py makes of all of them."""
     parent = tmp_path_factory.mktemp("ranks")
     commands = {name: words_on_ranks(name, parent) for name in ON_RANKS}
-    (parent / "commands.json").write_text(json.dumps({name: words for name, (words, _) in commands.items()}))
+    (parent / "commands.json").write_text(
+        json.dumps({name: words for name, (words, _) in commands.items()})
+    )
     program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(parent)]
     done = subprocess.run(mpirun(2, *program), capture_output=True, text=True, timeout=300)
     codes = json.loads((parent / "codes.json").read_text()) | {"nowhere": [done.returncode] * 2}
@@ -93,7 +101,10 @@ def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
     for name, (first, second) in codes.items():
         assert first == second, name
         said = [(parent / f"{name}.{ending}").read_text() for ending in ("out", "err")]
-        found[name] = subprocess.CompletedProcess(commands[name][0], first, *said), commands[name][1]
+        found[name] = (
+            subprocess.CompletedProcess(commands[name][0], first, *said),
+            commands[name][1],
+        )
     return found
 
 
@@ -126,7 +137,14 @@ def tendon_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_folder_holds_history_fields_scene_and_log(tendon_run: Path) -> None:
     names = {path.name for path in tendon_run.iterdir()}
     # on a slow machine there is a second checkpoint
-    files = {"history.csv", "fields.vtkhdf", "fields_chains.vtkhdf", "scene.toml", "run.log", "report.html"}
+    files = {
+        "history.csv",
+        "fields.vtkhdf",
+        "fields_chains.vtkhdf",
+        "scene.toml",
+        "run.log",
+        "report.html",
+    }
     assert names - {"checkpoint-b.npz"} == files | {"checkpoint-a.npz"}
     log = (tendon_run / "run.log").read_text()
     assert "finished" in log
@@ -146,7 +164,15 @@ def test_history_has_the_columns_of_the_contract(tendon_run: Path) -> None:
 
 def test_the_first_row_is_the_unloaded_body(tendon_run: Path) -> None:
     first = {name: values[0] for name, values in read_history(tendon_run).items()}
-    nothing = ("time", "force", "remodeling_power", "newton_iterations", "linear_iterations", "substeps", "seconds")
+    nothing = (
+        "time",
+        "force",
+        "remodeling_power",
+        "newton_iterations",
+        "linear_iterations",
+        "substeps",
+        "seconds",
+    )
     assert all(first[name] == 0.0 for name in nothing)
     for name in ("mean_stretch", "min_stretch", "max_stretch", "min_jacobian"):
         assert first[name] == pytest.approx(1.0, abs=1e-14)
@@ -163,7 +189,9 @@ def test_one_and_two_ranks_write_the_same_files(on_ranks: Callable[[str, int], D
         np.testing.assert_allclose(two[name], one[name], rtol=1e-7, err_msg=name)
     for name in ("fields.vtkhdf", "fields_chains.vtkhdf"):
         with h5py.File(here / name) as first, h5py.File(folder / name) as second:
-            np.testing.assert_array_equal(first["VTKHDF/Connectivity"][:], second["VTKHDF/Connectivity"][:])
+            np.testing.assert_array_equal(
+                first["VTKHDF/Connectivity"][:], second["VTKHDF/Connectivity"][:]
+            )
             a, b = (file["VTKHDF/PointData/displacement"][:] for file in (first, second))
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
 
@@ -176,8 +204,13 @@ def test_petsc_options_from_scene_and_environment(tmp_path: Path) -> None:
     monitored = run(*one, tmp_path / "scene", "--set", "solver.petsc_options.snes_monitor=true")
     assert monitored.returncode == 0 and "SNES Function norm" in monitored.stdout
     # LU of MUMPS is exact: one linear iteration a Newton iteration; GMRES with Jacobi needs more
-    loose = {**os.environ, "PETSC_OPTIONS": "-remodel_ksp_type gmres -remodel_ksp_rtol 1e-12 -remodel_pc_type jacobi"}
-    other = run(*one, tmp_path / "other", "--set", "solver.petsc_options.pc_type=cholesky", env=loose)
+    loose = {
+        **os.environ,
+        "PETSC_OPTIONS": "-remodel_ksp_type gmres -remodel_ksp_rtol 1e-12 -remodel_pc_type jacobi",
+    }
+    other = run(
+        *one, tmp_path / "other", "--set", "solver.petsc_options.pc_type=cholesky", env=loose
+    )
     assert other.returncode == 0, other.stderr
     direct, iterative = read_history(tmp_path / "quiet"), read_history(tmp_path / "other")
     assert direct["linear_iterations"][1] == direct["newton_iterations"][1] > 0
@@ -189,15 +222,22 @@ def test_petsc_options_from_scene_and_environment(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ranks", [2, *slowly(1)])
-def test_a_folder_with_files_is_never_touched(ranks: int, on_ranks: Callable[[str, int], Done]) -> None:
+def test_a_folder_with_files_is_never_touched(
+    ranks: int, on_ranks: Callable[[str, int], Done]
+) -> None:
     done, folder = on_ranks("taken", ranks)
     assert done.returncode == 2
-    assert done.stderr == f"remodel-fenicsx: folder {folder}: is not empty; allowed is a new or an empty folder\n"
+    assert (
+        done.stderr
+        == f"remodel-fenicsx: folder {folder}: is not empty; allowed is a new or an empty folder\n"
+    )
     assert [path.name for path in folder.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_output_that_cannot_be_written_is_exit_code_5(ranks: int, on_ranks: Callable[[str, int], Done]) -> None:
+def test_output_that_cannot_be_written_is_exit_code_5(
+    ranks: int, on_ranks: Callable[[str, int], Done]
+) -> None:
     done, _ = on_ranks("nowhere", ranks)
     assert done.returncode == 5
     assert done.stderr.count("cannot write the results") == 1 and done.stderr.count("\n") == 1
@@ -205,18 +245,26 @@ def test_output_that_cannot_be_written_is_exit_code_5(ranks: int, on_ranks: Call
 
 def test_a_folder_below_a_file_is_exit_code_2(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "must be a new or an empty folder" in refusal_of("run", demo("cube"), "-o", tmp_path / "file" / "below")
+    assert "must be a new or an empty folder" in refusal_of(
+        "run", demo("cube"), "-o", tmp_path / "file" / "below"
+    )
 
 
 # ---------------------------------------------------------------- failures and signals
 
 
 @pytest.mark.parametrize("ranks", [2, *slowly(1)])
-def test_an_impossible_load_is_exit_code_3_and_says_where(ranks: int, on_ranks: Callable[[str, int], Done]) -> None:
+def test_an_impossible_load_is_exit_code_3_and_says_where(
+    ranks: int, on_ranks: Callable[[str, int], Done]
+) -> None:
     done, folder = on_ranks("impossible", ranks)
     assert done.returncode == 3, done.stderr
     line = next(line for line in done.stderr.splitlines() if line.startswith("remodel-fenicsx:"))
-    assert "no equilibrium at time 3: " in line and "largest r/L = " in line and "prescribe less elongation" in line
+    assert (
+        "no equilibrium at time 3: " in line
+        and "largest r/L = " in line
+        and "prescribe less elongation" in line
+    )
     np.testing.assert_array_equal(read_history(folder)["time"], [0.0, 1.0, 2.0])
     assert (folder / "scene.toml").exists()
 
@@ -226,18 +274,26 @@ def test_an_impossible_load_is_exit_code_3_and_says_where(ranks: int, on_ranks: 
     [(signal.SIGINT, 1), (signal.SIGTERM, 2),
      *slowly((signal.SIGINT, 2), (signal.SIGTERM, 1), (signal.SIGHUP, 1), (signal.SIGHUP, 2))],
 )  # fmt: skip
-def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: signal.Signals, ranks: int) -> None:
+def test_a_signal_ends_the_run_and_keeps_finished_steps(
+    tmp_path: Path, number: signal.Signals, ranks: int
+) -> None:
     """The end that it makes is a checkpoint, also where there is none on the way."""
     folder = tmp_path / "out"
     command = mpirun(ranks, *COMMAND, "run", str(demo("cube")), "--set=output.checkpoint=0", "--set=time.end=900",
                      "--set=mesh.refinement=2", "-o", str(folder))  # fmt: skip
     # in a group of its own, which gets the signal as a terminal gives it
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
+    )
     wait_for_rows(process, folder, 4)
     os.killpg(process.pid, number)
     _, errors = process.communicate(timeout=200)
-    assert process.returncode == 128 + number if ranks == 1 else process.returncode != 0  # mpirun's own code
-    assert ranks == 2 or errors.endswith(f"stopped by {number.name}; all finished steps are saved\n")
+    assert (
+        process.returncode == 128 + number if ranks == 1 else process.returncode != 0
+    )  # mpirun's own code
+    assert ranks == 2 or errors.endswith(
+        f"stopped by {number.name}; all finished steps are saved\n"
+    )
     last = read_history(folder)["time"][-1]
     assert last >= 2 and (folder / "history.csv").read_text().endswith("\n")
     for _ in range(60):  # mpirun may end before its ranks have written what they keep
@@ -246,7 +302,10 @@ def test_a_signal_ends_the_run_and_keeps_finished_steps(tmp_path: Path, number: 
             break
         time.sleep(0.5)
     assert done.returncode == 0, done.stderr
-    assert ranks == 2 or f"resumes from the checkpoint of time {last:g}, " in (folder / "run.log").read_text()
+    assert (
+        ranks == 2
+        or f"resumes from the checkpoint of time {last:g}, " in (folder / "run.log").read_text()
+    )
     assert read_history(folder)["time"].tolist() == list(range(int(last) + 3))
 
 
@@ -278,12 +337,22 @@ os._exit(status)
 """
     done = forked("python", program, "run", demo("cube"), "--set", "time.end=2", "-q", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert sorted(done.stdout.splitlines()) == ["results in results/cube", "results in results/cube-2"]
-    assert all((tmp_path / "results" / name / "history.csv").exists() for name in ("cube", "cube-2"))
+    assert sorted(done.stdout.splitlines()) == [
+        "results in results/cube",
+        "results in results/cube-2",
+    ]
+    assert all(
+        (tmp_path / "results" / name / "history.csv").exists() for name in ("cube", "cube-2")
+    )
 
 
 def test_a_misspelt_petsc_option_is_said_and_logged(tmp_path: Path) -> None:
-    options = ["--set", "solver.petsc_options.snes_linesearch_typ=bt", "--set", "solver.petsc_options.ksp_type=preonly"]
+    options = [
+        "--set",
+        "solver.petsc_options.snes_linesearch_typ=bt",
+        "--set",
+        "solver.petsc_options.ksp_type=preonly",
+    ]
     done = run("run", demo("cube"), *options, "--set", "time.end=2", "-q", "-o", tmp_path / "out")
     assert done.returncode == 0
     warning = "WARNING: solver.petsc_options: without effect (misspelt?): snes_linesearch_typ\n"
@@ -304,7 +373,9 @@ def test_an_old_dolfinx_is_exit_code_5(
 
 # ---------------------------------------------------------------- bad input and the small commands
 
-BAD_SETTINGS = (Path(__file__).parent / "bad_settings.txt").read_text()  # what is set, and how the line begins
+BAD_SETTINGS = (
+    Path(__file__).parent / "bad_settings.txt"
+).read_text()  # what is set, and how the line begins
 
 
 @pytest.mark.parametrize("line", BAD_SETTINGS.splitlines())
@@ -325,7 +396,9 @@ def test_bad_input_is_refused_once_on_two_ranks(two_ranks: dict[str, Done]) -> N
 
 def test_validate_new_and_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["validate", str(demo("artery"))]) == 0
-    assert "a valid scene (tube, 150 steps)\nnetwork modulus c = 1.568 Pa, " in capsys.readouterr().out
+    assert (
+        "a valid scene (tube, 150 steps)\nnetwork modulus c = 1.568 Pa, " in capsys.readouterr().out
+    )
     for preset in ("kuhl-holzapfel-2007", "sun-2002"):
         for shape in ("cube", "tendon", "tube", "sheet"):
             capsys.readouterr()
@@ -345,15 +418,25 @@ WHOLE_RAMP = slowly(("tendon", "3"), ("tendon", "14"), ("artery", "27"))
 
 
 @pytest.mark.parametrize(("name", "end"), [("cube", None), ("artery", "2"), *WHOLE_RAMP])
-def test_the_script_and_the_scene_of_a_demo_are_the_same_simulation(name: str, end: str | None, tmp_path: Path) -> None:
+def test_the_script_and_the_scene_of_a_demo_are_the_same_simulation(
+    name: str, end: str | None, tmp_path: Path
+) -> None:
     """On a coarse mesh of the tube, which both take by themselves."""
     program = f"{COARSE}import runpy; runpy.run_path({str(PROJECT / 'demos' / name)!r} + '.py', run_name='__main__')"
     script = forked("python", program, *([end] if end else []), cwd=tmp_path)
     assert script.returncode == 0, script.stderr
     settings = ["output.fields=false", *([f"time.end={end}"] if end else [])]
-    scene = forked("four layers", "run", demo(name), *(f"--set={setting}" for setting in settings), cwd=tmp_path)
+    scene = forked(
+        "four layers",
+        "run",
+        demo(name),
+        *(f"--set={setting}" for setting in settings),
+        cwd=tmp_path,
+    )
     assert scene.returncode == 0, scene.stderr
-    ours, theirs = read_history(tmp_path / "results" / f"{name}-script"), read_history(tmp_path / "results" / name)
+    ours, theirs = read_history(tmp_path / "results" / f"{name}-script"), read_history(
+        tmp_path / "results" / name
+    )
     assert list(ours) == list(theirs)
     for column in set(ours) - {"seconds"}:
         np.testing.assert_allclose(ours[column], theirs[column], rtol=1e-10, err_msg=column)
@@ -366,6 +449,9 @@ def test_an_unstable_equilibrium_is_exit_code_3_where_the_scene_says_stop(
     done, folder = on_ranks("unstable", ranks)
     assert done.returncode == 3, done.stderr
     line = next(line for line in done.stderr.splitlines() if line.startswith("remodel-fenicsx:"))
-    assert "the equilibrium at time 2 is unstable: 1 negative" in line and "run --resume continues from there" in line
+    assert (
+        "the equilibrium at time 2 is unstable: 1 negative" in line
+        and "run --resume continues from there" in line
+    )
     history = read_history(folder)
     np.testing.assert_array_equal(history["time"], [0.0, 1.0])

@@ -47,7 +47,10 @@ os._exit(cli.main(sys.argv[1:]))  # what it has not written by itself is lost
 """
     done = forked("python", program, *CUBE, "-q", "-o", tmp_path / "out")
     assert done.returncode == 5
-    assert done.stderr == "remodel-fenicsx: cannot write to the standard output: No space left on device\n"
+    assert (
+        done.stderr
+        == "remodel-fenicsx: cannot write to the standard output: No space left on device\n"
+    )
     assert read_history(tmp_path / "out")["time"][-1] == 10
 
 
@@ -71,7 +74,9 @@ sys.exit(cli.main(sys.argv[1:]))
 """
 
 
-def test_a_step_that_is_stopped_while_it_compiles_is_taken_back_and_the_run_goes_on(tmp_path: Path) -> None:
+def test_a_step_that_is_stopped_while_it_compiles_is_taken_back_and_the_run_goes_on(
+    tmp_path: Path,
+) -> None:
     """Parts of a step are compiled when the first step needs them."""
     words = [*CUBE, "-q", "--set", "output.checkpoint=0", "-o", tmp_path]
     stopped = forked("python", STOPPED_WHILE_IT_COMPILES, *words)
@@ -82,11 +87,16 @@ def test_a_step_that_is_stopped_while_it_compiles_is_taken_back_and_the_run_goes
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, *slowly(signal.SIGINT)])
-def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.Signals, tmp_path: Path) -> None:
+def test_a_signal_that_was_ignored_from_the_start_stays_ignored(
+    number: signal.Signals, tmp_path: Path
+) -> None:
     """nohup ignores SIGHUP, a shell script SIGINT for its jobs in the background."""
     words = [*COMMAND, "--set", "mesh.refinement=3", "-q", "-o", str(tmp_path / "out")]
     process = subprocess.Popen(
-        words, stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(number, signal.SIG_IGN)
+        words,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_IGN),
     )
     wait_for_rows(process, tmp_path / "out", 3)
     process.send_signal(number)
@@ -97,9 +107,15 @@ def test_a_signal_that_was_ignored_from_the_start_stays_ignored(number: signal.S
 
 @pytest.mark.parametrize(
     ("module", "number"),
-    [("pydantic", signal.SIGINT), ("petsc4py.PETSc", signal.SIGTERM), ("remodel_fenicsx.running", signal.SIGHUP)],
+    [
+        ("pydantic", signal.SIGINT),
+        ("petsc4py.PETSc", signal.SIGTERM),
+        ("remodel_fenicsx.running", signal.SIGHUP),
+    ],
 )
-def test_a_signal_among_the_imports_ends_with_a_line(module: str, number: signal.Signals, tmp_path: Path) -> None:
+def test_a_signal_among_the_imports_ends_with_a_line(
+    module: str, number: signal.Signals, tmp_path: Path
+) -> None:
     program = f"""
 import os, runpy, signal, sys
 class Signal:
@@ -110,7 +126,9 @@ sys.meta_path.insert(0, Signal)
 sys.argv = {["remodel-fenicsx", *CUBE, "-o", str(tmp_path / "out")]!r}
 runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__")
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=100
+    )
     line = f"remodel-fenicsx: stopped by {number.name}\n"
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", line)
     assert list(tmp_path.iterdir()) == []
@@ -149,7 +167,12 @@ def test_processes_of_srun_that_share_no_mpi_are_refused(tmp_path: Path) -> None
     done = forked("remodel-fenicsx", *words, variables=variables)
     assert done.returncode == 5 and "without a common MPI: use mpirun -n 2" in done.stderr
     assert not (tmp_path / "out").exists()
-    assert forked("remodel-fenicsx", *words, variables=variables | {"SLURM_STEP_NUM_TASKS": "1"}).returncode == 0
+    assert (
+        forked(
+            "remodel-fenicsx", *words, variables=variables | {"SLURM_STEP_NUM_TASKS": "1"}
+        ).returncode
+        == 0
+    )
 
 
 def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: Path) -> None:
@@ -157,7 +180,16 @@ def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: 
     points, triangles = tube(around=640, along=160)
     file = tmp_path / "lumen.vtp"
     pyvista.PolyData.from_regular_faces(points, triangles).save(file)
-    words = ["wall", str(file), "--thickness", "0.3", "--size", "0.3", "-o", str(tmp_path / "wall.msh")]
+    words = [
+        "wall",
+        str(file),
+        "--thickness",
+        "0.3",
+        "--size",
+        "0.3",
+        "-o",
+        str(tmp_path / "wall.msh"),
+    ]
     process = subprocess.Popen([*COMMAND[:3], *words], stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None and "remeshing 204800 triangles" in process.stderr.readline()
     process.terminate()
@@ -172,7 +204,16 @@ def test_a_limit_of_files_is_no_fault_of_a_surface(tmp_path: Path) -> None:
     points, triangles = tube()
     file = tmp_path / "lumen.vtp"
     pyvista.PolyData.from_regular_faces(points, triangles).save(file)
-    words = ["wall", str(file), "--thickness", "0.3", "--size", "0.3", "-o", str(tmp_path / "wall.msh")]
+    words = [
+        "wall",
+        str(file),
+        "--thickness",
+        "0.3",
+        "--size",
+        "0.3",
+        "-o",
+        str(tmp_path / "wall.msh"),
+    ]
     for blocks in (20, 200):
         limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$0" "$@"', *COMMAND[:3], *words]
         done = subprocess.run(limited, capture_output=True, text=True, timeout=100)

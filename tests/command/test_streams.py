@@ -17,7 +17,9 @@ def test_a_closed_output_is_like_one_that_nobody_reads(tmp_path: Path) -> None:
     (tmp_path / "cube.toml").write_text(pulled_cube(1.0).to_toml())
     command = f"{sys.executable} -P -m remodel_fenicsx.cli"
     for words in (f"run {tmp_path}/cube.toml -o {tmp_path}/run", f"status {tmp_path}/run"):
-        done = subprocess.run(f"{command} {words} <&- >&-", shell=True, capture_output=True, text=True)
+        done = subprocess.run(
+            f"{command} {words} <&- >&-", shell=True, capture_output=True, text=True
+        )
         assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
 
 

@@ -41,7 +41,9 @@ def run_in_terminal(arguments: list[str], columns: int = 100) -> tuple[int, str]
     leader, follower = pty.openpty()
     environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": str(columns)}
     environment.pop("NO_COLOR", None)
-    with subprocess.Popen(arguments, stdin=follower, stdout=follower, stderr=follower, env=environment) as run:
+    with subprocess.Popen(
+        arguments, stdin=follower, stdout=follower, stderr=follower, env=environment
+    ) as run:
         os.close(follower)
         received = bytearray()
         while True:
@@ -66,9 +68,13 @@ def test_a_terminal_gets_a_bar(tmp_path):
     assert status == 0, text
     lines = [line.strip() for line in re.split(r"[\r\n]+", plain(text))]
     bars = [line for line in lines if "━" in line]
-    assert re.match(r"artery \[4\] ━+ 8/8 t = 8, pressure \[0.5\], 3 Newton 0:00:0\d", bars[-1]), bars[-1]
+    assert re.match(
+        r"artery \[4\] ━+ 8/8 t = 8, pressure \[0.5\], 3 Newton 0:00:0\d", bars[-1]
+    ), bars[-1]
     assert any(re.search(r"[2-7]/8 .* left$", line) for line in bars)
-    assert "two substeps" in lines and "WARNING: careful" in lines  # lines of their own, above the bar
+    assert (
+        "two substeps" in lines and "WARNING: careful" in lines
+    )  # lines of their own, above the bar
     assert lines[-2:] == ["the end", ""]
     assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1  # the cursor came back
     assert "WARNING careful" in (tmp_path / "run.log").read_text()

@@ -30,7 +30,10 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
             rows = csv.writer(table)
             rows.writerow(["x", "y", "z", "angle"])
             rows.writerows(
-                [x + away, y, z, 30] for x in (-1.5, 0, 1.5) for y in (-1.5, 0, 1.5) for z in (0.5, 1.5, 2.5)
+                [x + away, y, z, 30]
+                for x in (-1.5, 0, 1.5)
+                for y in (-1.5, 0, 1.5)
+                for z in (0.5, 1.5, 2.5)
             )
     return file
 

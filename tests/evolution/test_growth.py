@@ -25,13 +25,27 @@ from tests.runs import goes_on, last_row, made, opening_angle, rows_of, simulate
 from tests.values import ANGLES, isotropic, ramped
 
 SELF = MPI.COMM_SELF
-GROWN = ["content", "natural_length", "growth", "collagen_share", "wall_thickness", "mean_hoop_stress"]
+GROWN = [
+    "content",
+    "natural_length",
+    "growth",
+    "collagen_share",
+    "wall_thickness",
+    "mean_hoop_stress",
+]
 PLACES = [f"hoop_stress_{place}" for place in ("inner", "middle", "outer")]
 
 
-def wall(volume: float, end: float | str = 1440.0, tolerance: float | None = 1.0, **tables: Any) -> Scene:
+def wall(
+    volume: float, end: float | str = 1440.0, tolerance: float | None = 1.0, **tables: Any
+) -> Scene:
     """A tube of 1 to 1.3 under a pressure of 1.2 and an elongation of 10 %, with the rates `cauchy`."""
-    turnover = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0, "volume": volume} | tables.pop("turnover", {})
+    turnover = {
+        "time": 40.0,
+        "deposition_stretch": 1.1,
+        "gain": 1.0,
+        "volume": volume,
+    } | tables.pop("turnover", {})
     values = isotropic(
         "consistent",
         geometry={"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0}
@@ -40,7 +54,9 @@ def wall(volume: float, end: float | str = 1440.0, tolerance: float | None = 1.0
         time={"end": end} | ({} if end == "equilibrium" else {"step": 4.0, "tolerance": tolerance}),
         output={"fields": False, "report": False},
     )
-    scene = scene_from_dict(values | {"mesh": {"refinement": 2, "degree": 2}, "loads": raised(1.0)} | tables)
+    scene = scene_from_dict(
+        values | {"mesh": {"refinement": 2, "degree": 2}, "loads": raised(1.0)} | tables
+    )
     columns = [*ANGLES, "inner_radius", "outer_radius", *PLACES, *GROWN]
     kept = [name for name in columns if volume or name not in ("growth", "collagen_share")]
     return scene.with_values({"output.columns": kept})
@@ -88,7 +104,10 @@ LOCAL = {  # hoop stress and content inside, half-way and outside; growth makes 
 
 
 def at_rest(
-    case: tuple[float, float, float, float], pressure: float = 1.2, held: float = 1600.0, **tables: Any
+    case: tuple[float, float, float, float],
+    pressure: float = 1.2,
+    held: float = 1600.0,
+    **tables: Any,
 ) -> Scene:
     """The wall of a case, on the path through the rest before; eight elements, as its angles are of eighths."""
     volume, gain, stretch, factor = case
@@ -110,27 +129,35 @@ def compare(row: dict[str, float], expected: Rest, *but: str) -> None:
 
 
 @pytest.mark.parametrize("case", RESTS, ids=str)
-def test_walls_rest_where_an_independent_program_says(case: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_walls_rest_where_an_independent_program_says(
+    case: Any, caplog: pytest.LogCaptureFixture
+) -> None:
     """Radius, thickness, means, angles, what a cut shows, curves continued to the faces; nothing is said."""
     with simulated(at_rest(case)) as (simulation, (row,)):
         stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
-        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.part("turnover")._values(
-            "content"
-        )
+        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.part(
+            "turnover"
+        )._values("content")
     compare(row, RESTS[case])
-    for values, expected, accuracy in zip((stress, content.ravel()), LOCAL.get(case, ()), (0.1, 0.02)):
+    for values, expected, accuracy in zip(
+        (stress, content.ravel()), LOCAL.get(case, ()), (0.1, 0.02)
+    ):
         curve = np.polynomial.Polynomial.fit(depth, values, 8)
         assert curve(np.array([0.0, 0.5, 1.0])) == pytest.approx(expected, rel=0.03, abs=accuracy)
     if case[0]:
         assert row["growth"] == pytest.approx(1 + case[0] * (row["content"] - 1), rel=1e-3)
-        assert row["collagen_share"] == pytest.approx(case[0] * row["content"] / row["growth"], abs=0.01)
+        assert row["collagen_share"] == pytest.approx(
+            case[0] * row["content"] / row["growth"], abs=0.01
+        )
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
 @pytest.mark.parametrize("case", THICK_RESTS, ids=str)
 def test_thick_walls_too(case: Any) -> None:
     """The paper's radii and pressure; half-way is a line between two of eight elements, in one of which angles jump."""
-    finer = at_rest(case, 4.8, geometry={"outer_radius": 3.0}).with_values({"mesh.refinement": 1 + (case[0] == 0.0)})
+    finer = at_rest(case, 4.8, geometry={"outer_radius": 3.0}).with_values(
+        {"mesh.refinement": 1 + (case[0] == 0.0)}
+    )
     columns = [*finer.output.columns, "axial_force"]
     row, expected = last_row(finer.with_values({"output.columns": columns})), THICK_RESTS[case]
     if case[0]:  # growth turns a pull along the axis into a thrust
@@ -144,7 +171,9 @@ def test_thick_walls_too(case: Any) -> None:
     ("volume", "thickness", "stress", "opening_angle"),
     [(0.3, 1.189, 1.465, 158.5), *slowly((0.5, 1.411, 1.220, 155.5), (1.0, 1.994, 0.841, 151.5))],
 )
-def test_room_from_rest_on(volume: float, thickness: float, stress: float, opening_angle: float) -> None:
+def test_room_from_rest_on(
+    volume: float, thickness: float, stress: float, opening_angle: float
+) -> None:
     """Over the rest before, that of a wall without room; however short its loads were held."""
     before = RESTS[0.0, 1.0, 1.1, 1.0]
     row = last_row(at_rest((volume, 1.0, 1.1, 1.5), held=100.0, turnover={"from": "rest"}))
@@ -164,7 +193,12 @@ def test_a_wall_comes_back_when_the_pressure_falls() -> None:
 def membrane(volume: float, gain: float, loads: Any, end: float, step: float) -> Scene:
     """A thin wall that collagen alone bears."""
     bulk = {"lame_lambda": 100.0, "lame_mu": 0.01}
-    thin: Any = {"geometry": {"outer_radius": 1.01}, "turnover": {"gain": gain}, "material": bulk, "loads": loads}
+    thin: Any = {
+        "geometry": {"outer_radius": 1.01},
+        "turnover": {"gain": gain},
+        "material": bulk,
+        "loads": loads,
+    }
     return wall(volume, end, None, **thin).with_values({"time.step": step})
 
 
@@ -194,40 +228,70 @@ def test_growth_does_not_alternate_from_point_to_point(monkeypatch: pytest.Monke
     """As much of it as the strain of an element can follow: with all of it J_e swings within every element."""
 
     def swing() -> float:
-        stiff = {"material": {"lame_lambda": 300.0}, "mesh": {"degree": 2, "formulation": "displacement"}}
+        stiff = {
+            "material": {"lame_lambda": 300.0},
+            "mesh": {"degree": 2, "formulation": "displacement"},
+        }
         with simulated(wall(0.5, 200.0, **stiff)) as (simulation, _):
             J = np.linalg.det(simulation.state.elastic_gradient()).reshape(-1, 3)
         return float(np.abs(J[:, 0] - 2 * J[:, 1] + J[:, 2]).max() / np.ptp(J.mean(axis=1)))
 
     projected = swing()
-    monkeypatch.setattr(Quadrature, "polynomial_residual", lambda self, degree, values: np.zeros_like(values))
+    monkeypatch.setattr(
+        Quadrature, "polynomial_residual", lambda self, degree, values: np.zeros_like(values)
+    )
     assert swing() > 3 * projected
 
 
-@pytest.mark.parametrize("case", ["growth", "opening angle", "random tissue", "residual stress alone"])
+@pytest.mark.parametrize(
+    "case", ["growth", "opening angle", "random tissue", "residual stress alone"]
+)
 def test_walls_are_those_of_the_reference(case: str) -> None:
     """At a time on the way to rest, with fine steps; where tissue does not turn over, the opened sector too."""
-    rng, tissue, opening, volume, gain, stretch = np.random.default_rng(3), RadialMaterial(), 0.0, 0.5, 1.0, 1.1
+    rng, tissue, opening, volume, gain, stretch = (
+        np.random.default_rng(3),
+        RadialMaterial(),
+        0.0,
+        0.5,
+        1.0,
+        1.1,
+    )
     if case == "random tissue":
-        numbers = [float(rng.uniform(*ends)) for ends in ((10, 60), (1, 6), (1, 4), (1.5, 2.5), (0.9, 1.1))]
+        numbers = [
+            float(rng.uniform(*ends)) for ends in ((10, 60), (1, 6), (1, 4), (1.5, 2.5), (0.9, 1.1))
+        ]
         tissue, volume, gain, stretch = RadialMaterial(*numbers), 0.8, 1.4, 1.15
     elif case != "growth":
         opening = 90.0
     turns = case != "residual stress alone"
-    reference = Wall(tissue, (1.0, 1.3), opening, 0.025, 10.0 if turns else 1e12, stretch, gain, volume)
+    reference = Wall(
+        tissue, (1.0, 1.3), opening, 0.025, 10.0 if turns else 1e12, stretch, gain, volume
+    )
     reference.run(1.2, 0.1, 8.0, 20.0, 0.5)
     turnover = {"time": reference.time, "gain": gain, "deposition_stretch": stretch}
     moduli = {name: getattr(tissue, name) for name in ("lame_lambda", "lame_mu", "contour_length")}
     density = tissue.network_modulus / (1.381e-23 * 310.0 / (4 * 1.365))
-    tables: Any = {"loads": ramped(8.0, pressure=1.2, elongation=0.1), "material": moduli | {"chain_density": density}}
-    scene = wall(volume, 20.0, None, turnover=turnover, natural={"opening_angle": opening}, **tables).with_values(
-        {"time.step": 0.5, "mesh.refinement": 6, "cells.end_to_end_length": tissue.end_to_end_length}
+    tables: Any = {
+        "loads": ramped(8.0, pressure=1.2, elongation=0.1),
+        "material": moduli | {"chain_density": density},
+    }
+    scene = wall(
+        volume, 20.0, None, turnover=turnover, natural={"opening_angle": opening}, **tables
+    ).with_values(
+        {
+            "time.step": 0.5,
+            "mesh.refinement": 6,
+            "cells.end_to_end_length": tissue.end_to_end_length,
+        }
     )
     expected = reference.row()
     with simulated(scene.with_values({"output.columns": [*expected]})) as (simulation, rows):
         for name, value in expected.items():
             assert rows[-1][name] == pytest.approx(value, rel=2e-3), name
-        if case in ("random tissue", "residual stress alone"):  # the angle is that sensitive to steps elsewhere
+        if case in (
+            "random tissue",
+            "residual stress alone",
+        ):  # the angle is that sensitive to steps elsewhere
             assert opening_angle(simulation) == pytest.approx(reference.cut(), abs=1.0)
 
 
@@ -250,12 +314,25 @@ def test_kinematics_agree() -> None:
 def test_whole_tubes_and_their_files_agree(tmp_path: Path) -> None:
     """Linear elements; the file's wall grows along the radial axis that is found in it."""
     geometry = {"inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH}
-    names, loads = ["growth", "content", "collagen_share"], ramped(8.0, pressure=4.0, elongation=0.1)
-    tables: Any = {"turnover": {"time": 10.0}, "loads": loads, "mesh": {"degree": 1}, "model": {"kinematics": "full"}}
-    scene = wall(0.5, 12.0, None, geometry=geometry, **tables).with_values({"output.columns": names})
+    names, loads = ["growth", "content", "collagen_share"], ramped(
+        8.0, pressure=4.0, elongation=0.1
+    )
+    tables: Any = {
+        "turnover": {"time": 10.0},
+        "loads": loads,
+        "mesh": {"degree": 1},
+        "model": {"kinematics": "full"},
+    }
+    scene = wall(0.5, 12.0, None, geometry=geometry, **tables).with_values(
+        {"output.columns": names}
+    )
     whole = last_row(scene, whole_tube(scene.geometry, COUNTS, "hexahedron", 1, SELF))
     body = {"shape": "mesh", "file": str(write_tube(tmp_path / "tube.msh"))}
-    changes: dict[str, Any] = {"preset": None, "material.repulsion": "log", "remodeling.law": "tensor"}
+    changes: dict[str, Any] = {
+        "preset": None,
+        "material.repulsion": "log",
+        "remodeling.law": "tensor",
+    }
     file = last_row(scene.with_values(changes | {"geometry": body, "cells.axes": "local"}))
     assert whole["growth"] > 1.1
     for name in names:
@@ -276,7 +353,10 @@ def test_load_cases_grow_alike() -> None:
     """Two cases of the same loads are one."""
     values: Any = {"mesh": {"degree": 2}, "loads": SHORT["loads"], "turnover": {"time": 10.0}}
     plain = last_row(wall(0.5, 12.0, None, **values))
-    cases = [{"weight": 0.5, "loads": {"pressure": 1.0}}, {"weight": 0.5, "loads": {"pressure": 1.0}}]
+    cases = [
+        {"weight": 0.5, "loads": {"pressure": 1.0}},
+        {"weight": 0.5, "loads": {"pressure": 1.0}},
+    ]
     twice = last_row(wall(0.5, 12.0, None, **values, cases=cases))
     for name in ("inner_radius", *GROWN):
         assert twice[name] == pytest.approx(plain[name], rel=1e-8), name
@@ -287,7 +367,11 @@ def test_a_folder_of_an_earlier_version_goes_on_as_it_was(tmp_path: Path) -> Non
     scene = wall(0.0, 8.0, None, turnover={"rates": "tension", "time": 10.0}, loads=SHORT["loads"])
     folder = run(scene, tmp_path / "run", SELF)
     text = (folder / "scene.toml").read_text()
-    lines = [line for line in text.splitlines() if not line.startswith(("rates =", "volume =", "from =", "growth ="))]
+    lines = [
+        line
+        for line in text.splitlines()
+        if not line.startswith(("rates =", "volume =", "from =", "growth ="))
+    ]
     assert len(lines) < len(text.splitlines())
     (folder / "scene.toml").write_text("\n".join(lines) + "\n")
     turnover = Recording(folder).scene.remodeling.turnover
@@ -304,7 +388,10 @@ def test_a_vessel_that_grows_pushes_along_its_axis(caplog: pytest.LogCaptureFixt
 
 def test_tissue_that_is_lost_is_refused() -> None:
     """All of a wall is collagen, which goes where nothing pulls."""
-    slack = {"turnover": {"time": 1.0, "deposition_stretch": 1.3}, "loads": ramped(4.0, pressure=0.01, elongation=0.0)}
+    slack = {
+        "turnover": {"time": 1.0, "deposition_stretch": 1.3},
+        "loads": ramped(4.0, pressure=0.01, elongation=0.0),
+    }
     with pytest.raises(StepFailure, match="tissue"):
         rows_of(wall(1.0, 200.0, None, **slack))
 
@@ -312,7 +399,10 @@ def test_tissue_that_is_lost_is_refused() -> None:
 @pytest.mark.parametrize(
     ("turnover", "says"),
     [
-        ({"gain": 0.35}, "gain = 0.35: no stable homeostasis with this deposition_stretch; must exceed 0.397"),
+        (
+            {"gain": 0.35},
+            "gain = 0.35: no stable homeostasis with this deposition_stretch; must exceed 0.397",
+        ),
         ({"gain": 0.45}, "gain = 0.45: reaches equilibrium slowly"),
         ({"gain": 0.45, "rates": "tension"}, "must exceed 0.496"),
         ({"gain": 0.45, "deposition_stretch": 1.2}, "reaches equilibrium slowly"),
@@ -326,7 +416,9 @@ def test_validate_says_which_gains_rest(
     (tmp_path / "scene.toml").write_text(wall(0.3, turnover=turnover).to_toml())
     assert cli.main(["validate", str(tmp_path / "scene.toml")]) == 0
     printed = capsys.readouterr()
-    found = [line for line in (printed.out + printed.err).splitlines() if "turnover.gain = " in line]
+    found = [
+        line for line in (printed.out + printed.err).splitlines() if "turnover.gain = " in line
+    ]
     assert says in found[0] if says else not found
 
 
@@ -334,7 +426,9 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
     """E T/(k a - 2) for a membrane without a matrix, from the fall of its rates; a matrix makes it rest sooner."""
     for gain in (1.0, 2.0):
         rates: list[float] = []
-        with made(membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 20.0 / gain)) as simulation:
+        with made(
+            membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 20.0 / gain)
+        ) as simulation:
             turnover = simulation.stepper.part("turnover")
             for step in simulation.steps():
                 rates += [np.abs(turnover.rates()).max()] if step.time in (600.0, 700.0) else []

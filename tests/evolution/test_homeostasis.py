@@ -20,7 +20,10 @@ from tests.values import ANGLES, isotropic
 
 def values(kinematics: str = "radial", **tables: Any) -> dict[str, Any]:
     """The artery of isotropic cells."""
-    base = {"time": {"end": "equilibrium"}, "output": {"columns": ["pass_residual"], "fields": False}}
+    base = {
+        "time": {"end": "equilibrium"},
+        "output": {"columns": ["pass_residual"], "fields": False},
+    }
     return isotropic(kinematics=kinematics, **base | tables)
 
 
@@ -45,10 +48,15 @@ def test_it_is_where_time_leads(driver: str) -> None:
     assert isinstance(way, Homeostasis) and row["substeps"] == way.steps
     assert row["pass_residual"] < 1e-6
     in_time = Simulation(
-        artery(remodeling=changes, time={"end": 3000.0 if driver == "pk2" else 900.0, "step": 12.5}), SELF
+        artery(
+            remodeling=changes, time={"end": 3000.0 if driver == "pk2" else 900.0, "step": 12.5}
+        ),
+        SELF,
     )
     last = list(in_time.steps())[-1].row
-    np.testing.assert_allclose(at_once.cells.dimension_values, in_time.cells.dimension_values, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        at_once.cells.dimension_values, in_time.cells.dimension_values, rtol=0, atol=1e-6
+    )
     for name in ("inner_radius", "outer_radius", "stored_energy"):
         assert row[name] == pytest.approx(last[name], rel=1e-6)
     assert row["inner_radius"] > 1.3  # remodeled, and loaded
@@ -57,7 +65,9 @@ def test_it_is_where_time_leads(driver: str) -> None:
 @pytest.mark.parametrize("target, end, away", [
     ({"exponent": 1.0}, 2e3, 1e-5), ({"threshold": 2.0, "coupling": "staggered"}, 2e4, 2e-3),
 ])  # fmt: skip
-def test_other_targets_come_to_rest_where_time_leads(target: dict[str, Any], end: float, away: float) -> None:
+def test_other_targets_come_to_rest_where_time_leads(
+    target: dict[str, Any], end: float, away: float
+) -> None:
     """Points near a threshold rest late; not where the target of exponent 2 leads."""
     times = ({"end": last, "tolerance": 0.5} for last in ("equilibrium", end))
     scenes = [artery(preset="consistent", remodeling=target, time=time) for time in times]
@@ -77,7 +87,9 @@ def test_relaxation_and_tensor_have_the_same_limit_as_eq_11() -> None:
     found = []
     for law in ("explicit", "relaxation", "tensor"):
         material = {"repulsion": "log" if law == "tensor" else "axes"}
-        simulation = Simulation(artery(remodeling={"law": law, "frame": "material"}, material=material), SELF)
+        simulation = Simulation(
+            artery(remodeling={"law": law, "frame": "material"}, material=material), SELF
+        )
         assert solved(simulation)["pass_residual"] < 1e-6
         found.append(simulation.cells.structure_tensor())
     for other in found[1:]:
@@ -86,11 +98,17 @@ def test_relaxation_and_tensor_have_the_same_limit_as_eq_11() -> None:
 
 @pytest.mark.slow
 def test_one_and_two_ranks_agree(case: Case) -> None:
-    scene = values("full") | {"geometry": {"shape": "cube"}, "mesh": {"refinement": 2}, "cells": {"initial": "random"}}
+    scene = values("full") | {
+        "geometry": {"shape": "cube"},
+        "mesh": {"refinement": 2},
+        "cells": {"initial": "random"},
+    }
     one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
     for name in ("u", "l"):
         np.testing.assert_allclose(two[name], one[name], atol=1e-8)
-    np.testing.assert_allclose(np.sort(one["l"], axis=-1)[..., :2], 0.0, atol=1e-6)  # all of it along the load
+    np.testing.assert_allclose(
+        np.sort(one["l"], axis=-1)[..., :2], 0.0, atol=1e-6
+    )  # all of it along the load
 
 
 # ---------------------------------------------------------------- the way decides
@@ -104,13 +122,20 @@ def tube_in_time(
 ) -> Any:
     """Of a tube on a ray, at once and in time to kappa t = 20: row, A at all points, simulation."""
     ramp, found = [list(pair) for pair in factors], []
-    loads = {name: {"value": v, "ramp": ramp} for name, v in (("pressure", pressure), ("elongation", elongation))}
+    loads = {
+        name: {"value": v, "ramp": ramp}
+        for name, v in (("pressure", pressure), ("elongation", elongation))
+    }
     shape = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0}
     base = isotropic(None, **{"geometry": shape, "mesh": {"degree": 2}, "loads": loads} | tables)
-    at_once: dict[str, Any] = {"end": "equilibrium"} | ({"tolerance": tolerance} if tolerance else {})
+    at_once: dict[str, Any] = {"end": "equilibrium"} | (
+        {"tolerance": tolerance} if tolerance else {}
+    )
     for time in (at_once, {"end": end, "tolerance": 0.5}):
         with simulated(base | {"time": time}) as (simulation, rows):
-            found.append((rows[-1], simulation.state.equilibrium_cells.structure_tensor(), simulation))
+            found.append(
+                (rows[-1], simulation.state.equilibrium_cells.structure_tensor(), simulation)
+            )
     return found
 
 
@@ -142,27 +167,46 @@ def test_a_front_rests_where_time_leaves_it(caplog: pytest.LogCaptureFixture) ->
     # with fixed steps of 0.05 and of 0.1 the axial share is 0.0961; the default tolerance leaves the front a point off
     caplog.set_level(logging.INFO)
     chains = {"chain_density": 2e22, "contour_length": 1.594, "persistence_length": 1.365}
-    tables = {"material": {"lame_lambda": 600.0, "lame_mu": 3.0, **chains}, "mesh": {"degree": 2, "refinement": 2}}
-    tables |= {"remodeling": {"law": "explicit", "frame": "spatial", "coupling": "staggered", "kappa": 0.025}}
+    tables = {
+        "material": {"lame_lambda": 600.0, "lame_mu": 3.0, **chains},
+        "mesh": {"degree": 2, "refinement": 2},
+    }
+    tables |= {
+        "remodeling": {
+            "law": "explicit",
+            "frame": "spatial",
+            "coupling": "staggered",
+            "kappa": 0.025,
+        }
+    }
     (at_once, cells, simulation), (in_time, others, _) = tube_in_time(
         8.0, 0.3, [(0.0, 0.0), (25.0, 1.0)], 0.5, **{**CAROTID, **tables}
     )
     axial = [
-        simulation.quadrature.mean(A.reshape(*simulation.quadrature.shape, 3, 3)[..., 2, 2]) for A in (cells, others)
+        simulation.quadrature.mean(A.reshape(*simulation.quadrature.shape, 3, 3)[..., 2, 2])
+        for A in (cells, others)
     ]
     r0 = simulation.scene.cells.end_to_end_length
-    assert axial[0] / r0**2 == pytest.approx(axial[1] / r0**2, abs=0.025)  # a point of the mesh is 0.02 of the volume
+    assert axial[0] / r0**2 == pytest.approx(
+        axial[1] / r0**2, abs=0.025
+    )  # a point of the mesh is 0.02 of the volume
     assert at_once["inner_radius"] == pytest.approx(in_time["inner_radius"], rel=2e-3)
     assert at_once["fibre_angle_outer"] > 85 and at_once["fibre_angle_inner"] < 5
     assert "the cells have a front near 4.2" in caplog.text
 
 
-def test_cells_without_tension_stay_where_the_way_has_left_them(caplog: pytest.LogCaptureFixture) -> None:
+def test_cells_without_tension_stay_where_the_way_has_left_them(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """After a reversal of the loads, and the share of the body where it matters is said."""
     caplog.set_level("INFO")
     (_, cells, _), (_, others, simulation) = tube_in_time(3.0, 0.1, HALF_WAY_BACK)
     np.testing.assert_allclose(cells, others, atol=0.03)
-    (said,) = [record.getMessage() for record in caplog.records if "no tension in equilibrium" in record.getMessage()]
+    (said,) = [
+        record.getMessage()
+        for record in caplog.records
+        if "no tension in equilibrium" in record.getMessage()
+    ]
     values = np.linalg.eigvalsh(simulation.stepper.remodeling.driving_tensor()[1])
     squares = np.sign(values) * values**2
     tension, compression = np.maximum(squares, 0).sum(axis=1), -np.minimum(squares, 0).sum(axis=1)
@@ -197,19 +241,31 @@ def test_the_artery_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_a_run_that_goes_on_to_the_equilibrium(tmp_path: Path) -> None:
     """From random cells that have remodeled for a while, to where the equilibrium at once is."""
-    tables: dict[str, Any] = {"geometry": {"shape": "cube"}, "mesh": {"refinement": 2}, "cells": {"initial": "random"}}
+    tables: dict[str, Any] = {
+        "geometry": {"shape": "cube"},
+        "mesh": {"refinement": 2},
+        "cells": {"initial": "random"},
+    }
     tables["output"] = {"columns": ["mean_stretch", "pass_residual"], "report": False}
     at_once = run(scene_from_dict(values("full") | tables), tmp_path / "at_once", SELF)
-    in_parts = run(scene_from_dict(values("full") | tables | {"time": {"end": 10.0}}), tmp_path / "in_parts", SELF)
+    in_parts = run(
+        scene_from_dict(values("full") | tables | {"time": {"end": 10.0}}),
+        tmp_path / "in_parts",
+        SELF,
+    )
     resume(in_parts, ["time.end=equilibrium"], SELF)
     first, second = Recording(at_once), Recording(in_parts)
     assert first.scene.time.end == second.scene.time.end == "equilibrium"
     assert len(first.history["time"]) == 2 and len(second.history["time"]) == 12
-    assert second.history["mean_stretch"][-1] == pytest.approx(first.history["mean_stretch"][-1], rel=1e-7)
+    assert second.history["mean_stretch"][-1] == pytest.approx(
+        first.history["mean_stretch"][-1], rel=1e-7
+    )
     assert abs(second.history["mean_stretch"][-2] / second.history["mean_stretch"][-1] - 1) > 1e-4
     assert max(record.history["pass_residual"][-1] for record in (first, second)) < 1e-6
     time = first.scene.last_time
     np.testing.assert_array_equal(first.times, [0.0, time])
-    np.testing.assert_allclose(first.fields(time)["displacement"], second.fields(time)["displacement"], atol=1e-6)
+    np.testing.assert_allclose(
+        first.fields(time)["displacement"], second.fields(time)["displacement"], atol=1e-6
+    )
     resume(in_parts, [], SELF)  # nothing is left to do
     assert len(Recording(in_parts).history["time"]) == 12

@@ -27,7 +27,10 @@ from tests.runs import goes_on, last_row, made, rows_of, simulated
 from tests.values import ANGLES, TENSION, ramped, isotropic
 
 TURNOVER = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0} | TENSION
-GROWING = [{"law": "tensor", "coupling": coupling, "turnover": TURNOVER} for coupling in ("staggered", "extrapolated")]
+GROWING = [
+    {"law": "tensor", "coupling": coupling, "turnover": TURNOVER}
+    for coupling in ("staggered", "extrapolated")
+]
 LAWS = [("tensor", "extrapolated"), ("tensor", "relaxed"), ("explicit", "staggered")]
 HALVES = [{"weight": 0.5}, {"weight": 0.5}]
 COUNTED = ("newton_iterations", "linear_iterations", "seconds")
@@ -36,10 +39,15 @@ TURNS = 1e-9  # relative: rounding, after steps that hand it on
 
 def pulse(a: float) -> list[dict[str, Any]]:
     """Diastole and systole about the same mean pressure."""
-    return [{"weight": 2 / 3, "loads": {"pressure": 1 - a}}, {"weight": 1 / 3, "loads": {"pressure": 1 + 2 * a}}]
+    return [
+        {"weight": 2 / 3, "loads": {"pressure": 1 - a}},
+        {"weight": 1 / 3, "loads": {"pressure": 1 + 2 * a}},
+    ]
 
 
-def artery(cases: Any = (), end: float = 30.0, columns: Any = (), pressure: float = 4.8, **tables: Any) -> Any:
+def artery(
+    cases: Any = (), end: float = 30.0, columns: Any = (), pressure: float = 4.8, **tables: Any
+) -> Any:
     """The paper's artery on one radius."""
     values = isotropic(
         "consistent",
@@ -66,9 +74,13 @@ def rest_of_the_mean() -> np.ndarray:
 
 
 # ---------------------------------------------------------------- cases that are none
-@pytest.mark.parametrize("remodeling", [*({"law": law, "coupling": coupling} for law, coupling in LAWS), *GROWING])
+@pytest.mark.parametrize(
+    "remodeling", [*({"law": law, "coupling": coupling} for law, coupling in LAWS), *GROWING]
+)
 def test_one_case_is_none_to_the_last_bit(remodeling: dict[str, Any]) -> None:
-    plain, one = (rows_of(artery(cases, end=20.0, remodeling=remodeling)) for cases in ((), [{"weight": 1.0}]))
+    plain, one = (
+        rows_of(artery(cases, end=20.0, remodeling=remodeling)) for cases in ((), [{"weight": 1.0}])
+    )
     for row, other in zip(plain, one, strict=True):
         assert {**row, "seconds": 0} == {**other, "seconds": 0}
 
@@ -85,14 +97,24 @@ def test_two_equal_halves_are_none_to_rounding(law: str, coupling: str, mean: st
     if mean == "target" and law != "tensor":
         pytest.skip("it has no target")
     remodeling = {"law": law, "coupling": coupling}
-    plain, halves = alone(law, coupling), rows_of(artery(HALVES, remodeling=remodeling | {"mean": mean}))
+    plain, halves = alone(law, coupling), rows_of(
+        artery(HALVES, remodeling=remodeling | {"mean": mean})
+    )
     for row, other in zip(plain, halves, strict=True):
         for name in row.keys() - {*COUNTED}:
             assert other[name] == pytest.approx(row[name], rel=TURNS, abs=TURNS, nan_ok=True), name
-        for name in ("pressure", "axial_elongation", "inner_radius", "stored_energy", "max_chain_extension"):
+        for name in (
+            "pressure",
+            "axial_elongation",
+            "inner_radius",
+            "stored_energy",
+            "max_chain_extension",
+        ):
             assert other[f"{name}@2"] == pytest.approx(row[name], rel=TURNS, abs=TURNS), name
     assert not [name for name in plain[0] if "@" in name]
-    assert not {"time@2", "fibre_angle_inner@2", "seconds@2", "remodeling_power@2"} & halves[0].keys()
+    assert (
+        not {"time@2", "fibre_angle_inner@2", "seconds@2", "remodeling_power@2"} & halves[0].keys()
+    )
 
 
 # ---------------------------------------------------------------- cases that differ
@@ -117,12 +139,16 @@ def test_against_an_independent_program() -> None:
     with made(artery(cases, end, remodeling={"coupling": "staggered"})) as simulation:
         found = [step.row for step in simulation.steps()]
         names = ("inner_radius", "outer_radius", "inner_radius@2", "outer_radius@2")
-        np.testing.assert_allclose([[row[name] for name in names] for row in found], rows, rtol=5e-4)
+        np.testing.assert_allclose(
+            [[row[name] for name in names] for row in found], rows, rtol=5e-4
+        )
         assert found[-1]["inner_radius@2"] > found[-1]["inner_radius"] + 0.05
         order = np.argsort(simulation.quadrature.coordinates[..., 0].ravel())
         cells, local = simulation.cells, simulation.cells.local_axes.axes
         radial = local[..., 0, :]
-        around = np.einsum("epa,epab,epb->ep", radial, cells.structure_tensor(), radial).ravel()[order]
+        around = np.einsum("epa,epab,epb->ep", radial, cells.structure_tensor(), radial).ravel()[
+            order
+        ]
         depth = simulation.quadrature.coordinates[..., 0].ravel()[order]
         expected = np.interp(depth, tube.points, squares[:, CIRCUMFERENTIAL])
         np.testing.assert_allclose(around, expected, atol=5e-3)
@@ -133,8 +159,12 @@ def test_which_case_is_first_changes_no_cell() -> None:
     one, two = rows_of(artery([first, second])), rows_of(artery([second, first]))
     for row, other in zip(one, two, strict=True):
         for name in (*ANGLES, "inner_radius@2", "pressure@2"):
-            assert other[name.removesuffix("@2")] == pytest.approx(row[name], rel=TURNS, abs=TURNS, nan_ok=True)
-    assert one[-1]["pressure@2"] == pytest.approx(1.8 * 4.8) and one[-1]["pressure"] == pytest.approx(0.6 * 4.8)
+            assert other[name.removesuffix("@2")] == pytest.approx(
+                row[name], rel=TURNS, abs=TURNS, nan_ok=True
+            )
+    assert one[-1]["pressure@2"] == pytest.approx(1.8 * 4.8) and one[-1][
+        "pressure"
+    ] == pytest.approx(0.6 * 4.8)
 
 
 def test_a_pulse_is_seen_as_its_mean() -> None:
@@ -143,7 +173,10 @@ def test_a_pulse_is_seen_as_its_mean() -> None:
     assert rest(pulse(0.1))[1] - mean[1] == pytest.approx(0.6, abs=0.3)
     assert rest(pulse(0.33))[1] - mean[1] == pytest.approx(6.1, abs=1.0)
     assert rest(pulse(0.2)) - mean == pytest.approx([0.0, 2.5, 0.5], abs=0.5)
-    axial = [{"weight": 0.5, "loads": {"elongation": 0.0}}, {"weight": 0.5, "loads": {"elongation": 2.0}}]
+    axial = [
+        {"weight": 0.5, "loads": {"elongation": 0.0}},
+        {"weight": 0.5, "loads": {"elongation": 2.0}},
+    ]
     assert rest(axial)[1] - mean[1] > 6.0
     assert rest(axial, remodeling={"mean": "target"})[1] - mean[1] == pytest.approx(-14.8, abs=1.0)
 
@@ -158,7 +191,10 @@ def test_the_largest_tension_of_a_pulse_is_that_of_systole() -> None:
 @pytest.mark.parametrize("law, coupling", LAWS)
 def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
     """Equal halves take the steps of none; a pulse has an error as asked for."""
-    tables = {"remodeling": {"law": law, "coupling": coupling}, "time": {"end": 30.0, "step": 2.0, "tolerance": 1.0}}
+    tables = {
+        "remodeling": {"law": law, "coupling": coupling},
+        "time": {"end": 30.0, "step": 2.0, "tolerance": 1.0},
+    }
     plain, halves = rows_of(artery((), **tables)), rows_of(artery(HALVES, **tables))
     for row, other in zip(plain, halves, strict=True):
         for name in ("time", "time_error", "inner_radius", *ANGLES):
@@ -166,13 +202,17 @@ def test_chosen_steps_look_at_all_cases(law: str, coupling: str) -> None:
     chosen, fine = rows_of(artery(pulse(0.33), **tables)), artery(pulse(0.33), **tables)
     unloaded = [{"weight": 0.5, "loads": {"pressure": 0.0, "elongation": 0.0}}, {"weight": 0.5}]
     early = tables | {"time": tables["time"] | {"end": 14.0}}
-    for row, other in zip(*(rows_of(artery(order, **early)) for order in (unloaded, unloaded[::-1])), strict=True):
+    for row, other in zip(
+        *(rows_of(artery(order, **early)) for order in (unloaded, unloaded[::-1])), strict=True
+    ):
         for name in ("time", "time_error"):  # whichever is the first
             assert other[name] == pytest.approx(row[name], rel=1e-5), name
     fine["time"] = {"end": 30.0, "step": 0.5}
     short = rows_of(fine)
     for name in ("inner_radius", "outer_radius@2", "fibre_angle_outer"):
-        assert chosen[-1][name] == pytest.approx(short[-1][name], rel=5e-3, abs=0.5 if "angle" in name else 0.0), name
+        assert chosen[-1][name] == pytest.approx(
+            short[-1][name], rel=5e-3, abs=0.5 if "angle" in name else 0.0
+        ), name
 
 
 def test_the_equilibrium_of_a_cycle_is_that_of_a_long_march() -> None:
@@ -192,7 +232,9 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
     changes = []
     for cases in (pulse(0.33), *([case | {"weight": 1.0}] for case in pulse(0.33))):
         with simulated(artery(cases, end=4.0, **tables)) as (simulation, _):
-            changes.append([np.log(simulation.stepper.part("turnover")._values(name)) for name in columns[:2]])
+            changes.append(
+                [np.log(simulation.stepper.part("turnover")._values(name)) for name in columns[:2]]
+            )
     both, diastole, systole = np.array(changes)
     np.testing.assert_allclose(both, 2 / 3 * diastole + 1 / 3 * systole, atol=1e-12)
     assert np.abs(systole - diastole).max() > 1e-4
@@ -207,7 +249,16 @@ def drives(turns: Rotation) -> list[Drive]:
     stress = stress + np.swapaxes(stress, -1, -2)
     Q = turns.as_matrix()
     return [
-        Drive(q @ f, q @ s @ q.T, DRIVERS["cauchy"], FRAMES["material"], 1e-9, np.ones((3, 3)), 1.0, 1.0)
+        Drive(
+            q @ f,
+            q @ s @ q.T,
+            DRIVERS["cauchy"],
+            FRAMES["material"],
+            1e-9,
+            np.ones((3, 3)),
+            1.0,
+            1.0,
+        )
         for q, f, s in zip(Q, F, stress, strict=True)
     ]
 
@@ -251,8 +302,14 @@ def test_a_run_goes_on_with_all_cases(tmp_path: Path) -> None:
     found = goes_on(artery(pulse(0.4), 20.0), tmp_path, 10.0)
     page = write_report(tmp_path / "whole").read_text()
     rows = dict(re.findall(r"<tr><th>(Load case [^<]*)</th><td>([^<]*)</td>", page))
-    assert [rows[f"Load case {number}"] for number in (1, 2)] == ["weight 0.666667", "weight 0.333333"]
-    assert [rows[f"Load case {number} loads"] for number in (1, 2)] == ["pressure 0.6", "pressure 1.8"]
+    assert [rows[f"Load case {number}"] for number in (1, 2)] == [
+        "weight 0.666667",
+        "weight 0.333333",
+    ]
+    assert [rows[f"Load case {number} loads"] for number in (1, 2)] == [
+        "pressure 0.6",
+        "pressure 1.8",
+    ]
     assert "inner_radius@2" in found.history
     with pytest.raises(SceneError):
         resume(found.path, ["cases=[]"])
@@ -268,7 +325,10 @@ def test_a_case_that_is_not_solved_takes_the_step_back() -> None:
         states, before = list(simulation.state.each_case().values()), []
         with pytest.raises(StepFailure, match="load case 2"):
             for step in simulation.steps():
-                before = [(state.unknown.x.array.copy(), dict(state.loading.values), state.time) for state in states]
+                before = [
+                    (state.unknown.x.array.copy(), dict(state.loading.values), state.time)
+                    for state in states
+                ]
     for state, (unknown, loads, time) in zip(states, before, strict=True):
         np.testing.assert_array_equal(state.unknown.x.array, unknown)
         assert (state.loading.values, state.time) == (loads, time)
@@ -280,7 +340,11 @@ def test_what_threatens_one_case_is_said_of_it(caplog: pytest.LogCaptureFixture)
     thin = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.1, "length": 40.0}
     cases = [{"weight": 0.5}, {"weight": 0.5, "loads": {"elongation": -1.0}}]
     rows_of(artery(cases, end=24.0, pressure=0.03, geometry=thin, mesh={"degree": 2}))
-    found = [record.getMessage() for record in caplog.records if "expected buckling" in record.getMessage()]
+    found = [
+        record.getMessage()
+        for record in caplog.records
+        if "expected buckling" in record.getMessage()
+    ]
     assert len(found) == 1 and ", load case 2: expected buckling" in found[0]
 
 
@@ -290,7 +354,10 @@ def test_what_threatens_one_case_is_said_of_it(caplog: pytest.LogCaptureFixture)
 def test_studies_of_one_load_case_refuse_several(tmp_path: Path) -> None:
     """Their derivatives are those of a single state."""
     scene = scene_from_dict(artery(HALVES))
-    for study in (lambda: fit(scene, tmp_path / "data.toml"), lambda: stability(scene, tmp_path / "run")):
+    for study in (
+        lambda: fit(scene, tmp_path / "data.toml"),
+        lambda: stability(scene, tmp_path / "run"),
+    ):
         with pytest.raises(SceneError, match="^cases: "):
             study()
     assert not list(tmp_path.iterdir())

@@ -29,9 +29,13 @@ def test_the_share_is_one_of_the_structure_tensor(factor: float) -> None:
     old, new = random_cells(1), random_cells(2)
     found = relaxed(old, new, factor)
     before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
-    np.testing.assert_allclose(structure_tensor(*found[:2]), (1 - factor) * before + factor * after, atol=1e-13)
     np.testing.assert_allclose(
-        found.axes @ np.swapaxes(found.axes, 1, 2), np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-12
+        structure_tensor(*found[:2]), (1 - factor) * before + factor * after, atol=1e-13
+    )
+    np.testing.assert_allclose(
+        found.axes @ np.swapaxes(found.axes, 1, 2),
+        np.broadcast_to(np.eye(3), (50, 3, 3)),
+        atol=1e-12,
     )
 
 
@@ -52,10 +56,14 @@ def test_the_relaxed_cube_ends_where_the_papers_ends() -> None:
     }
     ends = {}
     for coupling in ("staggered", "relaxed"):
-        scene = preset_scene(PAPER, "cube").with_values({**changes, "remodeling.coupling": coupling})
+        scene = preset_scene(PAPER, "cube").with_values(
+            {**changes, "remodeling.coupling": coupling}
+        )
         *_, last = Simulation(scene).steps()
         ends[coupling] = last.row
-    assert ends["relaxed"]["mean_stretch"] == pytest.approx(ends["staggered"]["mean_stretch"], abs=1e-4)
+    assert ends["relaxed"]["mean_stretch"] == pytest.approx(
+        ends["staggered"]["mean_stretch"], abs=1e-4
+    )
     assert ends["relaxed"]["mean_fibre_angle"] < 0.1
 
 
@@ -73,14 +81,21 @@ def short_tube(driver: str, coupling: str, end: float = 60.0) -> list[dict[str, 
     return [step.row for step in Simulation(scene, MPI.COMM_SELF, domain).steps()]
 
 
-def test_the_relaxed_pass_settles_where_the_printed_one_jumps(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_relaxed_pass_settles_where_the_printed_one_jumps(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Driver finger: what a pass wants to change fades, where the printed scheme swings to the end (0.9 and more)."""
     with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
         settled = short_tube("finger", "relaxed")
         assert "overshoots" not in caplog.text
         printed = short_tube("finger", "staggered")
-        assert "overshoots" in caplog.text and 'set remodeling.coupling = "relaxed" (docs' in caplog.text
+        assert (
+            "overshoots" in caplog.text
+            and 'set remodeling.coupling = "relaxed" (docs' in caplog.text
+        )
     assert min(row["pass_residual"] for row in printed) > 0.6
     assert settled[0]["pass_residual"] == pytest.approx(printed[0]["pass_residual"], rel=1e-9)
     assert settled[-1]["pass_residual"] < 0.2
-    assert sum(row["newton_iterations"] for row in settled) < 0.6 * sum(row["newton_iterations"] for row in printed)
+    assert sum(row["newton_iterations"] for row in settled) < 0.6 * sum(
+        row["newton_iterations"] for row in printed
+    )

@@ -41,7 +41,9 @@ def test_the_lazy_zone_slows_and_stops(coupling: str) -> None:
     asleep = last_row(stiff_cube(threshold=10.5, coupling=coupling))
     assert slow["mean_fibre_angle"] == pytest.approx(half["mean_fibre_angle"], abs=2e-3)
     start = np.degrees(np.arccos(1 / np.sqrt(3)))
-    assert slow["mean_fibre_angle"] < start - 3 and asleep["mean_fibre_angle"] == pytest.approx(start, abs=1e-9)
+    assert slow["mean_fibre_angle"] < start - 3 and asleep["mean_fibre_angle"] == pytest.approx(
+        start, abs=1e-9
+    )
     assert (slow["asleep_share"], asleep["asleep_share"]) == (0.0, 1.0)
     with np.errstate(all="raise"):
         assert tensor_law.activation(np.diag([1e-300, 0.0, -1.0])[None], 1e60) == 0

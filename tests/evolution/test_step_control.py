@@ -33,7 +33,9 @@ PRESETS = tuple(dict.fromkeys(COUPLINGS.values()))
 
 def tube(coupling: str, end: float = END, **changes: Any) -> Scene:
     """The wall of the paper's artery, of isotropic cells."""
-    scene = scene_from_dict(isotropic(COUPLINGS[coupling], remodeling={"frame": "material", "coupling": coupling}))
+    scene = scene_from_dict(
+        isotropic(COUPLINGS[coupling], remodeling={"frame": "material", "coupling": coupling})
+    )
     return scene.with_values({"time.end": end, **changes})
 
 
@@ -47,7 +49,9 @@ class Angles(Watcher):
     def committed(self, step: Step) -> None:
         simulation = self.simulation
         cells, local = simulation.state.equilibrium_cells, simulation.cells.local_axes.axes
-        angles = simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, local)
+        angles = simulation.scene.geometry.fibre_angle(
+            cells.dimension_values, cells.axis_values, local
+        )
         self.by_time[step.time] = angles.copy()
         self.cells[step.time] = UnitCell(*(values.copy() for values in cells.point_cells[:2]))
 
@@ -84,14 +88,21 @@ def exact() -> dict[str, dict[float, np.ndarray]]:
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_the_estimate_is_the_error(
-    coupling: str, artery: dict[str, tuple[list[Step], Angles]], exact: dict[str, dict[float, np.ndarray]]
+    coupling: str,
+    artery: dict[str, tuple[list[Step], Angles]],
+    exact: dict[str, dict[float, np.ndarray]],
 ) -> None:
     """At the end of the ramp and of the run; errors that cancel over time are not counted on."""
     steps, angles = artery[coupling]
     for time in (25.0, END):
         step = next(step for step in steps if step.time == time)
         error = distance(angles.simulation, angles.by_time[time], exact[COUPLINGS[coupling]][time])
-        assert step.time_error / 4 < error < 2.5 * step.time_error, (coupling, time, error, step.time_error)
+        assert step.time_error / 4 < error < 2.5 * step.time_error, (
+            coupling,
+            time,
+            error,
+            step.time_error,
+        )
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
@@ -112,11 +123,15 @@ def test_no_row_of_the_printed_method_is_off_by_more_than_the_tolerance() -> Non
     steps, rows = marched(tube("staggered", 60.0, **{"time.tolerance": tolerance, **columns}))
     reference = Simulation(tube("staggered", 60.0, **columns), MPI.COMM_SELF)
     exact, times = Angles(reference), [0.0, *(step.time for step in steps)]
-    parts = [time for before, after in pairwise(times) for time in np.linspace(before, after, 17)[1:]]
+    parts = [
+        time for before, after in pairwise(times) for time in np.linspace(before, after, 17)[1:]
+    ]
     same = list(reference.stepper.march(parts, [reference.observer, exact]))[15::16]
     estimated, largest = [], []
     for step, other in zip(steps, same, strict=True):
-        apart = angle_between(rows.cells[step.time], exact.cells[step.time]).reshape(reference.quadrature.shape)
+        apart = angle_between(rows.cells[step.time], exact.cells[step.time]).reshape(
+            reference.quadrature.shape
+        )
         angle = float(np.sqrt(reference.quadrature.mean(apart**2)))
         pitch = distance(reference, rows.by_time[step.time], exact.by_time[step.time])
         strain = np.degrees(max(abs(step.row[name] / other.row[name] - 1) for name in radii))
@@ -138,12 +153,17 @@ def test_lengths_count_as_angles(monkeypatch: pytest.MonkeyPatch) -> None:
             "output": {"fields": False, "columns": ["time_error", "mean_stretch"]},
         }
     )
-    scene = scene.with_values({"time.end": 5.0, "time.step": 0.25, "loads.force.value": 8 * scene.loads["force"].value})
+    scene = scene.with_values(
+        {"time.end": 5.0, "time.step": 0.25, "loads.force.value": 8 * scene.loads["force"].value}
+    )
     steps, _ = marched(scene)
     coarse, fine = (
-        np.array([step.row["mean_stretch"] for step in marched(scene.with_values({"time.step": 0.25 / n}))[0]])[
-            n - 1 :: n
-        ]
+        np.array(
+            [
+                step.row["mean_stretch"]
+                for step in marched(scene.with_values({"time.step": 0.25 / n}))[0]
+            ]
+        )[n - 1 :: n]
         for n in (8, 16)
     )
     found = [step.time_error for step in steps[4:]]
@@ -171,7 +191,11 @@ def test_fields_of_asked_times_are_written(tmp_path: Path) -> None:
 def test_a_rejected_step_leaves_no_trace_but_its_work() -> None:
     """The rows are those of fixed steps of the same lengths."""
     first = 20.0
-    scene = tube("staggered", 25.0, **{"time.tolerance": 1.5, "time.step": first, "output.columns": ["inner_radius"]})
+    scene = tube(
+        "staggered",
+        25.0,
+        **{"time.tolerance": 1.5, "time.step": first, "output.columns": ["inner_radius"]},
+    )
     scene = scene.with_values({"solver.predictor": "none"})
     simulation = Simulation(scene, MPI.COMM_SELF)
     undone: list[float] = []
@@ -182,10 +206,14 @@ def test_a_rejected_step_leaves_no_trace_but_its_work() -> None:
 
     steps = list(simulation.steps([Undone()]))
     assert undone and undone[0] == 12.5 and steps[0].time < 12.5
-    plain = tube("staggered", 25.0, **{"output.columns": ["inner_radius"], "solver.predictor": "none"})
+    plain = tube(
+        "staggered", 25.0, **{"output.columns": ["inner_radius"], "solver.predictor": "none"}
+    )
     plain = Simulation(plain, MPI.COMM_SELF)
     again = list(plain.stepper.march([step.time for step in steps], [plain.observer]))
-    assert [step.row["inner_radius"] for step in again] == [step.row["inner_radius"] for step in steps]
+    assert [step.row["inner_radius"] for step in again] == [
+        step.row["inner_radius"] for step in steps
+    ]
     assert steps[0].work.newton_iterations > again[0].work.newton_iterations
     np.testing.assert_array_equal(plain.cells.dimension_values, simulation.cells.dimension_values)
 
@@ -194,9 +222,15 @@ SWINGS: dict[str, Any] = {"cells.initial": [0.8, 0.0, 0.6], "remodeling.frame": 
 
 
 @pytest.mark.parametrize(("coupling", "changes"), [("extrapolated", {}), ("staggered", SWINGS)])
-def test_a_run_that_goes_on_takes_the_same_steps(coupling: str, changes: dict[str, Any], tmp_path: Path) -> None:
+def test_a_run_that_goes_on_takes_the_same_steps(
+    coupling: str, changes: dict[str, Any], tmp_path: Path
+) -> None:
     """In steps that were chosen, and among those in vain."""
-    scene = tube(coupling, 25.0, **{"time.tolerance": 0.3, "output.checkpoint": 5, "output.report": False, **changes})
+    scene = tube(
+        coupling,
+        25.0,
+        **{"time.tolerance": 0.3, "output.checkpoint": 5, "output.report": False, **changes},
+    )
     whole, part = run(scene, tmp_path / "whole", MPI.COMM_SELF), tmp_path / "part"
 
     def stops(self: Pause, step: Step) -> None:
@@ -214,7 +248,9 @@ def test_a_run_that_goes_on_takes_the_same_steps(coupling: str, changes: dict[st
         resume(part, ["time.tolerance=0.5"], MPI.COMM_SELF)
 
 
-def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Cells of other lengths than their stress asks for turn over in the first pass, however short it is."""
     lengths = [0.2, 0.4, float(np.sqrt(0.8))]
     steps, _ = marched(tube("staggered", 10.0, **{"cells.initial": lengths, "time.tolerance": 0.5}))
@@ -223,9 +259,13 @@ def test_where_no_step_is_short_enough_the_run_goes_on_and_says_so(caplog: pytes
     assert sum("exceeds time.tolerance" in record.message for record in caplog.records) == 1
 
 
-def test_a_step_that_can_never_be_solved_is_tried_three_times_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_that_can_never_be_solved_is_tried_three_times_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Each a quarter of the one before; none is shorter than 2^-12 of the first step."""
-    simulation = Simulation(tube("staggered", 4.0, **{"time.tolerance": 5.0, "time.step": 4.0}), MPI.COMM_SELF)
+    simulation = Simulation(
+        tube("staggered", 4.0, **{"time.tolerance": 5.0, "time.step": 4.0}), MPI.COMM_SELF
+    )
     tried: list[float] = []
 
     def fails(time: float, loads: Any) -> Any:
@@ -243,9 +283,13 @@ def test_a_step_that_can_never_be_solved_is_tried_three_times_more(monkeypatch: 
     assert tried == pytest.approx([shortest], rel=0.05)
 
 
-def controlled(error: Callable[[float, float], float], end: float, **changes: Any) -> tuple[Simulation, list[float]]:
+def controlled(
+    error: Callable[[float, float], float], end: float, **changes: Any
+) -> tuple[Simulation, list[float]]:
     """Times of the steps where the estimated error is this function of their start and length, over the tolerance."""
-    simulation = Simulation(tube("staggered", end, **{"time.tolerance": 1.0, **changes}), MPI.COMM_SELF)
+    simulation = Simulation(
+        tube("staggered", end, **{"time.tolerance": 1.0, **changes}), MPI.COMM_SELF
+    )
     control = simulation.way
     assert control is not None
 
@@ -286,7 +330,9 @@ def test_a_step_whose_error_hardly_falls_is_not_tried_for_ever() -> None:
     assert 2 <= len(tried) <= 4 and max(np.array(tried[1:]) / tried[:-1]) <= 0.85 * 1.05
 
 
-def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.LogCaptureFixture) -> None:
+def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """An error that is the same however short the step: twenty in vain in a time 1/kappa, and longer ones."""
     tried = 0
 
@@ -304,8 +350,14 @@ def test_where_errors_do_not_fall_the_number_of_steps_is_bounded(caplog: pytest.
     in_vain = int((lengths < 0.9).sum())
     assert 20 <= in_vain <= 20 + 20 * (end - 25.0) * settings.kappa + 8
     assert len(times) < end + 150 and tried < 2 * len(times)
-    said = [record.message for record in caplog.records if "exceeds time.tolerance" in record.message]
-    assert len(said) == 2 and "continuing" not in said[0] and "continuing with step size 1.04" in said[1]
+    said = [
+        record.message for record in caplog.records if "exceeds time.tolerance" in record.message
+    ]
+    assert (
+        len(said) == 2
+        and "continuing" not in said[0]
+        and "continuing with step size 1.04" in said[1]
+    )
 
 
 def test_the_tolerance_counts_again_when_errors_fall() -> None:
@@ -330,7 +382,9 @@ def test_a_printed_pass_that_swings_does_not_crawl(caplog: pytest.LogCaptureFixt
     """By rank the chains of this tube turn over at once, to and fro: thousands of steps in 0.2.0."""
     steps, _ = marched(tube("staggered", 150.0, **{"time.tolerance": 0.5}, **SWINGS))
     assert len(steps) < 600 and steps[-1].time == 150.0
-    assert np.diff([step.time for step in steps]).min() > 0.5 / 360 * 25 / 1.06  # degrees, and the time of the ramp
+    assert (
+        np.diff([step.time for step in steps]).min() > 0.5 / 360 * 25 / 1.06
+    )  # degrees, and the time of the ramp
     assert any("exceeds time.tolerance" in record.message for record in caplog.records)
 
 
@@ -354,7 +408,11 @@ def test_after_cells_have_turned_over_the_error_is_that_of_the_steps_again() -> 
 
 
 def test_nothing_that_remodels_has_no_error() -> None:
-    steps, _ = marched(tube("staggered", 50.0, **{"remodeling.kappa": 0.0, "time.tolerance": 0.1, "time.step": 5.0}))
+    steps, _ = marched(
+        tube(
+            "staggered", 50.0, **{"remodeling.kappa": 0.0, "time.tolerance": 0.1, "time.step": 5.0}
+        )
+    )
     assert [step.time_error for step in steps] == [0.0] * len(steps) and len(steps) < 6
 
 
@@ -370,5 +428,7 @@ def test_studies_of_equal_steps_refuse_it(tmp_path: Path, refused: Refused) -> N
     path.write_text(tube("staggered", **{"time.tolerance": 1.0}).to_toml())
     said = refused("stability", path, "-o", tmp_path / "a")
     assert "time.tolerance = 1: the analysis needs equal steps" in said
-    said = refused("ensemble", path, "--set", "cells.initial=random", "--set", "model.kinematics=full")
+    said = refused(
+        "ensemble", path, "--set", "cells.initial=random", "--set", "model.kinematics=full"
+    )
     assert "time.tolerance = 1: each seed would have other steps" in said

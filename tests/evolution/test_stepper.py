@@ -21,7 +21,9 @@ from tests.parts import cube
 KAPPA = 0.4
 
 
-def pulled_cube(load: Callable[[float], float] = lambda t: 1.0 + t, **remodeling: Any) -> tuple[parts.Body, Stepper]:
+def pulled_cube(
+    load: Callable[[float], float] = lambda t: 1.0 + t, **remodeling: Any
+) -> tuple[parts.Body, Stepper]:
     """One element of isotropic cells, free to contract, a force along z: stress and cells are the same everywhere."""
     made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
     return made, made.stepper(lambda t: {"force": load(t)}, kappa=KAPPA, **remodeling)
@@ -38,7 +40,9 @@ def test_cells_follow_the_time_not_the_number_of_steps(law: str) -> None:
         left = np.exp(-KAPPA * time)
         expected = np.array([1 + (start - 1) * left, start * left, start * left])
         found = made.cells.dimension_values
-        np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            found, np.broadcast_to(expected, found.shape), rtol=0, atol=1e-12
+        )
         along = np.abs(made.cells.axis_values[..., 0, :])
         np.testing.assert_allclose(along, np.broadcast_to([0.0, 0.0, 1.0], along.shape), atol=1e-12)
 
@@ -51,7 +55,9 @@ def test_the_relaxed_pass_makes_its_share_of_the_change() -> None:
     left, start = np.exp(-KAPPA * 2.0), 1 / np.sqrt(3)
     asked = np.array([1 + (start - 1) * left, start * left, start * left]) ** 2
     found = made.cells.dimension_values**2
-    np.testing.assert_allclose(found, np.broadcast_to(0.75 / 3 + 0.25 * asked, found.shape), rtol=1e-12)
+    np.testing.assert_allclose(
+        found, np.broadcast_to(0.75 / 3 + 0.25 * asked, found.shape), rtol=1e-12
+    )
     assert stepper.remodeling.distance() == pytest.approx(np.linalg.norm(asked - 1 / 3), rel=1e-12)
 
 
@@ -76,7 +82,9 @@ class Notes(Watcher):
     def note(self, stage: str, step: Step) -> None:
         state = self.state
         passed = not state.equilibrium_cells.equals(state.cells)
-        self.notes.append((self.name, stage, step.number, step.is_last, state.time, state.number, passed))
+        self.notes.append(
+            (self.name, stage, step.number, step.is_last, state.time, state.number, passed)
+        )
 
     def started(self, step: Step) -> None:
         assert step.loads == {"force": 0.0} and step.work.substeps == 0
@@ -102,7 +110,10 @@ def test_watchers_follow_each_step_from_its_solution_to_its_end() -> None:
     watchers = [Notes(name, notes, stepper) for name in ("first", "second")]
     steps = list(stepper.march([0.5, 2.0], watchers))
     assert [step.loads for step in steps] == [{"force": 1.5}, {"force": 3.0}]
-    assert [(step.time, step.number, step.is_last) for step in steps] == [(0.5, 1, False), (2.0, 2, True)]
+    assert [(step.time, step.number, step.is_last) for step in steps] == [
+        (0.5, 1, False),
+        (2.0, 2, True),
+    ]
     expected = [("started", 0, False, 0.0, 0, False)]
     for number, (old, new) in enumerate([(0.0, 0.5), (0.5, 2.0)], start=1):
         last = number == 2
@@ -184,13 +195,22 @@ def test_a_state_starts_unloaded() -> None:
 def test_admissible_is_below_the_contour_length_with_volume_left() -> None:
     here = (0.0, 0.0, 0.0)
     assert StateLimits(0.999, 1e-3, here).admissible
-    for extension, jacobian in ((1.0, 0.5), (1.1, 0.5), (0.5, 0.0), (0.5, -0.1), (np.nan, 0.5), (0.5, np.nan)):
+    for extension, jacobian in (
+        (1.0, 0.5),
+        (1.1, 0.5),
+        (0.5, 0.0),
+        (0.5, -0.1),
+        (np.nan, 0.5),
+        (0.5, np.nan),
+    ):
         assert not StateLimits(extension, jacobian, here).admissible
 
 
 def test_extension_names_the_point_where_chains_are_longest() -> None:
     """u = x (X, 0, 0) on chains along x: F_xx = 1 + 2 x, largest at the points next to x = 1."""
-    made = parts.body(cube(refinement=2, comm=MPI.COMM_SELF), Cells(initial="aligned", aligned_axis=1))
+    made = parts.body(
+        cube(refinement=2, comm=MPI.COMM_SELF), Cells(initial="aligned", aligned_axis=1)
+    )
     x = made.nodes[:, :1]
     made.set_displacement(np.hstack([0.2 * x**2, -0.1 * made.nodes[:, 1:2], 0 * x]))
     problem = made.problem()
@@ -203,6 +223,18 @@ def test_extension_names_the_point_where_chains_are_longest() -> None:
 
 def test_a_load_between_two_times_of_its_ramp_is_on_the_line_between_them() -> None:
     load = Load(value=2.0, ramp=[[1.0, 0.5], [3.0, 1.5], [4.0, 1.0]])
-    assert [load.factor(t) for t in (0.0, 1.0, 1.5, 2.5, 3.0, 3.25, 9.0)] == [0.5, 0.5, 0.75, 1.25, 1.5, 1.375, 1.0]
-    table = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "cube"}, "loads": {"force": load.model_dump()}}
+    assert [load.factor(t) for t in (0.0, 1.0, 1.5, 2.5, 3.0, 3.25, 9.0)] == [
+        0.5,
+        0.5,
+        0.75,
+        1.25,
+        1.5,
+        1.375,
+        1.0,
+    ]
+    table = {
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": "cube"},
+        "loads": {"force": load.model_dump()},
+    }
     assert Simulation(scene_from_dict(table), MPI.COMM_SELF).load_values(2.5) == {"force": 2.5}

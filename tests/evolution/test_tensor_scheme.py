@@ -31,7 +31,9 @@ def scene(shape: str, **changes: Any) -> Any:
     return scene_from_dict(values | changes)
 
 
-def short_tube(end: float, step: float = 1.0, cells: str = "random", **remodeling: Any) -> Simulation:
+def short_tube(
+    end: float, step: float = 1.0, cells: str = "random", **remodeling: Any
+) -> Simulation:
     """One layer of elements along the axis, coarse."""
     ramp = remodeling.pop("ramp", [[0.0, 0.0], [25.0, 1.0]])
     settings = scene(
@@ -69,7 +71,9 @@ def test_the_cubes_angle_is_the_closed_form(coupling: str, passes: int, force: f
     _, A, rows = run(simulation)
     for number, row in enumerate(rows, start=1):
         left = 2 / 3 * np.exp(-KAPPA * (number - 1 + passes))
-        assert row["mean_fibre_angle"] == pytest.approx(np.degrees(np.arctan(np.sqrt(left / (1 - left)))), abs=1e-9)
+        assert row["mean_fibre_angle"] == pytest.approx(
+            np.degrees(np.arctan(np.sqrt(left / (1 - left)))), abs=1e-9
+        )
     np.testing.assert_allclose(np.trace(A, axis1=-2, axis2=-1), 1.0, atol=1e-13)
     assert np.abs(A - A[0, 0] * np.eye(3)).max() < 1e-12  # nothing turns
 
@@ -95,7 +99,9 @@ def test_loads_that_cross_leave_the_cube_homogeneous(
     simulation = Simulation(settings, MPI.COMM_SELF)
     _, A, rows = run(simulation)
     F = simulation.state.deformation_gradient().reshape(-1, 3, 3)
-    assert F[0, 0, 0] > F[0, 2, 2] + 0.05 and rows[9]["mean_stretch"] > 1.1  # it is x that is stretched at last
+    assert (
+        F[0, 0, 0] > F[0, 2, 2] + 0.05 and rows[9]["mean_stretch"] > 1.1
+    )  # it is x that is stretched at last
     assert np.abs(F - F[0]).max() < 1e-8 and np.abs(A.reshape(-1, 3, 3) - A[0, 0]).max() < 1e-8
 
 
@@ -104,7 +110,9 @@ def test_little_is_made_of_what_is_off_the_axes_under_compression() -> None:
     ramp = [[0.0, 0.0], [10.0, 1.0]]
     settings = scene("cube", loads={"force": {"value": -10.0, "ramp": ramp}}, time={"end": 40.0})
     simulation = Simulation(settings, MPI.COMM_SELF)
-    noise = np.random.default_rng(1).uniform(-1e-3, 1e-3, (*simulation.cells.dimension_values.shape[:2], 3, 3))
+    noise = np.random.default_rng(1).uniform(
+        -1e-3, 1e-3, (*simulation.cells.dimension_values.shape[:2], 3, 3)
+    )
     noise -= np.trace(noise, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) / 3
     before = np.eye(3) / 3 + (noise + np.swapaxes(noise, -1, -2)) / 2
     squares, vectors = np.linalg.eigh(before)
@@ -130,7 +138,9 @@ def test_the_driving_stress_is_that_of_the_energy() -> None:
     simulation = short_tube(1.0)
     _, tensor = simulation.stepper.remodeling.driving_tensor()
     assert np.abs(tensor).max() < 1e-12
-    printed = Simulation(scene("tube", material={"repulsion": "axes"}, time={"end": 1.0}), MPI.COMM_SELF)
+    printed = Simulation(
+        scene("tube", material={"repulsion": "axes"}, time={"end": 1.0}), MPI.COMM_SELF
+    )
     assert np.abs(printed.stepper.remodeling.driving_tensor()[1]).max() < 1e-12
 
 
@@ -141,7 +151,9 @@ def test_the_extrapolated_scheme_is_of_second_order_and_the_staggered_one_of_fir
         errors = []
         for step in (1.0, 0.5):
             found = run(short_tube(4.0, step, coupling=coupling))
-            errors.append([np.abs(found[0][-1] - fine[0][-1]).max(), np.abs(found[1] - fine[1]).max()])
+            errors.append(
+                [np.abs(found[0][-1] - fine[0][-1]).max(), np.abs(found[1] - fine[1]).max()]
+            )
         orders[coupling] = np.log2(np.array(errors[0]) / errors[1])
     assert np.all(orders["extrapolated"] > 1.7)
     np.testing.assert_allclose(orders["staggered"], 1.0, atol=0.1)
@@ -163,7 +175,15 @@ def pulled_cube(ramp: list[list[float]], end: float, **changes: Any) -> Simulati
 
 
 LATE = [[4.0, 0.0], [5.0, 1.0]]
-TO_NOTHING_AND_BACK = [[0.0, 0.0], [2.0, 1.0], [4.0, 0.0], [6.0, 0.0], [7.0, 1.0], [8.0, -0.2], [9.0, 1.0]]
+TO_NOTHING_AND_BACK = [
+    [0.0, 0.0],
+    [2.0, 1.0],
+    [4.0, 0.0],
+    [6.0, 0.0],
+    [7.0, 1.0],
+    [8.0, -0.2],
+    [9.0, 1.0],
+]
 
 
 @pytest.mark.parametrize("kappa", [0.025, 0.25, 10.0])
@@ -177,15 +197,25 @@ def test_cells_that_tension_reaches_late_follow_from_then_on(kappa: float) -> No
 
 def test_the_first_step_under_tension_is_as_accurate_as_the_others() -> None:
     """Of second order with it, from random cells."""
-    found = {step: run(pulled_cube(LATE, 6.0, cells="random", force=1.0, step=step))[:2] for step in (1.0, 0.5, 0.125)}
+    found = {
+        step: run(pulled_cube(LATE, 6.0, cells="random", force=1.0, step=step))[:2]
+        for step in (1.0, 0.5, 0.125)
+    }
     errors = [
-        [np.abs(found[h][1] - found[0.125][1]).max(), np.abs(found[h][0][-1] - found[0.125][0][-1]).max()]
+        [
+            np.abs(found[h][1] - found[0.125][1]).max(),
+            np.abs(found[h][0][-1] - found[0.125][0][-1]).max(),
+        ]
         for h in (1.0, 0.5)
     ]
-    assert np.all(np.log2(np.array(errors[0]) / errors[1]) > 1.7) and np.all(np.array(errors[1]) < 3e-3)
+    assert np.all(np.log2(np.array(errors[0]) / errors[1]) > 1.7) and np.all(
+        np.array(errors[1]) < 3e-3
+    )
 
 
-@pytest.mark.parametrize("changes", [{"cells": "random"}, {"kappa": 10.0, "cells": "random"}, {"tolerance": 1.0}])
+@pytest.mark.parametrize(
+    "changes", [{"cells": "random"}, {"kappa": 10.0, "cells": "random"}, {"tolerance": 1.0}]
+)
 def test_the_trace_stays_where_tension_comes_goes_and_comes_back(changes: dict[str, Any]) -> None:
     simulation = pulled_cube(TO_NOTHING_AND_BACK, 10.0, **changes)
     for _ in simulation.steps():
@@ -216,7 +246,9 @@ def test_the_target_of_a_first_step_is_not_extrapolated() -> None:
 
 def test_a_step_that_is_solved_twice_is_one_step() -> None:
     """The little that its second solve moves is no measure for the next step, which would be looked into."""
-    first, second = (step.work.newton_iterations for step in pulled_cube([[0.0, 0.0], [10.0, 1.0]], 2.0).steps())
+    first, second = (
+        step.work.newton_iterations for step in pulled_cube([[0.0, 0.0], [10.0, 1.0]], 2.0).steps()
+    )
     assert second < first
 
 
@@ -244,7 +276,9 @@ def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts
         coupling._follow(target, state.time + 1.0)
     assert f"time 5: {points} points follow the last stress" in caplog.text
     A = cells.structure_tensor()
-    np.testing.assert_allclose(A[0], np.broadcast_to(np.diag([0.0, 0.0, 1.0]), A[0].shape), atol=1e-14)
+    np.testing.assert_allclose(
+        A[0], np.broadcast_to(np.diag([0.0, 0.0, 1.0]), A[0].shape), atol=1e-14
+    )
     share = -np.expm1(-KAPPA * target.switch)[:, None, None]
     expected = before.reshape(-1, 3, 3) + share * (target.direction - before.reshape(-1, 3, 3))
     np.testing.assert_allclose(A.reshape(-1, 3, 3)[points:], expected[points:], atol=1e-13)

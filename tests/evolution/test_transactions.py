@@ -103,15 +103,21 @@ class FullDisk(Watcher):
     def completed(self, step: Step) -> None:
         if step.time == FAILS and self.left:
             self.left = 0
-            resource.setrlimit(resource.RLIMIT_FSIZE, (self.history.stat().st_size + 5, WITHOUT_LIMIT[1]))
+            resource.setrlimit(
+                resource.RLIMIT_FSIZE, (self.history.stat().st_size + 5, WITHOUT_LIMIT[1])
+            )
 
 
 def column(after_pass: bool) -> Callable[..., list[Watcher]]:
     """A column of the solved state, or one of the whole step."""
 
-    def prepare(simulation: Simulation, error: BaseException, patch: pytest.MonkeyPatch, folder: Path) -> list[Watcher]:
+    def prepare(
+        simulation: Simulation, error: BaseException, patch: pytest.MonkeyPatch, folder: Path
+    ) -> list[Watcher]:
         once = Once(error)
-        simulation.observer.columns += (Column("odd", "", "fails once", lambda m: once(m.step.time), after_pass),)
+        simulation.observer.columns += (
+            Column("odd", "", "fails once", lambda m: once(m.step.time), after_pass),
+        )
         return []
 
     return prepare
@@ -122,10 +128,14 @@ def hook(name: str) -> Callable[..., list[Watcher]]:
     return lambda simulation, error, patch, folder: [Spoiler(name, error)]
 
 
-def after(where: Callable[[Simulation], Any], method: str, time: Callable[..., float]) -> Callable[..., list[Watcher]]:
+def after(
+    where: Callable[[Simulation], Any], method: str, time: Callable[..., float]
+) -> Callable[..., list[Watcher]]:
     """A method of a part that has done its work when it fails."""
 
-    def prepare(simulation: Simulation, error: BaseException, patch: pytest.MonkeyPatch, folder: Path) -> list[Watcher]:
+    def prepare(
+        simulation: Simulation, error: BaseException, patch: pytest.MonkeyPatch, folder: Path
+    ) -> list[Watcher]:
         once, part = Once(error), where(simulation)
         real = getattr(part, method)
 
@@ -140,17 +150,25 @@ def after(where: Callable[[Simulation], Any], method: str, time: Callable[..., f
     return prepare
 
 
-def full_disk(simulation: Simulation, error: BaseException, patch: pytest.MonkeyPatch, folder: Path) -> list[Watcher]:
+def full_disk(
+    simulation: Simulation, error: BaseException, patch: pytest.MonkeyPatch, folder: Path
+) -> list[Watcher]:
     """The history's."""
     return [FullDisk(folder / "history.csv")]
 
 
 FAULTS: dict[str, tuple[Callable[..., list[Watcher]], BaseException]] = {
     "loads": (after(lambda s: s.stepper, "load_values", lambda time: time), KeyError("force")),
-    "solver": (after(lambda s: s.stepper.coupling, "solve", lambda time, loads: time), KeyboardInterrupt()),
+    "solver": (
+        after(lambda s: s.stepper.coupling, "solve", lambda time, loads: time),
+        KeyboardInterrupt(),
+    ),
     "column": (column(after_pass=False), ZeroDivisionError()),
     "watcher, solved": (hook("solved"), RuntimeError()),
-    "pass": (after(lambda s: s.stepper.remodeling, "apply", lambda old, new, *_: new), FloatingPointError()),
+    "pass": (
+        after(lambda s: s.stepper.remodeling, "apply", lambda old, new, *_: new),
+        FloatingPointError(),
+    ),
     "column after the pass": (column(after_pass=True), ValueError()),
     "watcher, completed": (hook("completed"), KeyboardInterrupt()),
     "history": (full_disk, OSError(errno.EFBIG, "File too large")),
@@ -180,13 +198,23 @@ def test_who_fails_in_a_step_undoes_it(
             finally:
                 resource.setrlimit(resource.RLIMIT_FSIZE, WITHOUT_LIMIT)
             assert_same(everything(simulation), before)
-            assert before["time"] == 2.0 and before["number"] == 2 and str(caught.value) == str(error)
-            done += [simulation.stepper.advance(float(time), watchers) for time in range(3, END + 1)]
-    rows = [{name: value for name, value in numbers(step).items() if name != "odd"} for step in done]
+            assert (
+                before["time"] == 2.0 and before["number"] == 2 and str(caught.value) == str(error)
+            )
+            done += [
+                simulation.stepper.advance(float(time), watchers) for time in range(3, END + 1)
+            ]
+    rows = [
+        {name: value for name, value in numbers(step).items() if name != "odd"} for step in done
+    ]
     assert rows == expected[0]
     assert_same(everything(simulation), expected[1])
     recording = Recording(folder)
-    assert recording.history["time"].tolist() == recording.times.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    assert (
+        recording.history["time"].tolist()
+        == recording.times.tolist()
+        == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    )
     stretched = 1 + recording.fields(FAILS)["displacement"][:, 2].max()
     assert stretched > recording.value("mean_stretch", FAILS) > 1.05
     simulation.close()
@@ -219,7 +247,12 @@ def test_who_fails_after_a_step_was_accepted_leaves_it_accepted(undisturbed: Any
 
 
 # ---------------------------------------------------------------- two simulations in one process
-KRYLOV = {"ksp_type": "gmres", "pc_type": "jacobi", "ksp_rtol": 1e-12, "pc_factor_mat_solver_type": False}
+KRYLOV = {
+    "ksp_type": "gmres",
+    "pc_type": "jacobi",
+    "ksp_rtol": 1e-12,
+    "pc_factor_mat_solver_type": False,
+}
 
 
 def own_options() -> set[str]:
@@ -230,7 +263,9 @@ def own_options() -> set[str]:
 def test_two_simulations_have_their_own_solvers(undisturbed: Any) -> None:
     """A direct and a Krylov solver, step by step in turns; closing one leaves the other, and nothing stays behind."""
     others = own_options()
-    direct, krylov = (Simulation(scene(petsc_options=options), MPI.COMM_SELF) for options in ({}, KRYLOV))
+    direct, krylov = (
+        Simulation(scene(petsc_options=options), MPI.COMM_SELF) for options in ({}, KRYLOV)
+    )
     one, other = direct.steps(), krylov.steps()
     rows: dict[str, list[dict[str, float]]] = {"direct": [], "krylov": []}
     for number in range(END):

@@ -22,7 +22,13 @@ COLUMNS = ["content", "natural_length"]
 GROWS = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
 
 
-def wall(end: float | str, step: float, turnover: dict[str, float] | None, columns: list[str], **changes: Any) -> Any:
+def wall(
+    end: float | str,
+    step: float,
+    turnover: dict[str, float] | None,
+    columns: list[str],
+    **changes: Any,
+) -> Any:
     """A tube of 1 to 1.3 under a pressure of 1.2 and an elongation of 10 %."""
     return isotropic(
         "consistent",
@@ -35,7 +41,9 @@ def wall(end: float | str, step: float, turnover: dict[str, float] | None, colum
     )
 
 
-def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Figures of an independent program on one radius: in time, and at once in fewer steps; nothing is said."""
     for end, degrees in ((960.0, 3.0), ("equilibrium", 0.5)):
         with made(wall(end, 8.0, GROWS, COLUMNS)) as simulation:
@@ -45,7 +53,10 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(caplo
             )
             assert [row[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
             assert opening_angle(simulation) == pytest.approx(115.4, abs=degrees)
-            for name, expected in (("content", (3.9, 2.9, 2.2)), ("natural_length", (1.43, 1.31, 1.22))):
+            for name, expected in (
+                ("content", (3.9, 2.9, 2.2)),
+                ("natural_length", (1.43, 1.31, 1.22)),
+            ):
                 values = turnover._values(name).ravel()[order]
                 assert values[[0, len(values) // 2, -1]] == pytest.approx(expected, rel=0.03)
     assert simulation.way.steps < 100
@@ -54,12 +65,19 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(caplo
 
 
 def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    assert last_row(wall("equilibrium", 4.0, GROWS | {"gain": 0.2}, COLUMNS))["natural_length"] > 5.0
-    assert sum("growth has not reached equilibrium" in record.message for record in caplog.records) == 1
+    assert (
+        last_row(wall("equilibrium", 4.0, GROWS | {"gain": 0.2}, COLUMNS))["natural_length"] > 5.0
+    )
+    assert (
+        sum("growth has not reached equilibrium" in record.message for record in caplog.records)
+        == 1
+    )
 
 
 @pytest.mark.parametrize(
-    ("stretch", "tube", "angle"), [(1.15, (1.3, 1.2), 82.0), (1.1, (3.0, 4.8), 92.7)], ids=["stretch", "paper's wall"]
+    ("stretch", "tube", "angle"),
+    [(1.15, (1.3, 1.2), 82.0), (1.1, (3.0, 4.8), 92.7)],
+    ids=["stretch", "paper's wall"],
 )
 def test_other_walls_open_as_an_independent_solver_says(
     stretch: float, tube: tuple[float, float], angle: float
@@ -98,7 +116,11 @@ def errors(rows: list[dict[str, float]], small_steps: list[dict[str, float]]) ->
     for name in (*COLUMNS, ANGLES[1]):
         here = np.array([row[name] for row in rows])
         there = np.interp(times, exact, [row[name] for row in small_steps])
-        found.append(np.abs(here - there).max() if name in ANGLES else np.degrees(np.abs(np.log(here / there)).max()))
+        found.append(
+            np.abs(here - there).max()
+            if name in ANGLES
+            else np.degrees(np.abs(np.log(here / there)).max())
+        )
     return np.array(found)
 
 
@@ -107,13 +129,16 @@ def test_content_and_natural_length_have_the_order_of_the_coupling(
     coupling: str, order: int, small_steps: list[dict[str, float]]
 ) -> None:
     coarse, fine = (
-        errors(rows_of(wall(96.0, step, GROWS, COLUMNS, coupling=coupling))[-1:], small_steps) for step in (8.0, 2.0)
+        errors(rows_of(wall(96.0, step, GROWS, COLUMNS, coupling=coupling))[-1:], small_steps)
+        for step in (8.0, 2.0)
     )
     np.testing.assert_allclose(np.log(coarse / fine) / np.log(4.0), order, atol=0.35)
 
 
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
-def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_steps: list[dict[str, float]]) -> None:
+def test_chosen_steps_watch_content_and_natural_length(
+    coupling: str, small_steps: list[dict[str, float]]
+) -> None:
     """Errors fall as the tolerance does, and are below it; the estimate is about the error of the content."""
     found, counts = [], []
     for tolerance in (4.0, 1.0):
@@ -131,10 +156,22 @@ def test_chosen_steps_watch_content_and_natural_length(coupling: str, small_step
 def test_rates_against_their_equation() -> None:
     """At the stretch of deposition nothing changes; beyond it m and rho grow, and no faster than 1/T and its double."""
     chain, r0, contour, time = CHAINS["wormlike"], 1.0, 1.594, 40.0
-    tissue = Tissue(1.0, 1.0, 1.0, contour, r0, content=np.ones(4), natural_length=np.array([1.0, 1.3, 1.3, 1.0]))
+    tissue = Tissue(
+        1.0,
+        1.0,
+        1.0,
+        contour,
+        r0,
+        content=np.ones(4),
+        natural_length=np.array([1.0, 1.3, 1.3, 1.0]),
+    )
     stretches = np.array([1.1, 1.15, 0.9, 1.4])
-    found = TurnoverRule(time, 1.1, 1.0, TURNOVER_RATES["tension"]).at_length(tissue, stretches * tissue.natural_length)
-    tension = stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
+    found = TurnoverRule(time, 1.1, 1.0, TURNOVER_RATES["tension"]).at_length(
+        tissue, stretches * tissue.natural_length
+    )
+    tension = (
+        stretches * chain.stiffness(stretches, contour) / (1.1 * chain.stiffness(1.1, contour))
+    )
     assert found.content == pytest.approx(np.clip(tension - 1, -1, 1) / time, abs=1e-15)
     growth = (1 / time + np.maximum(found.content, 0)) * (stretches / 1.1 - 1)
     assert found.natural_length == pytest.approx(growth, abs=1e-15)
@@ -151,14 +188,20 @@ def test_a_growth_that_rests_is_no_instability_however_large(
     values["time"]["tolerance"] = 3.0
     with caplog.at_level(NOTICE), simulated(values) as (simulation, _):
         assert simulation.stepper.part("turnover")._values("content").max() > 10.0
-    assert not [record for record in caplog.records if record.levelname == "WARNING" and "rest" in record.message]
+    assert not [
+        record
+        for record in caplog.records
+        if record.levelname == "WARNING" and "rest" in record.message
+    ]
 
 
 @pytest.mark.parametrize(
     ("coupling", "time"),
     [("staggered", {}), ("extrapolated", {"tolerance": 1.0})],
 )
-def test_a_run_goes_on_with_its_content(coupling: str, time: dict[str, float], tmp_path: Path) -> None:
+def test_a_run_goes_on_with_its_content(
+    coupling: str, time: dict[str, float], tmp_path: Path
+) -> None:
     room = {"rates": "cauchy", "volume": 0.5} if time else {}
     values = wall(24.0, 4.0, {"time": 10.0, "gain": 1.0} | room, COLUMNS, coupling=coupling)
     values["time"] |= time
@@ -174,9 +217,15 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
     """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
     turnover = GROWS | {"gain": gain}
     rows_of(wall(480.0, 8.0, turnover, COLUMNS))
-    found = [record.message for record in caplog.records if "has not reached equilibrium" in record.message]
+    found = [
+        record.message
+        for record in caplog.records
+        if "has not reached equilibrium" in record.message
+    ]
     assert len(found) == (0 if rests else 1)
-    assert rests or ("decayed no faster than 1/t" in found[0] and "mechanobiological instability" in found[0])
+    assert rests or (
+        "decayed no faster than 1/t" in found[0] and "mechanobiological instability" in found[0]
+    )
     if gain == 0.2:
         caplog.clear()
         rows_of(wall(240.0, 8.0, turnover, COLUMNS))
@@ -184,7 +233,9 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
 
 
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
-def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_in_parts_has_parts_of_its_turnover(
+    coupling: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The end is that of the whole step; half-way ln m is half-way too."""
     values = wall(40.0, 8.0, GROWS, COLUMNS, coupling=coupling) | {"solver": {"predictor": "none"}}
     whole = rows_of(values)
@@ -194,7 +245,9 @@ def test_a_step_in_parts_has_parts_of_its_turnover(coupling: str, monkeypatch: p
     newton = coupled.blend.newton
     solve = newton.solve
 
-    def in_parts(step: Any, time: float, old_loads: Any, loads: Any, work: Any, again: bool) -> None:
+    def in_parts(
+        step: Any, time: float, old_loads: Any, loads: Any, work: Any, again: bool
+    ) -> None:
         coupled._solve_in_parts(time, old_loads, loads, work, None)
 
     def solved(origin: Any = None, loose_tolerance: bool = False) -> Any:
@@ -231,13 +284,17 @@ def test_steps_that_are_too_long_for_the_turnover_are_said() -> None:
     """Of fixed steps; chosen ones come to rest."""
     long = cube(100.0, 10.0, {"time": 5.0})
     (line,) = (line for line in scene_from_dict(long).warnings() if "turnover.time" in line)
-    assert "time.step = 10 exceeds remodeling.turnover.time = 5" in line and "time.tolerance" in line
+    assert (
+        "time.step = 10 exceeds remodeling.turnover.time = 5" in line and "time.tolerance" in line
+    )
     chosen = long | {"time": {"end": 100.0, "tolerance": 1.0}}
     for fine in (cube(100.0, 10.0, {}), chosen):
         assert not [line for line in scene_from_dict(fine).warnings() if "turnover.time" in line]
 
 
-def test_cells_that_stay_are_said_to_take_staggered_turnover(caplog: pytest.LogCaptureFixture) -> None:
+def test_cells_that_stay_are_said_to_take_staggered_turnover(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     Simulation(scene_from_dict(cube(10.0, 5.0, {}, kappa=0.0, coupling="extrapolated"))).close()
     assert "kappa is 0" in caplog.text and "in place of 'extrapolated'" in caplog.text
 

@@ -33,17 +33,28 @@ class Powers(Watcher):
         tissue, F = simulation.stepper.remodeling.parameters.at_points(), state.elastic_gradient()
         cells = [simulation.cells.point_cells]
         length = np.sqrt(simulation.cells.kernels.squared_length(F, cells[0]))
-        content, natural = TurnoverRule(TURNOVER["time"], 1.1, 1.0, TURNOVER_RATES["tension"]).at_length(tissue, length)
+        content, natural = TurnoverRule(
+            TURNOVER["time"], 1.1, 1.0, TURNOVER_RATES["tension"]
+        ).at_length(tissue, length)
 
         def energy(time: float) -> np.ndarray:
-            m, rho = tissue.content * np.exp(time * content), tissue.natural_length * np.exp(time * natural)
-            return np.asarray(replace(tissue, content=m, natural_length=rho).strain_energy(F, cells))
+            m, rho = tissue.content * np.exp(time * content), tissue.natural_length * np.exp(
+                time * natural
+            )
+            return np.asarray(
+                replace(tissue, content=m, natural_length=rho).strain_energy(F, cells)
+            )
 
         h, integral = 1e-4, simulation.quadrature.integral
-        values = {"turnover": (energy(-h) - energy(h)) / (2 * h), "production": tissue.content * content}
+        values = {
+            "turnover": (energy(-h) - energy(h)) / (2 * h),
+            "production": tissue.content * content,
+        }
         shape = simulation.quadrature.shape
         row = {name: float(integral(value.reshape(shape))) for name, value in values.items()}
-        self.rows.append({"time": step.time, "content_integral": integral(tissue.content.reshape(shape)), **row})
+        self.rows.append(
+            {"time": step.time, "content_integral": integral(tissue.content.reshape(shape)), **row}
+        )
 
 
 @cache
@@ -51,7 +62,11 @@ def balances(step: float, coupling: str) -> dict[str, float]:
     """Sums of powers over a time in which no load changes, by the trapezoidal rule; what the body has at its ends."""
     remodeling = {"turnover": TURNOVER, "coupling": coupling, "kappa": KAPPA}
     names = ["content", "inner_radius", "stored_energy", "remodeling_power", "turnover_power"]
-    of = grown(time={"end": 24.0, "step": step}, output={"fields": False, "columns": names}, remodeling=remodeling)
+    of = grown(
+        time={"end": 24.0, "step": step},
+        output={"fields": False, "columns": names},
+        remodeling=remodeling,
+    )
     with made(of) as simulation:
         powers = Powers(simulation)
         rows = [dict(each.row) for each in simulation.steps([powers])]
@@ -60,12 +75,18 @@ def balances(step: float, coupling: str) -> dict[str, float]:
     np.testing.assert_allclose(table["turnover_power"], table["turnover"], rtol=1e-5, atol=1e-6)
     held = table["time"] >= HELD
     table = {name: values[held] for name, values in table.items()}
-    decay = KAPPA * step  # a pass makes (1 - exp(-kappa dt)) of the way to its target: its rate is that at its start
+    decay = (
+        KAPPA * step
+    )  # a pass makes (1 - exp(-kappa dt)) of the way to its target: its rate is that at its start
     cells = table["remodeling_power"] * decay / (1 - np.exp(-decay))
     lumen = np.pi * table["inner_radius"] ** 2 * 2.0 * 1.1
     found = {name: np.trapezoid(table[name], table["time"]) for name in ("turnover", "production")}
     found["cells"] = np.trapezoid(cells, table["time"])
-    ends = {"energy": table["stored_energy"], "work": 1.2 * lumen, "content": table["content_integral"]}
+    ends = {
+        "energy": table["stored_energy"],
+        "work": 1.2 * lumen,
+        "content": table["content_integral"],
+    }
     found |= {name: values[-1] - values[0] for name, values in ends.items()}
     return {name: float(value) for name, value in found.items()}
 
@@ -96,7 +117,9 @@ def test_collagen_is_neither_made_nor_lost(coupling: str, order: int) -> None:
 
 
 # ---------------------------------------------------------------- a held stretch
-def held_stretch(force: float, step: float, coupling: str = "staggered") -> tuple[float, list[dict[str, float]]]:
+def held_stretch(
+    force: float, step: float, coupling: str = "staggered"
+) -> tuple[float, list[dict[str, float]]]:
     """r/r0 of isotropic cells that do not turn, in a matrix so stiff that chains leave it as it is; rows."""
     values = isotropic(
         None, "point", geometry={"shape": "cube"}, loads=ramped(step, force=force * 1e8),
@@ -126,7 +149,9 @@ def test_a_held_stretch_turns_over_as_its_differential_equations(force: float) -
     for step in (1.0, 0.5):
         chains, rows = held_stretch(force, step)
         # the rates of a row change the next one
-        expected = np.exp(solve_ivp(equation, (0, 20.0), [0.0, 0.0], rtol=1e-10, atol=1e-12).y[:, -1])
+        expected = np.exp(
+            solve_ivp(equation, (0, 20.0), [0.0, 0.0], rtol=1e-10, atol=1e-12).y[:, -1]
+        )
         found = np.array([rows[-1][name] for name in ("content", "natural_length")])
         errors.append(np.abs(found - expected))
     assert np.all(np.abs(expected - 1) > 0.02)

@@ -25,7 +25,9 @@ TURNOVER = {"time": 10.0, "deposition_stretch": 1.1, "gain": 1.0} | TENSION
 WALL = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 2.0}
 
 
-def grown(kinematics: str = "radial", driver: str = "cauchy", pressure: float = 1.2, **tables: Any) -> Any:
+def grown(
+    kinematics: str = "radial", driver: str = "cauchy", pressure: float = 1.2, **tables: Any
+) -> Any:
     """A thin tube under load while its collagen is turned over."""
     values: dict[str, Any] = {
         "preset": "consistent",
@@ -34,7 +36,10 @@ def grown(kinematics: str = "radial", driver: str = "cauchy", pressure: float = 
         "remodeling": {"driver": driver, "turnover": TURNOVER},
         "loads": ramped(8.0, pressure=pressure, elongation=0.1),
         "time": {"end": 12.0, "step": 2.0},
-        "output": {"fields": False, "columns": [*TURNED, "inner_radius", "outer_radius", "fibre_angle_outer"]},
+        "output": {
+            "fields": False,
+            "columns": [*TURNED, "inner_radius", "outer_radius", "fibre_angle_outer"],
+        },
     }
     return scene_from_dict(isotropic(kinematics=kinematics, **values | tables))
 
@@ -49,7 +54,11 @@ def at_its_end(scene: Any, domain: Any = None) -> tuple[dict[str, float], Simula
 def points_of(simulation: Simulation) -> tuple[Tissue, np.ndarray, np.ndarray]:
     """The tissue as arrays over the points, F_e and the radii there."""
     tissue = simulation.stepper.remodeling.parameters.at_points()
-    return tissue, simulation.state.elastic_gradient(), simulation.quadrature.coordinates[..., 0].ravel()
+    return (
+        tissue,
+        simulation.state.elastic_gradient(),
+        simulation.quadrature.coordinates[..., 0].ravel(),
+    )
 
 
 def cauchy_of_the_energy(simulation: Simulation) -> np.ndarray:
@@ -60,7 +69,9 @@ def cauchy_of_the_energy(simulation: Simulation) -> np.ndarray:
     for i, j in np.ndindex(3, 3):
         way = np.zeros((3, 3))
         way[i, j] = h
-        P[:, i, j] = (tissue.strain_energy(F + way, cells) - tissue.strain_energy(F - way, cells)) / (2 * h)
+        P[:, i, j] = (
+            tissue.strain_energy(F + way, cells) - tissue.strain_energy(F - way, cells)
+        ) / (2 * h)
     found: np.ndarray = P @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
     return found
 
@@ -71,7 +82,11 @@ def cauchy_of_the_energy(simulation: Simulation) -> np.ndarray:
 def test_fields_are_written_where_there_is_turnover(tmp_path: Path) -> None:
     """All fields have both; of a reduction they are turned to the whole body like any number."""
     remodeling = {"turnover": TURNOVER | {"volume": 0.5}}  # with the kernels of test_growth
-    folder = run(grown("sector", output={"every": 6, "report": False}, remodeling=remodeling), tmp_path / "run", SELF)
+    folder = run(
+        grown("sector", output={"every": 6, "report": False}, remodeling=remodeling),
+        tmp_path / "run",
+        SELF,
+    )
     fields = Recording(folder).fields(12.0)
     assert {*TURNED} < set(fields) and 1.0 < fields["content"].min() < fields["content"].max()
 
@@ -110,8 +125,14 @@ def test_regions_of_one_tissue_are_none() -> None:
 
 def test_each_region_turns_over_with_its_own_chains() -> None:
     """After the first row ln m and ln rho have the rates of its length L, r0 and chains, written down here."""
-    outer = {"material": {"contour_length": 1.9, "chain_density": 2.0}, "cells": {"end_to_end_length": 1.2}}
-    remodeling = {"turnover": TURNOVER, "coupling": "staggered"}  # the first step is solved with the cells of the start
+    outer = {
+        "material": {"contour_length": 1.9, "chain_density": 2.0},
+        "cells": {"end_to_end_length": 1.2},
+    }
+    remodeling = {
+        "turnover": TURNOVER,
+        "coupling": "staggered",
+    }  # the first step is solved with the cells of the start
     of = grown(regions=layers(**outer), time={"end": 2.0, "step": 2.0}, remodeling=remodeling)
     _, simulation = at_its_end(of)
     tissue, F, radius = points_of(simulation)
@@ -140,10 +161,15 @@ def test_closed_ends_and_residual_stress() -> None:
         loads=ramped(8.0, pressure=1.2, elongation=0.0),
     )
     with simulated(of) as (simulation, rows):
-        found, expected = simulation.stepper.remodeling.driving_tensor()[1], cauchy_of_the_energy(simulation)
+        found, expected = simulation.stepper.remodeling.driving_tensor()[1], cauchy_of_the_energy(
+            simulation
+        )
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(found).max())
     assert rows[0]["opening_angle"] == pytest.approx(120.0, abs=0.01)
-    assert rows[-1]["content"] > 1.2 and rows[-1]["axial_elongation"] > rows[3]["axial_elongation"] > 0.05
+    assert (
+        rows[-1]["content"] > 1.2
+        and rows[-1]["axial_elongation"] > rows[3]["axial_elongation"] > 0.05
+    )
 
 
 # ---------------------------------------------------------------- ranks

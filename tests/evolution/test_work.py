@@ -23,7 +23,9 @@ PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent"}
 
 def artery(coupling: str, **changes: Any) -> Scene:
     """The wall of the paper's artery, of isotropic cells, for two steps."""
-    scene = scene_from_dict(isotropic(PRESETS[coupling], remodeling={"coupling": coupling, "frame": "material"}))
+    scene = scene_from_dict(
+        isotropic(PRESETS[coupling], remodeling={"coupling": coupling, "frame": "material"})
+    )
     return scene.with_values({"time.end": 2.0, **changes})
 
 
@@ -53,7 +55,9 @@ def counts(found: list[Attempt]) -> tuple[int, int, int]:
     return newton, linear, tangents
 
 
-def rows(scene: Scene, found: list[Attempt]) -> Iterator[tuple[dict[str, float], Any, list[Attempt]]]:
+def rows(
+    scene: Scene, found: list[Attempt]
+) -> Iterator[tuple[dict[str, float], Any, list[Attempt]]]:
     """Row, work and attempts of each step; the latter are forgotten."""
     with made(scene) as simulation:
         for step in simulation.steps():
@@ -63,7 +67,9 @@ def rows(scene: Scene, found: list[Attempt]) -> Iterator[tuple[dict[str, float],
 
 @pytest.mark.parametrize("coupling", PRESETS)
 @pytest.mark.parametrize("method", ["direct", "lagged"])
-def test_every_solve_of_a_step_counts_once(coupling: str, method: str, attempts: list[Attempt]) -> None:
+def test_every_solve_of_a_step_counts_once(
+    coupling: str, method: str, attempts: list[Attempt]
+) -> None:
     """The first step of a coupling without a stress before it is solved twice."""
     solves = []
     # with fewer halvings than `parts.MIN_HALVINGS_FOR_JUMP` a step that goes far is not looked into again
@@ -71,7 +77,10 @@ def test_every_solve_of_a_step_counts_once(coupling: str, method: str, attempts:
     for row, work, found in rows(artery(coupling, **plain), attempts):
         spent = counts(found)
         assert (work.newton_iterations, work.linear_iterations, work.tangents) == spent
-        assert (row["newton_iterations"], row["linear_iterations"], row["substeps"]) == (*spent[:2], 1)
+        assert (row["newton_iterations"], row["linear_iterations"], row["substeps"]) == (
+            *spent[:2],
+            1,
+        )
         solves.append(len(found))
     assert solves == [1 + (coupling != "staggered"), 1]
 
@@ -87,19 +96,29 @@ def test_looks_at_a_step_that_goes_far_count(coupling: str, attempts: list[Attem
 @pytest.mark.parametrize("coupling", ["staggered", "extrapolated"])
 def test_failed_solves_and_parts_count(coupling: str, attempts: list[Attempt]) -> None:
     """A load far too large for one piece."""
-    changes = {"loads.pressure.value": 30.0, "loads.pressure.ramp": [[0.0, 0.0], [2.0, 1.0]], "time.step": 2.0}
+    changes = {
+        "loads.pressure.value": 30.0,
+        "loads.pressure.ramp": [[0.0, 0.0], [2.0, 1.0]],
+        "time.step": 2.0,
+    }
     scene = artery(coupling, **changes, **{"solver.maximum_iterations": 4})
     ((row, work, found),) = rows(scene, attempts)
     solved = sum(isinstance(attempt, Solution) for attempt in found)
     assert len(found) > solved > 1
-    assert row["substeps"] == solved - (coupling == "extrapolated")  # of two solves that are one step
+    assert row["substeps"] == solved - (
+        coupling == "extrapolated"
+    )  # of two solves that are one step
     newton, linear, tangents = counts(found)
     assert work.tangents == tangents
     # the direction in which a part may start is one iteration more
-    assert 0 <= row["newton_iterations"] - newton <= 2 and 0 <= row["linear_iterations"] - linear <= 2
+    assert (
+        0 <= row["newton_iterations"] - newton <= 2 and 0 <= row["linear_iterations"] - linear <= 2
+    )
 
 
-def test_attempts_that_were_taken_back_count_once(attempts: list[Attempt], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attempts_that_were_taken_back_count_once(
+    attempts: list[Attempt], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Three of them, more than two: sums of sums would double with each."""
     clock = SimpleNamespace(wall=0.0, processor=0.0)
     clock.perf_counter, clock.process_time = (lambda: clock.wall), (lambda: clock.processor)
@@ -117,5 +136,7 @@ def test_attempts_that_were_taken_back_count_once(attempts: list[Attempt], monke
     monkeypatch.setattr(simulation.stepper.coupling, "solve", timed)
     step = next(simulation.steps())
     assert len(starts) > 3 and starts == sorted(starts, reverse=True)
-    assert (step.work.newton_iterations, step.work.linear_iterations, step.work.tangents) == counts(attempts)
+    assert (step.work.newton_iterations, step.work.linear_iterations, step.work.tangents) == counts(
+        attempts
+    )
     assert (step.seconds, step.processor_seconds) == (10.0 * len(starts), 7.0 * len(starts))

@@ -33,7 +33,9 @@ def distorted_cube(scale: float = 0.1) -> parts.Body:
     """Random cells in eight hexahedra that are no parallelepipeds, with the selective formulation; nothing is held."""
     domain = cube(refinement=2)
     x = domain.mesh.geometry.x
-    x += scale * np.prod(x * (1 - x), axis=1)[:, None] * np.array([4.0, -3.0, 5.0])  # the node inside
+    x += (
+        scale * np.prod(x * (1 - x), axis=1)[:, None] * np.array([4.0, -3.0, 5.0])
+    )  # the node inside
     x += 0.5 * scale * x[:, [1, 2, 0]] * x[:, [2, 0, 1]]
     made = parts.body(domain, Cells(initial="random", seed=3))
     made.formulation = SELECTIVE
@@ -69,18 +71,26 @@ def test_the_driving_stress_has_the_pressure_of_the_element() -> None:
     made.set_displacement(smooth(made.nodes, 0.05, 4))
     alone = STIFF.model_copy(update={"chain_density": 0.0})
     remodeling = made.remodeling(alone, driver="cauchy")
-    made.set_displacement(smooth(made.nodes, 0.05, 5))  # after it was made: it looks at the present state
+    made.set_displacement(
+        smooth(made.nodes, 0.05, 5)
+    )  # after it was made: it looks at the present state
     F, stress = remodeling.driving_tensor()
     J = np.linalg.det(F)[:, None, None]
-    pressure = (J * stress - alone.lame_mu * (F @ np.swapaxes(F, 1, 2) - np.eye(3))).reshape(8, -1, 3, 3)
-    signs = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]) / 4  # slopes at the centre
+    pressure = (J * stress - alone.lame_mu * (F @ np.swapaxes(F, 1, 2) - np.eye(3))).reshape(
+        8, -1, 3, 3
+    )
+    signs = (
+        np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]) / 4
+    )  # slopes at the centre
     nodes = made.domain.mesh.geometry.dofmap
     reference = np.einsum("eni,nj->eij", made.domain.mesh.geometry.x[nodes], signs)
     dofs = made.displacement.function_space.dofmap.list
     change = np.einsum("eni,nj->eij", made.displacement.x.array.reshape(-1, 3)[dofs], signs)
     centroid = np.linalg.det(np.eye(3) + change @ np.linalg.inv(reference))
     expected = alone.lame_lambda * np.log(centroid)[:, None, None, None] * np.eye(3)
-    np.testing.assert_allclose(pressure, np.broadcast_to(expected, pressure.shape), atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        pressure, np.broadcast_to(expected, pressure.shape), atol=1e-8 * np.abs(expected).max()
+    )
     assert np.ptp(J.reshape(8, -1), axis=1).min() > 1e-3 and np.ptp(np.log(centroid)) > 1e-2
     made.formulation = "displacement"
     whole = made.remodeling(alone, driver="cauchy").driving_tensor()[1]
@@ -94,8 +104,13 @@ def test_the_guard_knows_j_where_the_formulation_takes_it() -> None:
     problem = made.problem()
     x, y, z = (2 * made.nodes - 1).T
     for sign in (-1.0, 1.0):
-        made.set_displacement(0.15 * np.column_stack((y * z, x * z, sign * x * y)) - 0.3 * made.nodes)
-        at_points, at_centre = problem.evaluate().jacobians.min(), problem.state.dilatation.jacobians().min()
+        made.set_displacement(
+            0.15 * np.column_stack((y * z, x * z, sign * x * y)) - 0.3 * made.nodes
+        )
+        at_points, at_centre = (
+            problem.evaluate().jacobians.min(),
+            problem.state.dilatation.jacobians().min(),
+        )
         assert at_centre == pytest.approx(0.7**3, rel=1e-12)
         assert (at_points > at_centre) == (sign < 0) and abs(at_points - at_centre) > 1e-3
         assert problem.extension().min_jacobian == min(at_points, at_centre)
@@ -109,12 +124,19 @@ def meshed(scene: Scene, around: int, through: int, along: int = 1) -> Domain:
     return tube(*size, 1, mesh.element, mesh.degree, SELF, (around, through, along))
 
 
-@pytest.mark.parametrize(("around", "through", "tolerance"), [(16, 8, 0.035), *slowly((32, 16, 0.01))])
-def test_a_thick_tube_does_not_lock(around: int, through: int, tolerance: float, caplog: Any) -> None:
+@pytest.mark.parametrize(
+    ("around", "through", "tolerance"), [(16, 8, 0.035), *slowly((32, 16, 0.01))]
+)
+def test_a_thick_tube_does_not_lock(
+    around: int, through: int, tolerance: float, caplog: Any
+) -> None:
     """Incompressible, closed form."""
     # few halvings: the three steps that go three times as far as their first Newton step are not looked into again
     scene = thick_tube(1e4, SELECTIVE).with_values({"solver.maximum_halvings": 4})
-    with caplog.at_level(logging.WARNING), simulated(scene, meshed(scene, around, through)) as (_, rows):
+    with (
+        caplog.at_level(logging.WARNING),
+        simulated(scene, meshed(scene, around, through)) as (_, rows),
+    ):
         assert rows[-1]["inner_radius"] - 1 == pytest.approx(EXACT_TUBE, rel=tolerance)
         assert max(row["newton_iterations"] for row in rows) <= 9
         assert {row["substeps"] for row in rows[1:]} == {1.0}
@@ -127,7 +149,9 @@ def test_a_tube_that_locks_is_told(caplog: Any) -> None:
     with caplog.at_level(logging.WARNING), simulated(locking, meshed(locking, 16, 8)) as (_, rows):
         lacking = 1 - (rows[-1]["inner_radius"] - 1) / EXACT_TUBE
     (record,) = caplog.records
-    assert record.getMessage().startswith("time 1: volumetric locking: displacements too small by about ")
+    assert record.getMessage().startswith(
+        "time 1: volumetric locking: displacements too small by about "
+    )
     assert record.getMessage().endswith(
         " % (lambda/mu up to 1000); set mesh.element = 'hexahedron' and mesh.formulation = "
         "'selective-integration' (docs/theory.md, Volumetric locking)"
@@ -153,9 +177,13 @@ def test_a_run_knows_what_its_elements_lack(
         {"geometry.outer_radius": radius, "model.kinematics": "radial", "mesh.degree": degree}
     )
     material = RadialMaterial(lame_lambda=3.103 * ratio, lame_mu=3.103, network_modulus=0.0)
-    exact = solve_radial(pressure, 0.0, 4.0, 4.0, law="none", outer_radius=radius, material=material).inner_radii[-1]
+    exact = solve_radial(
+        pressure, 0.0, 4.0, 4.0, law="none", outer_radius=radius, material=material
+    ).inner_radii[-1]
     with caplog.at_level(logging.WARNING), simulated(scene) as (simulation, rows):
-        missing = sum(LockingWarning(simulation.stepper, formulation == "displacement").missing_deformation())
+        missing = sum(
+            LockingWarning(simulation.stepper, formulation == "displacement").missing_deformation()
+        )
     lacking = 1 - (rows[-1]["inner_radius"] - 1) / (exact - 1)
     assert missing == pytest.approx(lacking, rel=0.25, abs=0.005)
     told = [record.getMessage() for record in caplog.records]
@@ -164,8 +192,12 @@ def test_a_run_knows_what_its_elements_lack(
     assert all(cause in line for line in told)
 
 
-@pytest.mark.parametrize(("kinematics", "pressure"), [("radial", 0.0), ("radial", 0.3), ("axisymmetric", 0.3)])
-def test_elements_that_lock_in_an_elongated_tube_are_told(kinematics: str, pressure: float, caplog: Any) -> None:
+@pytest.mark.parametrize(
+    ("kinematics", "pressure"), [("radial", 0.0), ("radial", 0.3), ("axisymmetric", 0.3)]
+)
+def test_elements_that_lock_in_an_elongated_tube_are_told(
+    kinematics: str, pressure: float, caplog: Any
+) -> None:
     """Most of the lateral motion is the contraction, which elements follow, and most of the work the elongation's.
 
     Chains along the radius make the contraction differ between the directions across, so that strain varies.
@@ -178,7 +210,9 @@ def test_elements_that_lock_in_an_elongated_tube_are_told(kinematics: str, press
         missing = sum(LockingWarning(simulation.stepper, True).missing_deformation())
     with simulated(scene.with_values({"mesh.refinement": 2, "mesh.degree": 2})) as (_, fine):
         pass
-    found, exact = (np.array([of[-1]["inner_radius"] - 1, of[-1]["outer_radius"] - 3]) for of in (rows, fine))
+    found, exact = (
+        np.array([of[-1]["inner_radius"] - 1, of[-1]["outer_radius"] - 3]) for of in (rows, fine)
+    )
     assert np.abs(found - exact).max() > 0.05 * np.abs(exact).max()
     assert missing > 0.05
     assert ["volumetric locking" in record.getMessage() for record in caplog.records] == [True]
@@ -208,7 +242,9 @@ def at_the_end(scene: Scene) -> np.ndarray:
 def mean_angles(ratio: float) -> np.ndarray:
     """Radii, and the same means over elements of a reference that shares no code."""
     material = RadialMaterial(lame_lambda=3.103 * ratio, lame_mu=3.103)
-    found = solve_radial(4.8, 0.1, 20.0, 40.0, law="tensor", step=0.5, elements=160, material=material)
+    found = solve_radial(
+        4.8, 0.1, 20.0, 40.0, law="tensor", step=0.5, elements=160, material=material
+    )
     angles = [found.mean_fibre_angle(*place) for place in ((1.0, 1.25), (1.75, 2.25), (2.75, 3.0))]
     return np.array([found.inner_radii[-1], found.outer_radii[-1], *angles])
 
@@ -235,8 +271,14 @@ def test_pressure_that_is_noise_is_told(ratio: float, degree: int, told: bool, c
         found = at_the_end(scene)
     smooth_pressure = at_the_end(scene.with_values({"mesh.formulation": SELECTIVE}))
     assert (np.abs(found - smooth_pressure)[2:].max() > 1.0) == told
-    said = [record.getMessage() for record in caplog.records if "pressure oscillations" in record.getMessage()]
-    assert len(said) == told and all("mesh.formulation = 'selective-integration'" in line for line in said)
+    said = [
+        record.getMessage()
+        for record in caplog.records
+        if "pressure oscillations" in record.getMessage()
+    ]
+    assert len(said) == told and all(
+        "mesh.formulation = 'selective-integration'" in line for line in said
+    )
 
 
 def test_a_slope_of_the_pressure_is_no_noise() -> None:
@@ -247,13 +289,20 @@ def test_a_slope_of_the_pressure_is_no_noise() -> None:
         noise, quadrature = watcher.degrees(), watcher.quadrature
         with pytest.MonkeyPatch.context() as patch:
             beyond = quadrature.polynomial_residual
-            patch.setattr(quadrature, "polynomial_residual", lambda degree, values: beyond(0, values))
+            patch.setattr(
+                quadrature, "polynomial_residual", lambda degree, values: beyond(0, values)
+            )
             assert noise < 0.4 * watcher.degrees()
 
 
 def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
     """They have no formulation that helps: the run says what their pressure does."""
-    values = {"mesh.element": "tetrahedron", "mesh.degree": 1, "model.kinematics": "full", "geometry.length": 0.5}
+    values = {
+        "mesh.element": "tetrahedron",
+        "mesh.degree": 1,
+        "model.kinematics": "full",
+        "geometry.length": 0.5,
+    }
     scene = remodeling_tube(300.0, **values, **{"time.end": 5.0})
     with caplog.at_level(logging.WARNING), simulated(scene, meshed(scene, 8, 4)):
         pass
@@ -264,12 +313,18 @@ def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
     ({"natural.opening_angle": 60.0}, "mesh.degree = 2 or a larger mesh.refinement, because [natural] needs"),
     ({"time.tolerance": 0.5, "mesh.formulation": "displacement"}, "mesh.formulation = 'selective-integration'"),
 ])  # fmt: skip
-def test_what_is_told_can_be_done_and_is_told_once(changes: dict[str, Any], remedy: str, caplog: Any) -> None:
+def test_what_is_told_can_be_done_and_is_told_once(
+    changes: dict[str, Any], remedy: str, caplog: Any
+) -> None:
     """Of accepted steps alone: a step that is taken back has said nothing."""
     scene = remodeling_tube(1e3, **{"time.end": 5.0}, **changes)
     with caplog.at_level(logging.WARNING), simulated(scene) as (_, rows):
         times = [float(record.getMessage()[5:].split(":")[0]) for record in caplog.records]
-    told = [record.getMessage() for record in caplog.records if "pressure oscillations" in record.getMessage()]
+    told = [
+        record.getMessage()
+        for record in caplog.records
+        if "pressure oscillations" in record.getMessage()
+    ]
     assert len(told) == 1 and remedy in told[0]
     assert all(np.isclose(time, [row["time"] for row in rows]).any() for time in times)
 
@@ -291,13 +346,18 @@ def test_what_auto_takes() -> None:
 
 def random_artery(**values: Any) -> Scene:
     """The paper's artery."""
-    return preset_scene("kuhl-holzapfel-2007", "tube").with_values({"cells.initial": "random", **values})
+    return preset_scene("kuhl-holzapfel-2007", "tube").with_values(
+        {"cells.initial": "random", **values}
+    )
 
 
 def test_the_papers_artery_is_fine_enough(caplog: Any) -> None:
     """Where its random cells make strain vary most: two thirds of what is said."""
     artery = random_artery(**{"time.end": 5.0})
-    with caplog.at_level(logging.WARNING), simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _):
+    with (
+        caplog.at_level(logging.WARNING),
+        simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _),
+    ):
         watcher = LockingWarning(simulation.stepper, True)
         assert 0.025 < sum(watcher.missing_deformation()) < 0.038
     assert not caplog.records
@@ -307,10 +367,15 @@ def test_what_cells_do_is_no_lack_of_elements(caplog: Any) -> None:
     """Under a tenth of the paper's pressure random cells deform the wall by more than the load does."""
     values = {"loads.pressure.value": 0.48, "loads.elongation.value": 0.0, "time.end": 3.0}
     artery = random_artery(**values)
-    with caplog.at_level(logging.WARNING), simulated(artery, meshed(artery, 16, 8)) as (simulation, _):
+    with (
+        caplog.at_level(logging.WARNING),
+        simulated(artery, meshed(artery, 16, 8)) as (simulation, _),
+    ):
         watcher = LockingWarning(simulation.stepper, True)
         assert sum(watcher.energies()[1:]) > 0.2 * watcher.work()[0]
-    assert not [record for record in caplog.records if "displacements are off by" in record.getMessage()]
+    assert not [
+        record for record in caplog.records if "displacements are off by" in record.getMessage()
+    ]
 
 
 RANDOM_CUBE = {
@@ -328,7 +393,12 @@ ON_ONE_AND_TWO_RANKS = [{"scene": RANDOM_CUBE}]
 def test_one_and_two_ranks_agree(case: Case) -> None:
     one, two = (case(RANDOM_CUBE, ranks=ranks) for ranks in (1, 2))
     assert np.ptp(one["l"] - one["l0"]) > 0.05
-    for name, tolerance in (("mean_stretch", 1e-8), ("min_jacobian", 1e-8), ("u", 1e-7), ("l", 1e-6)):
+    for name, tolerance in (
+        ("mean_stretch", 1e-8),
+        ("min_jacobian", 1e-8),
+        ("u", 1e-7),
+        ("l", 1e-6),
+    ):
         np.testing.assert_allclose(two[name], one[name], rtol=0, atol=tolerance, err_msg=name)
 
 

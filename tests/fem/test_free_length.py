@@ -27,8 +27,15 @@ END = 4.0
 
 def values(kinematics: str, loads: dict[str, Any], **tables: Any) -> dict[str, Any]:
     direct = {"method": "direct"}  # whose iterations are counted
-    base = {"loads": ramped(END, pressure=4.8, elongation=0.0) | loads, "solver": direct, "output": None}
-    return isotropic(kinematics=kinematics, **base | {"remodeling": {"kappa": 0.1}, "time": {"end": END}} | tables)
+    base = {
+        "loads": ramped(END, pressure=4.8, elongation=0.0) | loads,
+        "solver": direct,
+        "output": None,
+    }
+    return isotropic(
+        kinematics=kinematics,
+        **base | {"remodeling": {"kappa": 0.1}, "time": {"end": END}} | tables,
+    )
 
 
 def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]], list[float]]:
@@ -38,7 +45,9 @@ def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]],
         domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
     with made(scene, domain) as simulation:
         rows, forces = [], []
-        for step in simulation.steps([AtSolved(lambda step: forces.append(force_of(simulation)))] if force_of else []):
+        for step in simulation.steps(
+            [AtSolved(lambda step: forces.append(force_of(simulation)))] if force_of else []
+        ):
             rows.append(step.row)
     return rows, forces
 
@@ -59,28 +68,39 @@ def integral_of_stress(simulation: Simulation) -> float:
     stresses = PointStresses(state, simulation.tissue)
     stresses.refresh()
     P = stresses.ufl.first_piola_kirchhoff
-    found = quadrature.evaluate(jit.expression(ufl.as_vector([P[2, 2]]), quadrature.points), (1,))[..., 0]
+    found = quadrature.evaluate(jit.expression(ufl.as_vector([P[2, 2]]), quadrature.points), (1,))[
+        ..., 0
+    ]
     return quadrature.integral(found) / simulation.scene.geometry.axial_length
 
 
 def as_load(forces: list[float]) -> dict[str, Any]:
-    return {"value": 1.0, "ramp": [[0.0, 0.0], *([float(n), force] for n, force in enumerate(forces, start=1))]}
+    return {
+        "value": 1.0,
+        "ramp": [[0.0, 0.0], *([float(n), force] for n, force in enumerate(forces, start=1))],
+    }
 
 
 @pytest.mark.parametrize(
     ("kinematics", "force_of"),
     [("radial", integral_of_stress), pytest.param("full", nodal_reaction, marks=pytest.mark.slow)],
 )
-def test_the_reaction_of_a_prescribed_length_gives_that_length(kinematics: str, force_of: Any) -> None:
+def test_the_reaction_of_a_prescribed_length_gives_that_length(
+    kinematics: str, force_of: Any
+) -> None:
     length = {"length": 1.0} if kinematics == "full" else {}
     geometry = {"shape": "tube"} | length
     elongation = {"elongation": {"value": 0.1, "ramp": [[0, 0], [END / 2, 1]]}}
-    prescribed, forces = rows_of(scene_from_dict(values(kinematics, elongation, geometry=geometry)), force_of)
+    prescribed, forces = rows_of(
+        scene_from_dict(values(kinematics, elongation, geometry=geometry)), force_of
+    )
     assert min(forces) > 1.0 and np.ptp(forces) > 1.0
     scene = scene_from_dict(values(kinematics, {"axial_force": as_load(forces)}, geometry=geometry))
     found, _ = rows_of(scene)
     for name in ("axial_elongation", "inner_radius", "stored_energy"):
-        np.testing.assert_allclose([row[name] for row in found], [row[name] for row in prescribed], rtol=1e-9)
+        np.testing.assert_allclose(
+            [row[name] for row in found], [row[name] for row in prescribed], rtol=1e-9
+        )
     np.testing.assert_allclose([row["axial_force"] for row in found], forces, rtol=1e-9)
     assert max(row["newton_iterations"] for row in found) <= 6  # one method for field and length
 
@@ -92,7 +112,9 @@ def test_closed_ends_carry_the_force_on_the_caps() -> None:
     forces = [row["pressure"] * np.pi * row["inner_radius"] ** 2 for row in closed]
     pulled, _ = rows_of(scene_from_dict(values("radial", {"axial_force": as_load(forces)})))
     for name in ("axial_elongation", "inner_radius"):
-        np.testing.assert_allclose([row[name] for row in pulled], [row[name] for row in closed], rtol=1e-9)
+        np.testing.assert_allclose(
+            [row[name] for row in pulled], [row[name] for row in closed], rtol=1e-9
+        )
     free, _ = rows_of(scene_from_dict(values("radial", ramped(END, axial_force=0.0))))
     assert free[-1]["axial_elongation"] < 0.0 < closed[-1]["axial_elongation"]
 
@@ -100,10 +122,16 @@ def test_closed_ends_carry_the_force_on_the_caps() -> None:
 def test_the_equilibrium_of_a_closed_tube() -> None:
     """The cells take the length with them."""
     tables = {"supports": {"ends": "closed"}, "output": {"columns": ["pass_residual"]}}
-    at_once, _ = rows_of(scene_from_dict(values("radial", {}, **tables) | {"time": {"end": "equilibrium"}}))
-    in_time, _ = rows_of(scene_from_dict(values("radial", {}, **tables) | {"time": {"end": 240.0, "step": 2.0}}))
+    at_once, _ = rows_of(
+        scene_from_dict(values("radial", {}, **tables) | {"time": {"end": "equilibrium"}})
+    )
+    in_time, _ = rows_of(
+        scene_from_dict(values("radial", {}, **tables) | {"time": {"end": 240.0, "step": 2.0}})
+    )
     assert at_once[-1]["pass_residual"] < 1e-8
-    assert at_once[-1]["axial_elongation"] == pytest.approx(in_time[-1]["axial_elongation"], abs=1e-6)
+    assert at_once[-1]["axial_elongation"] == pytest.approx(
+        in_time[-1]["axial_elongation"], abs=1e-6
+    )
     assert abs(in_time[-1]["axial_elongation"] - in_time[1]["axial_elongation"]) > 0.01
 
 

@@ -34,12 +34,16 @@ print(len(jit.compiled_kernels()))
 """
 
 
-def compile_and_use(cache: Path, ranks: int = 1, **variables: str) -> subprocess.CompletedProcess[str]:
+def compile_and_use(
+    cache: Path, ranks: int = 1, **variables: str
+) -> subprocess.CompletedProcess[str]:
     command, environment = program(cache)
     if ranks == 1:
         return forked("python", PROGRAM, variables=environment | variables)
     command = mpirun(ranks, *command)
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment | variables)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=environment | variables
+    )
 
 
 def program(cache: Path, text: str = PROGRAM) -> tuple[list[str], dict[str, str]]:
@@ -79,8 +83,13 @@ def cache(compiled: Path, tmp_path: Path) -> Path:
 
 def test_only_what_is_really_compiled_is_said_and_counted(tmp_path: Path) -> None:
     count = tmp_path / "count"
-    first, again = (compile_and_use(tmp_path, REMODEL_FENICSX_COMPILED=str(count)) for _ in range(2))
-    assert "compiling the moment, once on this machine" in first.stderr and "compil" not in again.stderr
+    first, again = (
+        compile_and_use(tmp_path, REMODEL_FENICSX_COMPILED=str(count)) for _ in range(2)
+    )
+    assert (
+        "compiling the moment, once on this machine" in first.stderr
+        and "compil" not in again.stderr
+    )
     assert (first.stdout, again.stdout) == ("1\n", "0\n")
     assert count.read_text() == one_file(tmp_path, "libffcx_forms_*.c").stem + "\n"
 
@@ -107,9 +116,12 @@ def test_who_waits_for_a_compiler_says_for_whose(cache: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ranks", "lost"), [(1, ".c"), (1, ".c.cached"), *slowly((2, ".c.cached"), (2, ".c"), (1, ".so"))]
+    ("ranks", "lost"),
+    [(1, ".c"), (1, ".c.cached"), *slowly((2, ".c.cached"), (2, ".c"), (1, ".so"))],
 )
-def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: str, cache: Path) -> None:
+def test_a_compilation_that_was_cut_off_is_done_again_at_once(
+    ranks: int, lost: str, cache: Path
+) -> None:
     library, source = one_file(cache, "libffcx_forms_*.so"), one_file(cache, "libffcx_forms_*.c")
     library.unlink()  # as if the compiler had been killed: mostly .c, the lock, stays without the end mark
     source.with_suffix(lost).unlink(missing_ok=True)
@@ -121,7 +133,9 @@ def test_a_compilation_that_was_cut_off_is_done_again_at_once(ranks: int, lost: 
 
 
 @pytest.mark.parametrize("theirs", [False, True])
-def test_a_cache_that_is_not_ones_own_is_replaced_with_a_warning(theirs: bool, cache: Path, tmp_path: Path) -> None:
+def test_a_cache_that_is_not_ones_own_is_replaced_with_a_warning(
+    theirs: bool, cache: Path, tmp_path: Path
+) -> None:
     """What is there is run."""
     temporary, place = tmp_path / "temporary", tmp_path / "file" / "cache"
     temporary.mkdir()
@@ -154,7 +168,9 @@ print(len(jit.compiled_kernels()))
 """
 
 
-def test_an_expression_with_derivatives_is_compiled_once_for_all_problems_of_a_process(tmp_path: Path) -> None:
+def test_an_expression_with_derivatives_is_compiled_once_for_all_problems_of_a_process(
+    tmp_path: Path,
+) -> None:
     """Of (0.5^2 0.25^3): UFL's numbers of variables are not part of the kernel."""
     done = forked("python", DERIVED_TWICE, variables=program(tmp_path)[1])
     assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr[-2000:]
@@ -179,17 +195,25 @@ with StopRequest():
 
 
 @pytest.mark.parametrize(
-    ("group", "number"), [(True, signal.SIGINT), (False, signal.SIGTERM), *slowly((True, signal.SIGHUP))]
+    ("group", "number"),
+    [(True, signal.SIGINT), (False, signal.SIGTERM), *slowly((True, signal.SIGHUP))],
 )
-def test_a_signal_waits_for_the_compiler(group: bool, number: signal.Signals, tmp_path: Path) -> None:
+def test_a_signal_waits_for_the_compiler(
+    group: bool, number: signal.Signals, tmp_path: Path
+) -> None:
     """A terminal sends it to all processes; what is there afterwards is whole."""
     command, environment = program(tmp_path, IN_A_RUN)
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, env=environment, text=True, start_new_session=True
+    )
     wait_for_compiler(process)
     (os.killpg if group else os.kill)(process.pid, number)
     errors = process.communicate(timeout=200)[1]
     assert (process.returncode, errors) == (128 + number, "") and all_end(process.pid)
-    assert one_file(tmp_path, "libffcx_*.so").exists() and one_file(tmp_path, "libffcx_*.c.cached").exists()
+    assert (
+        one_file(tmp_path, "libffcx_*.so").exists()
+        and one_file(tmp_path, "libffcx_*.c.cached").exists()
+    )
 
 
 LOGARITHMS = """
@@ -209,14 +233,24 @@ print(*dolfinx.fem.assemble_vector(form).array[:48:8].tolist())
 """
 
 
-def test_the_simd_logarithm_is_the_scalar_one_and_lets_nothing_pass_the_guards(tmp_path: Path) -> None:
+def test_the_simd_logarithm_is_the_scalar_one_and_lets_nothing_pass_the_guards(
+    tmp_path: Path,
+) -> None:
     """Equal but for rounding; what is no number or infinite is so afterwards, in its own element alone."""
     said = []
-    for left_out in ((), ("-D__FAST_MATH__", "-O3")):  # at -O3 the compiler takes seconds for scalar logarithms
+    for left_out in (
+        (),
+        ("-D__FAST_MATH__", "-O3"),
+    ):  # at -O3 the compiler takes seconds for scalar logarithms
         done = forked("python", LOGARITHMS, *left_out, variables=program(tmp_path)[1])
         assert done.returncode == 0, done.stderr
         said.append([np.array(line.split(), dtype=float) for line in done.stdout.splitlines()])
     (vectors, bad), (scalars, bad_scalars) = said
     assert np.abs(vectors - scalars).max() <= 1e-14 * np.abs(scalars).max()
-    assert np.isnan(bad[[0, 3]]).all() and bad[1] == np.inf and bad[2] == -np.inf and np.isfinite(bad[4:]).all()
+    assert (
+        np.isnan(bad[[0, 3]]).all()
+        and bad[1] == np.inf
+        and bad[2] == -np.inf
+        and np.isfinite(bad[4:]).all()
+    )
     np.testing.assert_array_equal(np.isfinite(bad), np.isfinite(bad_scalars))

@@ -30,7 +30,11 @@ OF_THE_SOLVER = ("seconds", "newton_iterations", "linear_iterations", "substeps"
 
 def values(shape: str, kinematics: str, end: float, **tables: Any) -> dict[str, Any]:
     """The preset's body with isotropic cells, as a scene's values."""
-    base = {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": shape}, "model": {"kinematics": kinematics}}
+    base = {
+        "preset": "kuhl-holzapfel-2007",
+        "geometry": {"shape": shape},
+        "model": {"kinematics": kinematics},
+    }
     return base | {"cells": ISOTROPIC, "time": {"end": end}} | tables
 
 
@@ -51,14 +55,20 @@ def difference(one: Scene, other: Scene) -> float:
 
 
 # ---------------------------------------------------------------- against what is known otherwise
-def ray_and_reference(driver: str, end: float, **mesh: int) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
+def ray_and_reference(
+    driver: str, end: float, **mesh: int
+) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
     """Of tests/reference all; radii (2, steps), angle and the reference's at the quadrature points of a ray."""
     exact = solve_radial(driver=driver, end=end, elements=150)
     with made(scene("tube", "radial", end, mesh=mesh, remodeling={"driver": driver})) as simulation:
         steps = list(simulation.steps())
-        radii = np.array([[step.row[name] for step in steps] for name in ("inner_radius", "outer_radius")])
+        radii = np.array(
+            [[step.row[name] for step in steps] for name in ("inner_radius", "outer_radius")]
+        )
         angle = Measurement(simulation.observer, steps[-1]).fibre_angle
-        expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
+        expected = np.interp(
+            simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle()
+        )
     assert np.ptp(angle) > 3.0
     return exact, radii, angle, expected
 
@@ -80,26 +90,37 @@ def test_the_consistent_law_is_the_independent_solution(driver: str) -> None:
     """Its law, typed by hand in the reference too; linear elements, which other tests of this law compile anyway."""
     changes = {"driver": driver, "law": "tensor", "frame": "material"}
     tables: dict[str, Any] = {"mesh": {"refinement": 18}, "material": {"repulsion": "log"}}
-    exact, printed = (solve_radial(driver=driver, law=law, end=10.0, elements=150) for law in ("tensor", "explicit"))
+    exact, printed = (
+        solve_radial(driver=driver, law=law, end=10.0, elements=150)
+        for law in ("tensor", "explicit")
+    )
     with made(scene("tube", "radial", 10.0, remodeling=changes, **tables)) as simulation:
         steps = list(simulation.steps())
         inner = [step.row["inner_radius"] for step in steps]
         np.testing.assert_allclose(inner, exact.inner_radii, rtol=2e-5)
         assert np.abs(printed.inner_radii / exact.inner_radii - 1).max() > 1e-3
         angle = Measurement(simulation.observer, steps[-1]).fibre_angle
-        expected = np.interp(simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle())
+        expected = np.interp(
+            simulation.quadrature.coordinates[..., 0], exact.points, exact.fibre_angle()
+        )
         # linear elements: about their middle the strain rises and falls by 0.1 degrees
         np.testing.assert_allclose(angle.mean(axis=1), expected.mean(axis=1), rtol=0, atol=0.01)
 
 
 @pytest.mark.parametrize("cells", [ISOTROPIC, {"initial": [0.6, 0.0, 0.8]}, {"initial": "random"}])
 def test_a_cube_is_a_point(cells: dict[str, Any]) -> None:
-    assert difference(*(scene("cube", name, 12.0, cells=cells) for name in ("point", "full"))) < 1e-9
+    assert (
+        difference(*(scene("cube", name, 12.0, cells=cells) for name in ("point", "full"))) < 1e-9
+    )
 
 
-@pytest.mark.parametrize("cells", [{"initial": [0.48, 0.6, 0.64]}, ISOTROPIC | {"axes": "cylindrical"}])
+@pytest.mark.parametrize(
+    "cells", [{"initial": [0.48, 0.6, 0.64]}, ISOTROPIC | {"axes": "cylindrical"}]
+)
 def test_a_tendon_is_a_point(cells: dict[str, Any]) -> None:
-    assert difference(*(scene("tendon", name, 4.0, cells=cells) for name in ("point", "full"))) < 1e-9
+    assert (
+        difference(*(scene("tendon", name, 4.0, cells=cells) for name in ("point", "full"))) < 1e-9
+    )
 
 
 def test_a_half_plane_is_a_ray() -> None:
@@ -108,7 +129,9 @@ def test_a_half_plane_is_a_ray() -> None:
 
 def clamped(name: str, end: float) -> float:
     """Inner radius of a tube with clamped ends."""
-    return float(columns_of(scene("tube", name, end, supports={"ends": "clamped"}))["inner_radius"][-1])
+    return float(
+        columns_of(scene("tube", name, end, supports={"ends": "clamped"}))["inner_radius"][-1]
+    )
 
 
 def test_clamped_ends_hold_a_half_plane_as_a_quarter() -> None:
@@ -120,11 +143,15 @@ def test_clamped_ends_hold_a_half_plane_as_a_quarter() -> None:
 
 
 # ---------------------------------------------------------------- random cells of a quarter
-def test_a_quarter_of_random_cells_is_the_tube_that_has_their_mirror_images(monkeypatch: Any) -> None:
+def test_a_quarter_of_random_cells_is_the_tube_that_has_their_mirror_images(
+    monkeypatch: Any,
+) -> None:
     """With all layers along z: the whole tube, given these cells by hand, has the same columns."""
     monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (16, 8, 4))
     random = {"cells": {"initial": "random", "axes": "cylindrical", "seed": 3}}
-    quarter, whole = (Simulation(scene("tube", name, 2.0, **random), SELF) for name in ("sector", "full"))
+    quarter, whole = (
+        Simulation(scene("tube", name, 2.0, **random), SELF) for name in ("sector", "full")
+    )
     assert quarter.domain.number_of_elements == 128
     own, every = (one.quadrature.coordinates.mean(axis=1) for one in (quarter, whole))
     distances = np.linalg.norm(np.abs(every)[:, None] - own, axis=-1)
@@ -143,20 +170,30 @@ def test_a_quarter_of_random_cells_is_the_tube_that_has_their_mirror_images(monk
 
 def test_it_is_named_never_chosen_and_says_what_it_means(caplog: pytest.LogCaptureFixture) -> None:
     base = scene("tube", "sector", 2.0, cells={"initial": "random", "axes": "cylindrical"})
-    words = [line for line in describe_choice(base) if "means over seeds are nearly those of the whole tube" in line]
+    words = [
+        line
+        for line in describe_choice(base)
+        if "means over seeds are nearly those of the whole tube" in line
+    ]
     assert len(words) == 1
     left = describe_choice(base.with_values({"model.kinematics": AUTO}))
-    assert "'full'" in left[0] and any(line.startswith("'sector', allowed for means over seeds") for line in left)
+    assert "'full'" in left[0] and any(
+        line.startswith("'sector', allowed for means over seeds") for line in left
+    )
     with caplog.at_level("INFO"):
         Simulation(base, SELF).close()
     assert words[0] in caplog.messages
-    assert not [line for line in describe_choice(scene("tube", "sector", 2.0)) if "means over seeds" in line]
+    assert not [
+        line for line in describe_choice(scene("tube", "sector", 2.0)) if "means over seeds" in line
+    ]
 
 
 # ---------------------------------------------------------------- rules
 
 
-@pytest.mark.parametrize(("shape", "name", "refused", "allowed", "words"), table(__file__, "kinematics_rules.txt"))
+@pytest.mark.parametrize(
+    ("shape", "name", "refused", "allowed", "words"), table(__file__, "kinematics_rules.txt")
+)
 def test_every_rule_refuses_a_scene_and_allows_its_neighbour(
     shape: str, name: str, refused: str, allowed: str, words: str
 ) -> None:
@@ -187,7 +224,9 @@ def test_axes_of_ones_own_may_have_no_symmetry(monkeypatch: pytest.MonkeyPatch) 
     from remodel_fenicsx.model.cells import global_axes
     from remodel_fenicsx.model.axes import AXES
 
-    monkeypatch.setitem(AXES, "tilted", lambda points: np.roll(global_axes(points.coordinates), 1, axis=-1))
+    monkeypatch.setitem(
+        AXES, "tilted", lambda points: np.roll(global_axes(points.coordinates), 1, axis=-1)
+    )
     for shape in (Cube, Tube):
         monkeypatch.setattr(shape, "axis_kinds", ("global", "cylindrical", "tilted"))
     for shape, name, words in (
@@ -207,7 +246,9 @@ def test_axes_of_ones_own_may_have_no_symmetry(monkeypatch: pytest.MonkeyPatch) 
     ("tube", {"cells": {"initial": "random"}}, "full"),  # the quarter is right for means alone
     ("cube", {}, "point"), ("tendon", {"cells": {"initial": "random"}}, "full"),
 ])  # fmt: skip
-def test_auto_takes_the_cheapest_that_is_allowed(shape: str, tables: dict[str, Any], name: str) -> None:
+def test_auto_takes_the_cheapest_that_is_allowed(
+    shape: str, tables: dict[str, Any], name: str
+) -> None:
     chosen = scene(shape, AUTO, 2.0, **tables)
     assert choice(chosen).name == name
     lines = describe_choice(chosen)
@@ -216,8 +257,14 @@ def test_auto_takes_the_cheapest_that_is_allowed(shape: str, tables: dict[str, A
 
 
 def test_without_a_preset_the_choice_is_auto_and_presets_are_full() -> None:
-    assert scene_from_dict({"geometry": {"shape": "cube"}, "time": {"end": 1.0}}).model.kinematics == AUTO
-    assert scene_from_dict({"preset": "consistent", "geometry": {"shape": "cube"}}).model.kinematics == "full"
+    assert (
+        scene_from_dict({"geometry": {"shape": "cube"}, "time": {"end": 1.0}}).model.kinematics
+        == AUTO
+    )
+    assert (
+        scene_from_dict({"preset": "consistent", "geometry": {"shape": "cube"}}).model.kinematics
+        == "full"
+    )
 
 
 def test_what_the_symmetric_solution_cannot_show_is_said() -> None:
@@ -225,7 +272,8 @@ def test_what_the_symmetric_solution_cannot_show_is_said() -> None:
         lines = describe_choice(scene("tube", AUTO, 2.0, remodeling=remodeling))
         assert any("leaves it after a while" in line for line in lines) == said
     assert not any(
-        "leaves it" in line for line in describe_choice(scene("cube", AUTO, 2.0, remodeling={"driver": "pk2"}))
+        "leaves it" in line
+        for line in describe_choice(scene("cube", AUTO, 2.0, remodeling={"driver": "pk2"}))
     )
 
 
@@ -245,12 +293,16 @@ TENSOR = {"law": "tensor", "coupling": "extrapolated"}
 TWICE = {
     "point": values("cube", "point", 5.0),
     "one element": values("cube", "full", 3.0, mesh={"formulation": "selective-integration"}),
-    "chosen steps of a point": values("cube", "point", 3.0, time={"end": 3.0, "tolerance": 1.0}, remodeling=TENSOR),
+    "chosen steps of a point": values(
+        "cube", "point", 3.0, time={"end": 3.0, "tolerance": 1.0}, remodeling=TENSOR
+    ),
     "radial": values("tube", "radial", 5.0),
     "axisymmetric": values("tube", "axisymmetric", 5.0, supports={"ends": "clamped"}),
     "sector": values("tube", "sector", 3.0, cells={"initial": "random", "axes": "cylindrical"}),
 }
-ON_ONE_AND_TWO_RANKS = [{"scene": scene | {"solver": {"relative_tolerance": 1e-13}}} for scene in TWICE.values()]
+ON_ONE_AND_TWO_RANKS = [
+    {"scene": scene | {"solver": {"relative_tolerance": 1e-13}}} for scene in TWICE.values()
+]
 
 
 @pytest.fixture(scope="module")
@@ -266,7 +318,11 @@ def test_two_ranks_give_the_same(
 ) -> None:
     one, two = on_one_and_two_ranks[name]
     shape = TWICE[name]["geometry"]["shape"]
-    columns = ["mean_stretch", "force"] if shape == "cube" else ["inner_radius", "outer_radius", "fibre_angle_middle"]
+    columns = (
+        ["mean_stretch", "force"]
+        if shape == "cube"
+        else ["inner_radius", "outer_radius", "fibre_angle_middle"]
+    )
     for column in (*columns, "stored_energy", "max_chain_extension"):
         np.testing.assert_allclose(two[column], one[column], rtol=1e-12, err_msg=column)
     np.testing.assert_allclose(two["l"], one["l"], rtol=0, atol=1e-11)
@@ -276,15 +332,28 @@ def test_two_ranks_give_the_same(
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Folder of a shape's full run of one step, made once."""
-    return cache(lambda shape: run(scene(shape, "full", 1.0), tmp_path_factory.mktemp("full") / shape, SELF))
+    return cache(
+        lambda shape: run(scene(shape, "full", 1.0), tmp_path_factory.mktemp("full") / shape, SELF)
+    )
 
 
 @pytest.mark.parametrize(
     ("shape", "name", "cell"),
-    [("cube", "point", 3), ("tube", "radial", 3), ("tube", "axisymmetric", 9), ("tube", "sector", 12)],
+    [
+        ("cube", "point", 3),
+        ("tube", "radial", 3),
+        ("tube", "axisymmetric", 9),
+        ("tube", "sector", 12),
+    ],
 )
 def test_recorded_fields_are_revolved_into_the_body(
-    shape: str, name: str, cell: int, whole: Callable[[str], Path], tmp_path: Path, refused: Refused, monkeypatch: Any
+    shape: str,
+    name: str,
+    cell: int,
+    whole: Callable[[str], Path],
+    tmp_path: Path,
+    refused: Refused,
+    monkeypatch: Any,
 ) -> None:
     """Held against the full run, element by element. Those of `full` lie between chords."""
     monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (16, 4, 2))
@@ -293,7 +362,11 @@ def test_recorded_fields_are_revolved_into_the_body(
         assert set(file["VTKHDF/Types"][:]) == {cell}
     assert cli.main(["revolve", str(folders[name])]) == 0
     (tmp_path / "body").mkdir()
-    for file_name, source in (("fields_body.vtkhdf", name), ("scene.toml", name), ("history.csv", name)):
+    for file_name, source in (
+        ("fields_body.vtkhdf", name),
+        ("scene.toml", name),
+        ("history.csv", name),
+    ):
         target = file_name.replace("fields_body", "fields")
         (tmp_path / "body" / target).write_bytes((folders[source] / file_name).read_bytes())
     body, full = Recording(tmp_path / "body"), Recording(folders["full"])
@@ -305,9 +378,15 @@ def test_recorded_fields_are_revolved_into_the_body(
     nearest = np.linalg.norm(others[:, None] - own, axis=2).argmin(axis=1)
     found = {field: values[nearest] for field, values in found.items() if field != "displacement"}
     for field in ("deformation_gradient", "cauchy_stress", "fibre_angle", "chain_extension"):
-        size = np.abs(expected[field] - (np.eye(3).ravel() if field == "deformation_gradient" else 0.0)).max()
-        np.testing.assert_allclose(found[field], expected[field], rtol=0, atol=tolerance * size, err_msg=field)
-    axes = (np.stack([fields[f"axis_{i}"] for i in (1, 2, 3)], axis=1) for fields in (found, expected))
+        size = np.abs(
+            expected[field] - (np.eye(3).ravel() if field == "deformation_gradient" else 0.0)
+        ).max()
+        np.testing.assert_allclose(
+            found[field], expected[field], rtol=0, atol=tolerance * size, err_msg=field
+        )
+    axes = (
+        np.stack([fields[f"axis_{i}"] for i in (1, 2, 3)], axis=1) for fields in (found, expected)
+    )
     structure = map(structure_tensor, (found["cell_dimensions"], expected["cell_dimensions"]), axes)
     np.testing.assert_allclose(*structure, rtol=0, atol=0.01)
     with h5py.File(folders[name] / "fields_body_chains.vtkhdf") as file:
@@ -320,7 +399,9 @@ def test_a_full_run_has_nothing_to_revolve(whole: Callable[[str], Path], refused
 
 
 # ---------------------------------------------------------------- what buckles
-@pytest.mark.parametrize(("force", "unstable", "name"), [(10.0, "warn", "point"), (-30.0, "warn", "full")])
+@pytest.mark.parametrize(
+    ("force", "unstable", "name"), [(10.0, "warn", "point"), (-30.0, "warn", "full")]
+)
 def test_auto_is_full_where_a_load_presses(force: float, unstable: str, name: str) -> None:
     """The cube under -30 leaves its shape by a mode that a point does not have."""
     scene = scene_from_dict({
@@ -330,4 +411,6 @@ def test_auto_is_full_where_a_load_presses(force: float, unstable: str, name: st
     assert choice(scene).name == name
     assert ("buckle" in " ".join(describe_choice(scene))) == (name == "full")
     stops = scene.with_values({"solver.unstable": "stop"})
-    assert choice(stops).name == "full" and "modes of the whole body" in " ".join(describe_choice(stops))
+    assert choice(stops).name == "full" and "modes of the whole body" in " ".join(
+        describe_choice(stops)
+    )

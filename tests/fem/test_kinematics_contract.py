@@ -26,13 +26,25 @@ FREE = {"loads": ramped(4.0, axial_force=1.0, elongation=0.0, pressure=4.8)}
 AROUND_A_TUBE = {"alone": {}, "prestretched": PRESTRETCH, "of free length": FREE}
 TUBES = ("full", "sector", "axisymmetric", "radial")
 CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
-    **{f"tube {name} {around}": ("tube", name, tables) for name in TUBES for around, tables in AROUND_A_TUBE.items()},
-    "tube full with selective integration": ("tube", "full", {"mesh": {"formulation": "selective-integration"}}),
+    **{
+        f"tube {name} {around}": ("tube", name, tables)
+        for name in TUBES
+        for around, tables in AROUND_A_TUBE.items()
+    },
+    "tube full with selective integration": (
+        "tube",
+        "full",
+        {"mesh": {"formulation": "selective-integration"}},
+    ),
     "tube radial both": ("tube", "radial", PRESTRETCH | FREE),
     "cube point": ("cube", "point", {}),
     "cube full": ("cube", "full", {}),
     "tendon point": ("tendon", "point", {}),
-    "sheet point sheared": ("sheet", "point", {"loads": ramped(4.0, force_x=50.0, force_y=50.0, shear=0.2)}),
+    "sheet point sheared": (
+        "sheet",
+        "point",
+        {"loads": ramped(4.0, force_x=50.0, force_y=50.0, shear=0.2)},
+    ),
 }
 UNKNOWNS_PER_NODE = {"full": 3, "sector": 3, "axisymmetric": 2, "radial": 1}
 # the largest class of homogeneous gradients that each of them shows: where an entry may differ from that of I
@@ -71,9 +83,15 @@ def name_of(body: Simulation) -> str:
 
 def deform(body: Simulation, F: np.ndarray) -> None:
     """Give the body x = F X: all that is shown is linear in the unknowns, so least squares find them."""
-    kinematics, unknown, has_length = body.state.kinematics, body.unknown, body.scene.has_free_length
+    kinematics, unknown, has_length = (
+        body.state.kinematics,
+        body.unknown,
+        body.scene.has_free_length,
+    )
     strain, nodes = F - np.eye(3), kinematics.nodal_space(unknown).tabulate_dof_coordinates()
-    uniform = [kinematics.uniform_unknown(unknown.function_space, component) for component in range(3)]
+    uniform = [
+        kinematics.uniform_unknown(unknown.function_space, component) for component in range(3)
+    ]
     numbers = [(space.dofmap.list.flatten()[0], size) for space, size in filter(None, uniform)]
     wanted = [*(nodes @ strain.T).ravel(), *np.diag(strain)[: len(numbers)]]
     wanted += [strain[2, 2]] * has_length
@@ -115,19 +133,25 @@ def test_what_stands_around_is_what_the_scene_asks_for(body: Simulation) -> None
     assert kinematics.name == name_of(body)
 
 
-def test_a_homogeneous_deformation_has_its_gradient(deformed: tuple[Simulation, np.ndarray]) -> None:
+def test_a_homogeneous_deformation_has_its_gradient(
+    deformed: tuple[Simulation, np.ndarray],
+) -> None:
     body, F = deformed
     found = body.state.deformation_gradient()
     np.testing.assert_allclose(found, np.broadcast_to(F, found.shape), atol=1e-12)
 
 
-def test_the_displacement_of_forms_is_that_of_the_nodes(deformed: tuple[Simulation, np.ndarray]) -> None:
+def test_the_displacement_of_forms_is_that_of_the_nodes(
+    deformed: tuple[Simulation, np.ndarray],
+) -> None:
     body, F = deformed
     quadrature = body.quadrature
     expression = jit.expression(body.state.kinematics.displacement(body.unknown), quadrature.points)
     found = quadrature.evaluate(expression, (3,))
     strain = F - np.eye(3)
-    strain[0, 1] *= body.state.kinematics.three_dimensional  # a prescribed shear is no part of the unknowns
+    strain[
+        0, 1
+    ] *= body.state.kinematics.three_dimensional  # a prescribed shear is no part of the unknowns
     np.testing.assert_allclose(found, quadrature.coordinates @ strain.T, atol=1e-12)
 
 
@@ -145,7 +169,9 @@ def test_the_weight_makes_the_mesh_the_body(body: Simulation) -> None:
     assert quadrature.integral(np.ones(quadrature.shape)) == pytest.approx(volume, rel=1e-12)
 
 
-def test_the_energy_is_that_of_the_tissue_free_of_stress(deformed: tuple[Simulation, np.ndarray]) -> None:
+def test_the_energy_is_that_of_the_tissue_free_of_stress(
+    deformed: tuple[Simulation, np.ndarray],
+) -> None:
     """Typed on arrays: W of F G, for every volume of the tissue before it was stretched to the mesh."""
     body, F = deformed
     state, quadrature = body.state, body.quadrature
@@ -178,8 +204,12 @@ def test_the_forces_are_the_slope_of_the_energy_and_the_tangent_is_theirs(
     np.testing.assert_allclose(taylor_orders(body, equilibrium, 1e-2), 2.0, atol=0.1)
 
 
-@pytest.mark.parametrize("body", [key for key in CASES if KINEMATICS[CASES[key][1]].three_dimensional], indirect=True)
-def test_the_energy_does_not_see_a_turn_of_the_body(deformed: tuple[Simulation, np.ndarray]) -> None:
+@pytest.mark.parametrize(
+    "body", [key for key in CASES if KINEMATICS[CASES[key][1]].three_dimensional], indirect=True
+)
+def test_the_energy_does_not_see_a_turn_of_the_body(
+    deformed: tuple[Simulation, np.ndarray],
+) -> None:
     """Reductions have no turns."""
     body, F = deformed
     equilibrium = Equilibrium(body.state, body.tissue)

@@ -23,7 +23,9 @@ def points() -> Quadrature:
 def distance(points: Quadrature) -> np.ndarray:
     """From the axis along the middle of the element, (elements, points)."""
     middle = points.coordinates[..., :2].mean(axis=1)
-    return np.einsum("epi,ei->ep", points.coordinates[..., :2], middle / np.linalg.norm(middle, axis=1)[:, None])
+    return np.einsum(
+        "epi,ei->ep", points.coordinates[..., :2], middle / np.linalg.norm(middle, axis=1)[:, None]
+    )
 
 
 def trapezoid(inner: float, outer: float) -> tuple[float, float]:
@@ -45,9 +47,15 @@ def test_means_over_elements_are_by_volume(points: Quadrature) -> None:
 def test_integral_and_mean_are_by_volume_over_all_elements_or_some(points: Quadrature) -> None:
     (small, near), (large, far) = trapezoid(1.0, 2.0), trapezoid(2.0, 3.0)
     values = distance(points)
-    assert points.integral(np.ones(points.shape)) == pytest.approx(AROUND * (small + large), rel=1e-13)
-    assert points.integral(values) == pytest.approx(AROUND * (small * near + large * far), rel=1e-13)
-    assert points.mean(values) == pytest.approx((small * near + large * far) / (small + large), rel=1e-13)
+    assert points.integral(np.ones(points.shape)) == pytest.approx(
+        AROUND * (small + large), rel=1e-13
+    )
+    assert points.integral(values) == pytest.approx(
+        AROUND * (small * near + large * far), rel=1e-13
+    )
+    assert points.mean(values) == pytest.approx(
+        (small * near + large * far) / (small + large), rel=1e-13
+    )
     inner = values.max(axis=1) < 2.0
     assert points.nanmean(values, inner) == pytest.approx(near, rel=1e-13)
     # elements of two sizes: not the mean of their means
@@ -60,7 +68,10 @@ def test_integral_and_mean_are_by_volume_over_all_elements_or_some(points: Quadr
 
 def test_areas_are_volume_over_the_least_and_the_largest_extent() -> None:
     box = dolfinx.mesh.create_box(
-        MPI.COMM_SELF, [[0.0, 0.0, 0.0], [4.0, 3.0, 6.0]], [2, 1, 1], dolfinx.mesh.CellType.hexahedron
+        MPI.COMM_SELF,
+        [[0.0, 0.0, 0.0], [4.0, 3.0, 6.0]],
+        [2, 1, 1],
+        dolfinx.mesh.CellType.hexahedron,
     )
     points = Quadrature(box, 1)
     np.testing.assert_allclose(points.largest_areas, [3.0 * 6.0] * 2, rtol=1e-14)

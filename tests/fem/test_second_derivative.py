@@ -22,7 +22,9 @@ MESH = ufl.Mesh(basix.ufl.element("P", "hexahedron", 1, shape=(3,)))
 SPACE = ufl.FunctionSpace(MESH, basix.ufl.element("P", "hexahedron", 1, shape=(3,)))
 U, V, D = (ufl.Coefficient(SPACE) for _ in range(3))  # unknown, and the two directions
 F = ufl.Identity(3) + ufl.grad(U)
-GRADIENTS = dict(zip((U, V, D), np.random.default_rng(4).uniform(-0.15, 0.15, (3, 3, 3)), strict=True))
+GRADIENTS = dict(
+    zip((U, V, D), np.random.default_rng(4).uniform(-0.15, 0.15, (3, 3, 3)), strict=True)
+)
 
 
 def tissue_energy(repulsion: str, *weights: float) -> Any:
@@ -30,8 +32,12 @@ def tissue_energy(repulsion: str, *weights: float) -> Any:
     rng, cells = np.random.default_rng(5), []
     for weight in weights:
         axes = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-        cells.append(UnitCell(ufl.as_vector(rng.uniform(0.4, 0.7, 3)), ufl.as_matrix(axes.tolist()), weight))
-    return Tissue(3.0, 2.0, 1.6, 1.594, 1.0, repulsion=REPULSIONS[repulsion]).strain_energy(F, cells)
+        cells.append(
+            UnitCell(ufl.as_vector(rng.uniform(0.4, 0.7, 3)), ufl.as_matrix(axes.tolist()), weight)
+        )
+    return Tissue(3.0, 2.0, 1.6, 1.594, 1.0, repulsion=REPULSIONS[repulsion]).strain_energy(
+        F, cells
+    )
 
 
 ENERGIES: dict[str, Callable[[], Any]] = {
@@ -51,9 +57,13 @@ def value(expression: Any) -> float:
     """Of an expanded expression, where the functions are linear."""
 
     def of(gradient: np.ndarray) -> Callable[..., Any]:
-        return lambda x, derivatives=(): tuple(gradient[:, derivatives[0]]) if derivatives else tuple(gradient @ x)
+        return lambda x, derivatives=(): (
+            tuple(gradient[:, derivatives[0]]) if derivatives else tuple(gradient @ x)
+        )
 
-    return float(expression((0.3, 0.2, 0.1), {name: of(gradient) for name, gradient in GRADIENTS.items()}))
+    return float(
+        expression((0.3, 0.2, 0.1), {name: of(gradient) for name, gradient in GRADIENTS.items()})
+    )
 
 
 @pytest.mark.parametrize("name", list(ENERGIES))
@@ -69,7 +79,13 @@ def test_it_takes_less_than_half_of_the_operations() -> None:
     """Of the kernel at a quadrature point: a third."""
     test, trial = ufl.TestFunction(SPACE), ufl.TrialFunction(SPACE)
     energy = ENERGIES["paper"]() * ufl.dx(degree=2)
-    forms = [second_derivative(energy, U, test, trial), ufl.derivative(ufl.derivative(energy, U, test), U, trial)]
+    forms = [
+        second_derivative(energy, U, test, trial),
+        ufl.derivative(ufl.derivative(energy, U, test), U, trial),
+    ]
     options = ffcx.options.get_options()
-    ours, plain = (str(ffcx.compiler.compile_ufl_objects([form], options)).count("double sv_") for form in forms)
+    ours, plain = (
+        str(ffcx.compiler.compile_ufl_objects([form], options)).count("double sv_")
+        for form in forms
+    )
     assert 0 < ours < plain / 2

@@ -57,7 +57,11 @@ def imports_of(path: Path) -> list[tuple[str, str]]:
                 yield from walk(node.body, "types")
                 yield from walk(node.orelse, when)
             else:
-                inside = "function" if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) else when
+                inside = (
+                    "function"
+                    if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+                    else when
+                )
                 bodies = [getattr(node, field, []) for field in ("body", "orelse", "finalbody")]
                 bodies += [handler.body for handler in getattr(node, "handlers", [])]
                 yield from walk([statement for body in bodies for statement in body], inside)
@@ -102,7 +106,11 @@ def test_no_arrow_runs_upwards() -> None:
 
 def test_scripts_beside_the_package_import_what_is_there() -> None:
     """Nothing else runs most of them: what they import may move away unnoticed."""
-    scripts = [path for folder in ("benchmarks", "demos", "docs") for path in sorted((ROOT / folder).rglob("*.py"))]
+    scripts = [
+        path
+        for folder in ("benchmarks", "demos", "docs")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+    ]
     assert len(scripts) > 20
     for path in scripts:
         for imported, _ in imports_of(path):
@@ -112,7 +120,11 @@ def test_scripts_beside_the_package_import_what_is_there() -> None:
 
 def test_the_package_itself_only_hands_names_on() -> None:
     """Whoever asks for its version imports nothing else, and no room asks the package itself."""
-    assert {arrow.imported for arrow in arrows() if arrow.importer == "__init__" and arrow.when != "types"} == {
+    assert {
+        arrow.imported
+        for arrow in arrows()
+        if arrow.importer == "__init__" and arrow.when != "types"
+    } == {
         "_lazy",
         "_version",
     }
@@ -120,7 +132,11 @@ def test_the_package_itself_only_hands_names_on() -> None:
     assert {room(arrow.imported) for arrow in arrows() if arrow.importer == "__main__"} == {"cli"}
 
 
-SCENES = ("schema", "body", "scene")  # without a circle of files, whenever they import and whatever for
+SCENES = (
+    "schema",
+    "body",
+    "scene",
+)  # without a circle of files, whenever they import and whatever for
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
@@ -129,7 +145,9 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
         of_scenes = {arrow.importer.split(".")[0], arrow.imported.split(".")[0]} <= {*SCENES}
         if (arrow.when == "module" or of_scenes) and arrow.importer != arrow.imported:
             after.setdefault(arrow.importer, set()).add(arrow.imported)
-            parent = arrow.imported.rpartition(".")[0]  # importing a module runs the face of its room first
+            parent = arrow.imported.rpartition(".")[
+                0
+            ]  # importing a module runs the face of its room first
             if parent and parent != room(arrow.importer):
                 after[arrow.importer].add(parent)
 
@@ -174,16 +192,25 @@ def test_a_room_does_without(inside: str, never: set[str]) -> None:
     (f"{PACKAGE}.report", "dolfinx basix mpi4py petsc4py gmsh ufl pint matplotlib"),
 ])  # fmt: skip
 def test_importing_costs_no_more_than_it_must(module: str, never: str) -> None:
-    program = f"import sys, {module}; print(*(name for name in {never.split()} if name in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    program = (
+        f"import sys, {module}; print(*(name for name in {never.split()} if name in sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
 def test_a_scene_imports_no_other_shape() -> None:
-    others = [f"{PACKAGE}.body.{name}" for name in ("cube", "tendon", "sheet", "mesh_body", "mesh_file", "mesh_faces")]
+    others = [
+        f"{PACKAGE}.body.{name}"
+        for name in ("cube", "tendon", "sheet", "mesh_body", "mesh_file", "mesh_faces")
+    ]
     scene = f"{PACKAGE}.scene.preset_scene('consistent', 'tube')"
     program = f"import sys, {PACKAGE}.scene; {scene}; print(*(name for name in {others} if name in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
@@ -216,7 +243,9 @@ def test_names_in_docstrings_are_there() -> None:
     lost = [
         f"{path.name}: {owner}.{name}"
         for path in pages
-        for owner, name in re.findall(r"`+(?:\w+\.)*(\w+)\.(\w+)(?:\.\w+)*`+", path.read_text(encoding="utf-8"))
+        for owner, name in re.findall(
+            r"`+(?:\w+\.)*(\w+)\.(\w+)(?:\.\w+)*`+", path.read_text(encoding="utf-8")
+        )
         if owner in files.keys() - {"parts", "extend"}
         and name not in ("py", "c", "toml", "csv", "msh")
         and not re.search(rf"\b{name}\b", files[owner].read_text(encoding="utf-8"))

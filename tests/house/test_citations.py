@@ -6,7 +6,9 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-MONTHS = ("January February March April May June July August September October November December").split()
+MONTHS = (
+    "January February March April May June July August September October November December"
+).split()
 
 
 def in_one_form(text: str) -> str:
@@ -15,7 +17,10 @@ def in_one_form(text: str) -> str:
 
 
 def test_every_work_that_a_page_names_is_in_the_bibliography_and_the_other_way_round() -> None:
-    pages = [ROOT / "README.md", *(page for page in (ROOT / "docs").glob("*.md") if page.stem != "bibliography")]
+    pages = [
+        ROOT / "README.md",
+        *(page for page in (ROOT / "docs").glob("*.md") if page.stem != "bibliography"),
+    ]
     text = in_one_form(" ".join(page.read_text(encoding="utf-8") for page in pages))
     entries = (ROOT / "docs" / "bibliography.md").read_text(encoding="utf-8")
     keys = [in_one_form(key) for key in re.findall(r"^- \*\*(.*)\.\*\*", entries, re.MULTILINE)]
@@ -31,10 +36,16 @@ def test_the_paper_and_its_bibliography_name_the_same_works_and_its_figures_are_
     paper = ROOT / "paper" / "paper.md"
     _, head, text = paper.read_text(encoding="utf-8").split("---\n", 2)
     works = (paper.parent / "paper.bib").read_text(encoding="utf-8")
-    assert set(re.findall(r"@(\w+)", text)) == set(re.findall(r"^@\w+\{(\w+),", works, re.MULTILINE))
+    assert set(re.findall(r"@(\w+)", text)) == set(
+        re.findall(r"^@\w+\{(\w+),", works, re.MULTILINE)
+    )
     for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text):
         assert (paper.parent / picture).is_file(), picture
     assert all(
-        f"\n{key}:" in f"\n{head}" for key in ("title", "tags", "authors", "affiliations", "date", "bibliography")
+        f"\n{key}:" in f"\n{head}"
+        for key in ("title", "tags", "authors", "affiliations", "date", "bibliography")
     )
-    assert all(f"\n# {title}" in text for title in ("Summary", "Statement of need", "State of the field", "References"))
+    assert all(
+        f"\n# {title}" in text
+        for title in ("Summary", "Statement of need", "State of the field", "References")
+    )

@@ -23,9 +23,27 @@ from remodel_fenicsx.schema.tables import Table
 from tests.forks import forked
 
 MODULES = (remodel_fenicsx, parts, extend)
-PUBLIC = {name: getattr(module, name) for module in MODULES for name in module.__all__ if not name.startswith("__")}
-DESCRIBED = {name: value for name, value in PUBLIC.items() if inspect.isclass(value) or inspect.isfunction(value)}
-HEADS = ("Parameters", "Attributes", "Returns", "Yields", "Raises", "Notes", "References", "Examples")
+PUBLIC = {
+    name: getattr(module, name)
+    for module in MODULES
+    for name in module.__all__
+    if not name.startswith("__")
+}
+DESCRIBED = {
+    name: value
+    for name, value in PUBLIC.items()
+    if inspect.isclass(value) or inspect.isfunction(value)
+}
+HEADS = (
+    "Parameters",
+    "Attributes",
+    "Returns",
+    "Yields",
+    "Raises",
+    "Notes",
+    "References",
+    "Examples",
+)
 
 
 def sections(text: str) -> dict[str, str]:
@@ -37,7 +55,9 @@ def sections(text: str) -> dict[str, str]:
 def entries(text: str) -> set[str]:
     """Names of a section; "a, b : type" are two."""
     heads = re.findall(r"^(\S.*)", text, re.MULTILINE)
-    return {name.strip().lstrip("*") for head in heads for name in head.partition(" : ")[0].split(",")}
+    return {
+        name.strip().lstrip("*") for head in heads for name in head.partition(" : ")[0].split(",")
+    }
 
 
 def own(value: Any) -> str:
@@ -51,9 +71,15 @@ def parameters(value: Any) -> list[str]:
     made = inspect.isclass(value) and (
         dataclasses.is_dataclass(value) or hasattr(value, "_fields") or "__init__" in vars(value)
     )
-    if inspect.isclass(value) and (not made or issubclass(value, Table) or getattr(value, "_is_protocol", False)):
+    if inspect.isclass(value) and (
+        not made or issubclass(value, Table) or getattr(value, "_is_protocol", False)
+    ):
         return []
-    return [name for name in inspect.signature(value).parameters if name not in ("self", "args", "kwargs")]
+    return [
+        name
+        for name in inspect.signature(value).parameters
+        if name not in ("self", "args", "kwargs")
+    ]
 
 
 def members(kind: type) -> Iterator[tuple[str, Any]]:
@@ -64,9 +90,17 @@ def members(kind: type) -> Iterator[tuple[str, Any]]:
         function = (
             member.fget
             if isinstance(member, property)
-            else member.func if isinstance(member, cached_property) else getattr(member, "__func__", member)
+            else (
+                member.func
+                if isinstance(member, cached_property)
+                else getattr(member, "__func__", member)
+            )
         )
-        if base.__module__.startswith("remodel_fenicsx") and name[0] != "_" and inspect.isfunction(function):
+        if (
+            base.__module__.startswith("remodel_fenicsx")
+            and name[0] != "_"
+            and inspect.isfunction(function)
+        ):
             yield name, function
 
 
@@ -78,8 +112,13 @@ def faults(value: Any) -> Iterator[str]:
     if ">>> " not in said.get("Examples", ""):
         yield "no Examples"
     known = entries(said.get("Parameters", "")) | entries(said.get("Attributes", ""))
-    yield from (f"parameter {name} is not described" for name in parameters(value) if name not in known)
-    returned = inspect.isfunction(value) and value.__annotations__.get("return") not in (None, "None")
+    yield from (
+        f"parameter {name} is not described" for name in parameters(value) if name not in known
+    )
+    returned = inspect.isfunction(value) and value.__annotations__.get("return") not in (
+        None,
+        "None",
+    )
     if returned and not re.match(r"\S.*\n +\S", said.get("Returns", "") + said.get("Yields", "")):
         yield "no Returns with a type and, indented, what it is"
 
@@ -89,7 +128,11 @@ def test_a_public_name_has_a_docstring_with_all_sections(name: str) -> None:
     value = DESCRIBED[name]
     found = list(faults(value))
     if inspect.isclass(value):
-        found += [f"{name}: no docstring" for name, _ in members(value) if not inspect.getdoc(getattr(value, name))]
+        found += [
+            f"{name}: no docstring"
+            for name, _ in members(value)
+            if not inspect.getdoc(getattr(value, name))
+        ]
     assert not found
 
 
@@ -109,7 +152,10 @@ def run_examples() -> None:
     texts |= {module.__name__: module.__doc__ or "" for module in MODULES}
     for name, value in DESCRIBED.items():
         if inspect.isclass(value):
-            texts |= {f"{name}.{each}": inspect.getdoc(getattr(value, each)) or "" for each, _ in members(value)}
+            texts |= {
+                f"{name}.{each}": inspect.getdoc(getattr(value, each)) or ""
+                for each, _ in members(value)
+            }
     for name, text in texts.items():
         runner.run(parser.get_doctest(text, {"__name__": "__main__"}, name, name, 0))
     print(f"{runner.failures} of {runner.tries} failed")

@@ -27,7 +27,9 @@ def page(name: str) -> str:
 
 def test_pages_that_need_no_run_are_those_that_the_code_makes() -> None:
     """Keys, schema, public interface, columns; what is added, renamed or dropped shows in their own history."""
-    made = subprocess.run([sys.executable, str(ROOT / "docs" / "make"), "--check"], capture_output=True, text=True)
+    made = subprocess.run(
+        [sys.executable, str(ROOT / "docs" / "make"), "--check"], capture_output=True, text=True
+    )
     assert (
         made.returncode == 0
     ), f"if that is meant (CHANGELOG.md says so, where it is public):\n{made.stdout}{made.stderr}"
@@ -36,7 +38,9 @@ def test_pages_that_need_no_run_are_those_that_the_code_makes() -> None:
 def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
     """With both commands that stand after it, in their order."""
     (code, commands) = re.findall(
-        r"```python\n(.*?)```\n\nSave it as `mine.py` and run (.*?)\. ", page("README.md"), re.DOTALL
+        r"```python\n(.*?)```\n\nSave it as `mine.py` and run (.*?)\. ",
+        page("README.md"),
+        re.DOTALL,
     )[0]
     one, two = (command.split() for command in re.findall(r"`./with-fenicsx (.*?)`", commands))
     short, number = re.subn(r'"time\.end": 30\.0', '"time.end": 1.0', code)
@@ -44,13 +48,17 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(COARSE + short)
     outputs = [forked("python", COARSE + short, cwd=tmp_path)]
     command = mpirun(2, sys.executable, "mine.py")
-    outputs.append(subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200))
+    outputs.append(
+        subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+    )
     for done, folder in zip(outputs, ("tube", "tube-2"), strict=True):
         assert done.returncode == 0, done.stderr[-2000:]
         *steps, radii = done.stdout.strip().split("\n")
         assert [float(line.split()[0]) for line in steps] == [1.0]
         recorded = [float(radius) for radius in radii.strip("[]").split()]
-        assert recorded == pytest.approx([3.0, *(float(line.split()[1]) for line in steps)], abs=1e-7)
+        assert recorded == pytest.approx(
+            [3.0, *(float(line.split()[1]) for line in steps)], abs=1e-7
+        )
         assert (tmp_path / "results" / folder / "fields.vtkhdf").exists()
 
 
@@ -80,15 +88,24 @@ def named_sections(text: str) -> list[tuple[str, str]]:
 
 def test_sections_that_are_named_are_there() -> None:
     """By run messages, docstrings and pages."""
-    files = [*ROOT.glob("remodel_fenicsx/**/*.py"), *ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("docs/*.md")]
-    heads = {file.stem: re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.M) for file in files}
+    files = [
+        *ROOT.glob("remodel_fenicsx/**/*.py"),
+        *ROOT.glob("benchmarks/**/*.py"),
+        *ROOT.glob("docs/*.md"),
+    ]
+    heads = {
+        file.stem: re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.M)
+        for file in files
+    }
     found = {
         (file.name, name, section)
         for file in files
         for name, section in named_sections(file.read_text(encoding="utf-8"))
     }
     assert len(found) > 30
-    assert not [one for one in found if not any(one[2].startswith(head) for head in heads.get(one[1], []))]
+    assert not [
+        one for one in found if not any(one[2].startswith(head) for head in heads.get(one[1], []))
+    ]
     assert named_sections('"so (docs/theory.md, No "\n    "section)"') == [("theory", "No section")]
 
 
@@ -98,9 +115,13 @@ def test_commands_that_pages_show_are_commands(capsys: pytest.CaptureFixture[str
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         if path.name == "interface.md":  # a synopsis
             continue
-        for block in re.findall(r"^```(?:sh|text)\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S):
+        for block in re.findall(
+            r"^```(?:sh|text)\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S
+        ):
             for line in block.replace("\\\n", " ").splitlines():
-                command = re.match(r"(?:\./with-fenicsx )?(?:mpirun -n \S+ )?remodel-fenicsx (.*)", line)
+                command = re.match(
+                    r"(?:\./with-fenicsx )?(?:mpirun -n \S+ )?remodel-fenicsx (.*)", line
+                )
                 if command is None or line.startswith("remodel-fenicsx: "):  # a message
                     continue
                 words = shlex.split(re.sub(r" > .*|  +#.*", "", command[1]))
@@ -121,9 +142,16 @@ def test_the_project_keeps_within_its_ceilings() -> None:
 
 def test_tables_and_pictures_of_pages_are_of_this_version() -> None:
     """By the stamps that their studies write (`docs/make NAME` makes them anew)."""
-    stamps = {path.name: json.loads(path.read_text())["made by"] for path in (ROOT / "docs/figures").glob("*.json")}
+    stamps = {
+        path.name: json.loads(path.read_text())["made by"]
+        for path in (ROOT / "docs/figures").glob("*.json")
+    }
     assert len(stamps) > 20
-    old = {name: stamp for name, stamp in stamps.items() if stamp.split()[-1] != remodel_fenicsx.__version__}
+    old = {
+        name: stamp
+        for name, stamp in stamps.items()
+        if stamp.split()[-1] != remodel_fenicsx.__version__
+    }
     assert not old
 
 
@@ -132,10 +160,21 @@ LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)[^)]*\)")
 
 def test_every_link_between_files_leads_to_one() -> None:
     """In the repository, as a reader of it follows them; those of the site: tests/house/test_site.py."""
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("demos/**/*.md"), *ROOT.glob("paper/*.md")]
-    links = [(path, link) for path in pages for link in LINK.findall(path.read_text(encoding="utf-8"))]
+    pages = [
+        *ROOT.glob("*.md"),
+        *(ROOT / "docs").glob("*.md"),
+        *ROOT.glob("demos/**/*.md"),
+        *ROOT.glob("paper/*.md"),
+    ]
+    links = [
+        (path, link) for path in pages for link in LINK.findall(path.read_text(encoding="utf-8"))
+    ]
     assert len(links) > 100
-    dead = [f"{path.relative_to(ROOT)}: {link}" for path, link in links if not (path.parent / link).exists()]
+    dead = [
+        f"{path.relative_to(ROOT)}: {link}"
+        for path, link in links
+        if not (path.parent / link).exists()
+    ]
     assert not dead
 
 
@@ -156,5 +195,7 @@ assert 1.1 < row["mean_stretch"] < 1.3 and row["time"] == 1.0, row
 
 def test_the_studies_of_the_verification_page_run(tmp_path: Path) -> None:
     """Short ones; the comparisons with the radial reference are tests of their own."""
-    done = forked("python", f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{STUDIES}", cwd=tmp_path)
+    done = forked(
+        "python", f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{STUDIES}", cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr[-2000:]

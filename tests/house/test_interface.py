@@ -12,7 +12,9 @@ from remodel_fenicsx import cli
 
 ROOT = Path(__file__).parents[2]
 PUBLIC = {"remodel_fenicsx", "remodel_fenicsx.parts", "remodel_fenicsx.extend"}
-EXTENSIONS = [str(path.relative_to(ROOT)) for path in sorted((ROOT / "demos" / "extensions").glob("*.py"))]
+EXTENSIONS = [
+    str(path.relative_to(ROOT)) for path in sorted((ROOT / "demos" / "extensions").glob("*.py"))
+]
 
 
 def imported(source: str) -> list[str]:
@@ -23,7 +25,9 @@ def imported(source: str) -> list[str]:
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-            modules = [name for name in names if name in PUBLIC]  # from remodel_fenicsx import parts
+            modules = [
+                name for name in names if name in PUBLIC
+            ]  # from remodel_fenicsx import parts
             found += modules or [str(node.module)]
     return [name for name in found if name.partition(".")[0] == "remodel_fenicsx"]
 
@@ -48,13 +52,24 @@ def test_a_demo_needs_one_import(name: str) -> None:
 )
 def test_what_users_are_shown_imports_public_names(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
-    sources = [text] if name.endswith(".py") else re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    sources = (
+        [text] if name.endswith(".py") else re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    )
     found = {module for source in sources for module in imported(source)}
     assert found and found <= PUBLIC
 
 
 def test_the_table_of_exit_codes_has_those_of_the_command() -> None:
-    rows = re.search(r"\| exit code \|.*?\n\n", (ROOT / "docs" / "commands.md").read_text(encoding="utf-8"), re.DOTALL)
+    rows = re.search(
+        r"\| exit code \|.*?\n\n",
+        (ROOT / "docs" / "commands.md").read_text(encoding="utf-8"),
+        re.DOTALL,
+    )
     assert rows is not None
-    codes = [int(code) for row in rows[0].splitlines()[2:] if row for code in row.split("|")[1].split(",")]
+    codes = [
+        int(code)
+        for row in rows[0].splitlines()[2:]
+        if row
+        for code in row.split("|")[1].split(",")
+    ]
     assert codes == list(cli.EXIT_CODES)

@@ -13,7 +13,10 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "remodel_fenicsx"
 HEART = [
-    *(PACKAGE / "evolution" / f"{name}.py" for name in ("stepper", "coupling", "time_steps", "homeostasis")),
+    *(
+        PACKAGE / "evolution" / f"{name}.py"
+        for name in ("stepper", "coupling", "time_steps", "homeostasis")
+    ),
     PACKAGE / "evolution" / "remodeling.py",
     *sorted((PACKAGE / "solver").glob("*.py")),
     PACKAGE / "state.py",
@@ -37,7 +40,12 @@ print(*(name for name in sys.modules if name.startswith("remodel_fenicsx.evoluti
 def test_the_heart_hardly_asks_for_a_feature() -> None:
     """Whole words, in code, docstrings and comments; none of them is an import."""
     asks = re.compile(r"\b(turnover|growth|cases)\b", flags=re.IGNORECASE)
-    lines = [line for file in HEART for line in file.read_text(encoding="utf-8").splitlines() if asks.search(line)]
+    lines = [
+        line
+        for file in HEART
+        for line in file.read_text(encoding="utf-8").splitlines()
+        if asks.search(line)
+    ]
     assert len(lines) <= MOST_QUESTIONS, "\n".join(lines)
     assert not [line for line in lines if re.match(r"\s*(from|import) ", line)]
 

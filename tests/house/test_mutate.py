@@ -46,7 +46,15 @@ def project(tmp_path: Path) -> Path:
 
 def mutate(project: Path, *arguments: str) -> tuple[int, str]:
     """Exit status and what it said."""
-    command = [sys.executable, str(MUTATE), "--project", str(project), "--table", str(project / "table"), *arguments]
+    command = [
+        sys.executable,
+        str(MUTATE),
+        "--project",
+        str(project),
+        "--table",
+        str(project / "table"),
+        *arguments,
+    ]
     # the project's tests are plain: pytest's plugins, which take longer than they do, stay away
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
@@ -55,7 +63,9 @@ def mutate(project: Path, *arguments: str) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(("change", "old", "new"), rows(__file__, "changes.txt"))
-def test_a_change_makes_of_a_function_what_it_says(tool: Any, tmp_path: Path, change: str, old: str, new: str) -> None:
+def test_a_change_makes_of_a_function_what_it_says(
+    tool: Any, tmp_path: Path, change: str, old: str, new: str
+) -> None:
     (tmp_path / "remodel_fenicsx").mkdir()
     lines = (text.replace("; ", "\n    ") for text in (old, new))
     before, after = (f"def f(x, y=()):\n    {text}\n" for text in lines)
@@ -89,6 +99,8 @@ def test_what_is_not_there_is_said_and_nothing_runs(project: Path, entry: str) -
 
 def test_the_table_fits_the_project() -> None:
     """Who takes away what a fault changes takes its entry away too."""
-    done = subprocess.run([sys.executable, str(MUTATE), "--list"], capture_output=True, text=True, timeout=200)
+    done = subprocess.run(
+        [sys.executable, str(MUTATE), "--list"], capture_output=True, text=True, timeout=200
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(done.stdout.splitlines()) >= 250

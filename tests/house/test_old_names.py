@@ -9,9 +9,21 @@ import pytest
 
 from remodel_fenicsx import Simulation, extend, preset_scene
 from remodel_fenicsx._renamed import OLD_NAMES
-from remodel_fenicsx.extend import CHAINS, LAWS, WATCHERS, Law, Parameter, Traits, WarnsOnce, WatcherKind, ranked
+from remodel_fenicsx.extend import (
+    CHAINS,
+    LAWS,
+    WATCHERS,
+    Law,
+    Parameter,
+    Traits,
+    WarnsOnce,
+    WatcherKind,
+    ranked,
+)
 
-CUBE = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"model.kinematics": "point", "time.end": 2.0})
+CUBE = preset_scene("kuhl-holzapfel-2007", "cube").with_values(
+    {"model.kinematics": "point", "time.end": 2.0}
+)
 
 
 def test_a_script_with_old_names_runs() -> None:
@@ -65,9 +77,15 @@ def test_each_new_name_is_there() -> None:
         "Shape": CUBE.geometry,
         "Material": CUBE.material,
     }
-    owners |= {name: getattr(extend, name) for name in OLD_NAMES if hasattr(extend, name) and name not in owners}
+    owners |= {
+        name: getattr(extend, name)
+        for name in OLD_NAMES
+        if hasattr(extend, name) and name not in owners
+    }
     for name in owners.keys() & OLD_NAMES.keys() - {"ranked"}:
         for new in OLD_NAMES[name].values():
-            fields = getattr(owners[name], "__annotations__", {}) | getattr(owners[name], "__dataclass_fields__", {})
+            fields = getattr(owners[name], "__annotations__", {}) | getattr(
+                owners[name], "__dataclass_fields__", {}
+            )
             assert hasattr(owners[name], new) or new in fields, (name, new)
     simulation.close()

@@ -24,14 +24,23 @@ def prose(text: str) -> str:
     """Without code, tables, formulas of their own and links, which cannot be broken."""
     text = re.sub(r"^ *```.*?^ *```$", "", text, flags=re.MULTILINE | re.DOTALL)
     return "\n".join(
-        "" if re.match(r" *\||    |.*\$\$|<!--|!\[", line) and not re.match(r" *(?:[-*]|\d+\.) ", line) else line
+        (
+            ""
+            if re.match(r" *\||    |.*\$\$|<!--|!\[", line)
+            and not re.match(r" *(?:[-*]|\d+\.) ", line)
+            else line
+        )
         for line in text.splitlines()
     )
 
 
 def long_lines(text: str) -> list[int]:
     """Their numbers of characters."""
-    return [len(line) for line in prose(text).splitlines() if len(line) > LINE and " " in line[:LINE].strip()]
+    return [
+        len(line)
+        for line in prose(text).splitlines()
+        if len(line) > LINE and " " in line[:LINE].strip()
+    ]
 
 
 def long_paragraphs(text: str) -> list[int]:
@@ -49,7 +58,9 @@ def test_lines_and_paragraphs_are_short(name: str) -> None:
 def test_words_are_spelled_right() -> None:
     """By codespell's list of common mistakes: ./with-fenicsx has it. CI's REQUIRE_BROWSER does without nothing."""
     if shutil.which("codespell") is None:
-        assert not os.environ.get("REQUIRE_BROWSER"), "no codespell (environment/debian-packages.txt)"
+        assert not os.environ.get(
+            "REQUIRE_BROWSER"
+        ), "no codespell (environment/debian-packages.txt)"
         pytest.skip("no codespell: apt-get install codespell, or pip install codespell")
     ignored = ["--ignore-words-list", "mater,fro,larg,mke"]
     files = [
@@ -57,6 +68,8 @@ def test_words_are_spelled_right() -> None:
         *(str(ROOT / room) for room in ("remodel_fenicsx", "demos", "docs", "benchmarks")),
     ]
     done = subprocess.run(
-        ["codespell", "--skip", "*.js,*.json,*.pyc,*.svg,*.csv,_site", *ignored, *files], capture_output=True, text=True
+        ["codespell", "--skip", "*.js,*.json,*.pyc,*.svg,*.csv,_site", *ignored, *files],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stdout[-3000:]

@@ -28,9 +28,16 @@ def test_citation_image_and_change_log_say_the_version() -> None:
     first, second, *_ = re.findall(r"^## (.*)$", changes, re.MULTILINE)
     newest = second if first == f"After {__version__}" else first
     assert newest in (__version__, f"{__version__} (unreleased)")
-    labels = dict(re.findall(r'org\.opencontainers\.image\.(\w+)="([^"]*)"', (ROOT / "Dockerfile").read_text()))
+    labels = dict(
+        re.findall(
+            r'org\.opencontainers\.image\.(\w+)="([^"]*)"', (ROOT / "Dockerfile").read_text()
+        )
+    )
     assert (
-        labels["version"] == __version__ and labels["licenses"] == "MIT" and labels["title"] and labels["description"]
+        labels["version"] == __version__
+        and labels["licenses"] == "MIT"
+        and labels["title"]
+        and labels["description"]
     )
 
 
@@ -51,12 +58,18 @@ def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> 
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    shutil.copytree(ROOT / "remodel_fenicsx", source / "remodel_fenicsx", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "remodel_fenicsx",
+        source / "remodel_fenicsx",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
 
     alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
     def call(*words: str | Path) -> str:
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=200, env=alone)
+        done = subprocess.run(
+            words, cwd=tmp_path, capture_output=True, text=True, timeout=200, env=alone
+        )
         assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-1000:]
         return done.stdout
 
@@ -76,7 +89,18 @@ def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> 
         assert {f"remodel_fenicsx/{name}" for name in needed} | {"LICENSE", "README.md"} <= names
     call(sys.executable, "-m", "venv", "--system-site-packages", tmp_path / "venv")
     call(tmp_path / "venv/bin/python", "-m", "pip", "install", "--no-index", "--no-deps", wheel)
-    (tmp_path / "cube.toml").write_text(call(tmp_path / "venv/bin/remodel-fenicsx", "new", PRESET, "--shape", "cube"))
-    call(tmp_path / "venv/bin/remodel-fenicsx", "run", "cube.toml", "-q", "--set", "time.end=1", "-o", "cube")
+    (tmp_path / "cube.toml").write_text(
+        call(tmp_path / "venv/bin/remodel-fenicsx", "new", PRESET, "--shape", "cube")
+    )
+    call(
+        tmp_path / "venv/bin/remodel-fenicsx",
+        "run",
+        "cube.toml",
+        "-q",
+        "--set",
+        "time.end=1",
+        "-o",
+        "cube",
+    )
     assert f"remodel_fenicsx {__version__}\n" in (tmp_path / "cube" / "scene.toml").read_text()
     assert (tmp_path / "cube" / "report.html").stat().st_size > 100_000

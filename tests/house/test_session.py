@@ -36,7 +36,9 @@ pytestmark = pytest.mark.timeout(1, func_only=True)
 def session(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run pytest with the plugin on a folder's tests."""
     command = [sys.executable, "-m", "pytest", *words_of(folder, *arguments)]
-    return subprocess.run(command, cwd=folder, env=environment_of(**variables), capture_output=True, text=True)
+    return subprocess.run(
+        command, cwd=folder, env=environment_of(**variables), capture_output=True, text=True
+    )
 
 
 def words_of(folder: Path, *arguments: str) -> list[str]:
@@ -47,15 +49,30 @@ def words_of(folder: Path, *arguments: str) -> list[str]:
 
 def environment_of(**variables: str) -> dict[str, str]:
     """This one, but for what belongs to this session, and without plugins that take longer than these tests do."""
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "REMODEL_"))}
-    return {**inherited, "PYTHONPATH": str(PROJECT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", **variables}
+    inherited = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTEST_", "REMODEL_"))
+    }
+    return {
+        **inherited,
+        "PYTHONPATH": str(PROJECT),
+        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+        **variables,
+    }
 
 
-@pytest.mark.parametrize("name, workers", [("mpirun", "0"), ("deaf", "1"), *slowly(("sleep", "1"), ("deaf", "0"))])
-def test_a_test_that_hangs_fails_and_the_others_go_on(name: str, workers: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name, workers", [("mpirun", "0"), ("deaf", "1"), *slowly(("sleep", "1"), ("deaf", "0"))]
+)
+def test_a_test_that_hangs_fails_and_the_others_go_on(
+    name: str, workers: str, tmp_path: Path
+) -> None:
     ranks = tmp_path / "ranks"
     ranks.mkdir()
-    before, argument = (RANKS.replace("FOLDER", str(ranks)), "ranks") if name == "mpirun" else ("", "")
+    before, argument = (
+        (RANKS.replace("FOLDER", str(ranks)), "ranks") if name == "mpirun" else ("", "")
+    )
     text = f"{before}\ndef test_hangs({argument}):\n    {HANGS[name]}\ndef test_after(): pass\n"
     (tmp_path / "test_it.py").write_text(text)
     done = session(tmp_path, "-n", workers, "--timeout=1", "-o", "timeout_grace=0.5", "test_it.py")
@@ -63,7 +80,11 @@ def test_a_test_that_hangs_fails_and_the_others_go_on(name: str, workers: str, t
     if name == "deaf":
         assert 'test_it.py", line 3 in test_hangs' in done.stderr
         # it can only be ended with its process: one of several is replaced
-        assert workers == "0" or "1 failed, 1 passed" in done.stdout and "crashed while running" in done.stdout
+        assert (
+            workers == "0"
+            or "1 failed, 1 passed" in done.stdout
+            and "crashed while running" in done.stdout
+        )
     else:
         assert "Timeout >1.0s" in done.stdout and "1 failed, 1 passed" in done.stdout
     pids = list(ranks.iterdir())

@@ -23,7 +23,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its folder."""
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [sys.executable, ROOT / "docs" / "build", "-o", folder], capture_output=True, text=True, timeout=300
+        [sys.executable, ROOT / "docs" / "build", "-o", folder],
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
@@ -42,13 +45,17 @@ BEST = {  # where a reader wants to be
 def browser() -> Iterator[Browser]:
     """One for all words."""
     if browser_path() is None and not os.environ.get("REQUIRE_BROWSER"):
-        pytest.skip("no browser (chromium-headless-shell) is here; WITH_FENICSX_ADD=browser brings one")
+        pytest.skip(
+            "no browser (chromium-headless-shell) is here; WITH_FENICSX_ADD=browser brings one"
+        )
     with Browser() as started:
         yield started
 
 
 @pytest.mark.parametrize("words, page", BEST.items())
-def test_the_first_that_the_search_shows_is_the_right_page(site: Path, browser: Browser, words: str, page: str) -> None:
+def test_the_first_that_the_search_shows_is_the_right_page(
+    site: Path, browser: Browser, words: str, page: str
+) -> None:
     """By the site's own script, in a browser, from the disk."""
     browser.open(site / "index.html", wait=False)
     browser.call("Page.navigate", url=f"{(site / 'search.html').as_uri()}?q={quote(words)}")
@@ -72,9 +79,17 @@ def test_every_public_name_has_its_place(site: Path) -> None:
     import remodel_fenicsx
     from remodel_fenicsx import extend, parts
 
-    text = "".join((site / f"{name}.html").read_text(encoding="utf-8") for name in ("api", "api_parts", "api_extend"))
+    text = "".join(
+        (site / f"{name}.html").read_text(encoding="utf-8")
+        for name in ("api", "api_parts", "api_extend")
+    )
     found = re.findall(r'id="remodel_fenicsx\.(?:parts\.|extend\.)?([\w.]+)"', text)
-    public = {name for module in (remodel_fenicsx, parts, extend) for name in module.__all__ if name[0] != "_"}
+    public = {
+        name
+        for module in (remodel_fenicsx, parts, extend)
+        for name in module.__all__
+        if name[0] != "_"
+    }
     wanted = public | {"Recording.history", "UnitCells.structure_tensor"}
     assert wanted <= set(found), wanted - set(found)
     assert len(found) == len(set(found)) and not [name for name in found if "model_config" in name]

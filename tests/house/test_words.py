@@ -41,9 +41,15 @@ def test_the_counts_are_below_their_ceilings(places: dict[str, list[str]]) -> No
 @pytest.mark.parametrize(
     ("code", "kind"),
     [
-        ("def f():\n    '''Of the picture.'''", "docstrings that begin with a preposition or conjunction"),
+        (
+            "def f():\n    '''Of the picture.'''",
+            "docstrings that begin with a preposition or conjunction",
+        ),
         ("def f():\n    '''What is made of the body.'''", "docstrings that begin with a pronoun"),
-        ("def f():\n    '''Whether the body is at one place.'''", "docstrings 'Whether ...' of functions"),
+        (
+            "def f():\n    '''Whether the body is at one place.'''",
+            "docstrings 'Whether ...' of functions",
+        ),
         ("def f():\n    '''Look.'''", "docstrings of three words or fewer"),
         ("found = 1", "results named found"),
         ("def f(found): pass", "results named found"),
@@ -56,7 +62,9 @@ def test_the_counts_are_below_their_ceilings(places: dict[str, list[str]]) -> No
         ("# cells at rest", "banned terms in comments"),
     ],
 )
-def test_each_kind_is_noticed(code: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_kind_is_noticed(
+    code: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file, places = tmp_path / "module.py", defaultdict(list)
     file.write_text(code)
     read = WORDS["read_module"]

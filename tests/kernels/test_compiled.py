@@ -52,7 +52,9 @@ def test_close_values_are_told_apart_as_far_as_their_distance_allows(kernels: Po
     rng = np.random.default_rng(5)
     axes, gap = random_axes(rng), np.geomspace(3e-8, 1e-1, COUNT)
     values = np.stack([1 + gap, np.ones(COUNT), -np.ones(COUNT)], axis=1)
-    found, found_axes = kernels.principal(np.swapaxes(axes, 1, 2) @ (values[:, :, None] * axes), axes)
+    found, found_axes = kernels.principal(
+        np.swapaxes(axes, 1, 2) @ (values[:, :, None] * axes), axes
+    )
     np.testing.assert_allclose(found, values, rtol=0, atol=2e-15)
     assert np.max(np.abs(found_axes - axes) * gap[:, None, None]) < 2e-15
     np.testing.assert_allclose(
@@ -78,13 +80,21 @@ def test_noise_across_the_axes(kernels: PointKernels) -> None:
     for limit in (0.0, 1e-2, 0.5, rng.random(COUNT)):
         for given in (axes, near):
             wanted = spectral.drop_noise_shear(steady, given, limit)
-            np.testing.assert_allclose(kernels.drop_noise_shear(steady, given, limit), wanted, rtol=0, atol=1e-14)
+            np.testing.assert_allclose(
+                kernels.drop_noise_shear(steady, given, limit), wanted, rtol=0, atol=1e-14
+            )
 
 
 def test_the_positive_direction(kernels: PointKernels) -> None:
     rng = np.random.default_rng(9)
     values = rng.normal(size=(COUNT, 3)) * 10.0 ** rng.integers(-200, 200, (COUNT, 1))
-    values[:5] = [[0.0] * 3, [-1.0, -2.0, -3.0], [1.0, 1e-15, -1.0], [1.0, 1e-13, -1.0], [2.0, 0.5, 0.4]]
+    values[:5] = [
+        [0.0] * 3,
+        [-1.0, -2.0, -3.0],
+        [1.0, 1e-15, -1.0],
+        [1.0, 1e-13, -1.0],
+        [2.0, 0.5, 0.4],
+    ]
     for limit in (0.0, 0.5, rng.random(COUNT)):
         wanted, active = spectral.positive_direction(values, limit)
         found, found_active = kernels.positive_direction(values, limit)
@@ -92,13 +102,17 @@ def test_the_positive_direction(kernels: PointKernels) -> None:
         np.testing.assert_array_equal(found_active, active)
         assert 0 < active.sum() < COUNT
     for bad in (np.nan, np.inf):
-        with pytest.raises(FloatingPointError, match=f"set of principal values 7 of {COUNT} is not finite"):
+        with pytest.raises(
+            FloatingPointError, match=f"set of principal values 7 of {COUNT} is not finite"
+        ):
             kernels.positive_direction(np.where(np.arange(COUNT)[:, None] == 7, bad, values))
 
 
 def test_length_and_structure(kernels: PointKernels) -> None:
     rng = np.random.default_rng(7)
-    F, cell = np.eye(3) + 0.2 * rng.normal(size=(COUNT, 3, 3)), UnitCell(rng.random((COUNT, 3)), random_axes(rng))
+    F, cell = np.eye(3) + 0.2 * rng.normal(size=(COUNT, 3, 3)), UnitCell(
+        rng.random((COUNT, 3)), random_axes(rng)
+    )
     expected = energy.squared_end_to_end_length(F, [cell])
     np.testing.assert_allclose(kernels.squared_length(F, cell), expected, rtol=1e-14)
     wanted = structure_tensor(*cell[:2])
@@ -112,7 +126,9 @@ EDGES = np.array([0.0, 0.5, 0.9, 0.99, 1 - 1e-6, 1 + 1e-6, 1.005, 1.02, 1.1, 1.5
 
 @pytest.mark.parametrize("limited_by", ["tolerance", "threshold"])
 @pytest.mark.parametrize("pair", [0, 1])
-def test_values_that_just_agree_or_just_do_not(kernels: PointKernels, limited_by: str, pair: int) -> None:
+def test_values_that_just_agree_or_just_do_not(
+    kernels: PointKernels, limited_by: str, pair: int
+) -> None:
     """Diagonal tensors, whose values have no rounding, with previous axes a quarter of a turn off in the plane."""
     limit = 3e-8 if limited_by == "tolerance" else 1e-3  # of a largest value of 3
     values = np.tile([3.0, 2.0, 1.0], (len(EDGES), 1))
@@ -138,7 +154,9 @@ def test_signs_that_just_decide_or_just_do_not(kernels: PointKernels) -> None:
     previous[:, 0] = np.stack([-cosine, np.sqrt(1 - cosine**2), np.zeros_like(cosine)], axis=1)
     previous[:, 1] = [0.6, 0.8, 0.0]
     tensors = np.tile(np.diag([3.0, 2.0, 1.0]), (len(EDGES), 1, 1))
-    expected, found = (principal(tensors, previous)[1] for principal in (spectral.principal, kernels.principal))
+    expected, found = (
+        principal(tensors, previous)[1] for principal in (spectral.principal, kernels.principal)
+    )
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(found[:, 0, 0], np.where(EDGES > 1, -1.0, 1.0))
 
@@ -149,7 +167,9 @@ def test_tension_that_is_just_more_than_noise(kernels: PointKernels, size: float
     near = np.concatenate([EDGES, [1.0]])
     for limit, largest in ((0.25 * size, size), (spectral.ROUNDING * size, size)):
         threshold = limit if limit > 1e-3 * size else 0.0
-        values = np.stack([near * limit, np.full(len(near), -largest), np.full(len(near), -largest)], axis=1)
+        values = np.stack(
+            [near * limit, np.full(len(near), -largest), np.full(len(near), -largest)], axis=1
+        )
         expected, active = spectral.positive_direction(values, threshold)
         found, found_active = kernels.positive_direction(values, threshold)
         np.testing.assert_array_equal(found_active, active)
@@ -166,4 +186,6 @@ def test_what_is_just_across_the_axes(kernels: PointKernels, plane: tuple[int, i
     axes = np.tile(np.eye(3), (len(near), 1, 1))
     found = kernels.drop_noise_shear(tensors, axes, noise)
     np.testing.assert_array_equal(found, spectral.drop_noise_shear(tensors, axes, noise))
-    np.testing.assert_array_equal(found[:, plane[0], plane[1]], np.where(near > 1, -near * noise, 0.0))
+    np.testing.assert_array_equal(
+        found[:, plane[0], plane[1]], np.where(near > 1, -near * noise, 0.0)
+    )

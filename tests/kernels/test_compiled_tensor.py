@@ -48,8 +48,14 @@ def test_the_target(kernels: TensorKernels, driver: str, frame: str) -> None:
     tensors = tensors + np.swapaxes(tensors, 1, 2)
     tensors[:4] = np.array([0.0, -1.0, 3e-11, 1e200])[:, None, None] * np.eye(3)
     F = deformations(40, rng)
-    drive = Drive(F, tensors, DRIVERS[driver], FRAMES[frame], 1e-14, np.zeros((40, 3)), np.ones(40), 0.025)
-    for threshold, rounding in ((1e-14, 1e-14), (rng.uniform(0, 0.3, 40), 1e-14), (0.0, rng.uniform(0, 1e-4, 40))):
+    drive = Drive(
+        F, tensors, DRIVERS[driver], FRAMES[frame], 1e-14, np.zeros((40, 3)), np.ones(40), 0.025
+    )
+    for threshold, rounding in (
+        (1e-14, 1e-14),
+        (rng.uniform(0, 0.3, 40), 1e-14),
+        (0.0, rng.uniform(0, 1e-4, 40)),
+    ):
         asked = drive._replace(noise=threshold, rounding=rounding)
         expected, found = tensor_target(asked), kernels.target(asked)
         np.testing.assert_allclose(found.direction, expected.direction, atol=1e-12)

@@ -35,7 +35,9 @@ def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
     """All that the compiler sees when it optimises, which is all with -O2."""
     asked = "-O2 -Wall -Wextra -Werror -c -x c - -o".split()
     command = [*CC, *jit.LIBRARY_FLAGS, *asked, tmp_path / "object"]
-    done = subprocess.run(command, input=kernels.source(name, NUMBERS[name]), capture_output=True, text=True)
+    done = subprocess.run(
+        command, input=kernels.source(name, NUMBERS[name]), capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert not {"-w", "-Wno-all"} & set(jit.LIBRARY_FLAGS)
 
@@ -54,18 +56,24 @@ sys.exit(pytest.main(["-q", "-s", "-p", "no:cacheprovider", "-x", *files]))
 def test_memory_and_arithmetic_under_the_sanitizers() -> None:
     """What is held against numpy once more, with C that ends the process where it leaves an array, or the standard."""
     asked = [[*CC, f"-print-file-name=lib{name}.so"] for name in ("asan", "ubsan")]
-    found = [subprocess.run(command, capture_output=True, text=True).stdout.strip() for command in asked]
+    found = [
+        subprocess.run(command, capture_output=True, text=True).stdout.strip() for command in asked
+    ]
     if not all(map(os.path.isabs, found)):
         pytest.skip(f"{CC[0]} has no address and undefined-behaviour sanitizers")
     # what Python and its libraries keep to their end is no leak of ours
     own = {"LD_PRELOAD": " ".join(found), "ASAN_OPTIONS": "detect_leaks=0", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", SANITIZED]
-    done = subprocess.run(command, cwd=ROOT, env=os.environ | own, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | own, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
     assert re.search(r"\d\d passed", done.stdout)
 
 
-def test_a_change_of_any_file_or_number_is_another_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_of_any_file_or_number_is_another_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By its text it is found in the cache."""
     before = kernels.source("tensor.c", kernels.NUMBERS)
     assert kernels.source("tensor.c", kernels.NUMBERS) == before

@@ -23,7 +23,9 @@ PROJECT = Path(__file__).resolve().parents[2]
 LONG = 200  # seconds, for what takes a few on an idle machine
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
-MAPPED = [] if os.getuid() == 0 else ["--user", "--map-root-user"]  # of unshare(1), for a namespace to mount in
+MAPPED = (
+    [] if os.getuid() == 0 else ["--user", "--map-root-user"]
+)  # of unshare(1), for a namespace to mount in
 STAND_INS = Path(__file__).parent / "stand_ins"  # for programs that reach the network or mount
 
 
@@ -61,7 +63,10 @@ class Clone:
         stubs.mkdir()
         shutil.copy(STAND_INS / "mmdebstrap", stubs)
         script(stubs / "newuidmap", "#!/bin/sh\nexit 1\n")
-        script(stubs / "apt-get", '#!/bin/sh\necho "$*" >> "$RECORD/apt-get"; echo "E: no network" >&2; exit 100\n')
+        script(
+            stubs / "apt-get",
+            '#!/bin/sh\necho "$*" >> "$RECORD/apt-get"; echo "E: no network" >&2; exit 100\n',
+        )
         for engine in ("docker", "podman"):
             shutil.copy(STAND_INS / "engine", stubs / engine)
         if not shutil.which("mount", path=SYSTEM_PATH):
@@ -80,9 +85,15 @@ class Clone:
     def start(self, *command: str, **options):
         environment = self.environment | options.pop("environment", {})
         environment = {name: value for name, value in environment.items() if value is not None}
-        options = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
+        options = {
+            "stdin": subprocess.DEVNULL,
+            "stdout": subprocess.PIPE,
+            "stderr": subprocess.PIPE,
+        } | options
         words = [options.pop("launcher", self.launcher), *command]
-        return subprocess.Popen(words, env=environment, text=True, start_new_session=True, **options)
+        return subprocess.Popen(
+            words, env=environment, text=True, start_new_session=True, **options
+        )
 
     def run(self, *command: str, send: str | None = None, **options):
         if send is not None:
@@ -103,10 +114,16 @@ class Clone:
 
     def builds(self) -> list[list[str]]:
         record = self.record / "mmdebstrap"
-        return [call.split("\n") for call in record.read_text().split("\n----\n")[:-1]] if record.exists() else []
+        return (
+            [call.split("\n") for call in record.read_text().split("\n----\n")[:-1]]
+            if record.exists()
+            else []
+        )
 
     def roots(self) -> list[str]:
-        return sorted(path.name for path in (self.cache / "remodel-fenicsx").iterdir() if path.is_dir())
+        return sorted(
+            path.name for path in (self.cache / "remodel-fenicsx").iterdir() if path.is_dir()
+        )
 
     def engine_calls(self) -> list[list[str]]:
         return [json.loads(line) for line in (self.record / "engine").read_text().splitlines()]
@@ -128,8 +145,20 @@ def one_line(result, words: str) -> None:
 
 
 def namespaces_work(clone: Clone) -> bool:
-    words = ["unshare", *MAPPED, "--mount", "--propagation", "private", "mount", "--bind", "/usr", "/usr"]
-    tried = shutil.which("unshare") and subprocess.run(words, env=clone.environment, capture_output=True)
+    words = [
+        "unshare",
+        *MAPPED,
+        "--mount",
+        "--propagation",
+        "private",
+        "mount",
+        "--bind",
+        "/usr",
+        "/usr",
+    ]
+    tried = shutil.which("unshare") and subprocess.run(
+        words, env=clone.environment, capture_output=True
+    )
     return bool(tried) and tried.returncode == 0
 
 
@@ -172,7 +201,9 @@ def test_arguments_and_standard_input(ready):
 
 @pytest.mark.parametrize("where", ["/var/tmp", "/dev/shm", "/tmp"])
 def test_working_folder_and_owner(ready, where):
-    folder = Path(subprocess.check_output(["mktemp", "-d", f"{where}/with fenicsx.XXXXXX"], text=True).strip())
+    folder = Path(
+        subprocess.check_output(["mktemp", "-d", f"{where}/with fenicsx.XXXXXX"], text=True).strip()
+    )
     try:
         result = ready.run("sh", "-c", "pwd; echo data > file", cwd=folder)
         assert (result.returncode, result.stdout.strip()) == (0, str(folder))
@@ -191,7 +222,9 @@ def test_through_a_link_from_elsewhere(ready, tmp_path):
 
 def test_process_is_the_command_and_gets_its_signals(ready):
     for number in (signal.SIGINT, signal.SIGTERM):
-        process = ready.start("python3", "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(60)")
+        process = ready.start(
+            "python3", "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+        )
         assert int(process.stdout.readline()) == process.pid
         os.killpg(process.pid, number)
         process.communicate(timeout=LONG)
@@ -224,19 +257,32 @@ def test_another_python_does_not_reach_in(ready):
 
 def test_ranks_must_start_inside(ready):
     for name in ("OMPI_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS"):
-        one_line(ready.run("true", environment={name: "2"}), "must start inside: ./with-fenicsx mpirun -n 2 true\n")
-    assert ready.run("true", environment={"SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "1"}).returncode == 0
+        one_line(
+            ready.run("true", environment={name: "2"}),
+            "must start inside: ./with-fenicsx mpirun -n 2 true\n",
+        )
+    assert (
+        ready.run("true", environment={"SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "1"}).returncode
+        == 0
+    )
 
 
 # ---------------------------------------------------------------- making the root
 def test_made_once_from_the_list(rooted):
     first = rooted.run("cat", send="made\n")
     assert (first.returncode, first.stdout) == (0, "made\n")
-    assert "making a Debian trixie environment" in first.stderr and "downloading packages" in first.stderr
+    assert (
+        "making a Debian trixie environment" in first.stderr
+        and "downloading packages" in first.stderr
+    )
     second = rooted.run("echo", "again")
     assert (second.returncode, second.stdout, second.stderr) == (0, "again\n", "")
     (arguments,) = rooted.builds()
-    (included,) = [argument.removeprefix("--include=") for argument in arguments if argument.startswith("--include=")]
+    (included,) = [
+        argument.removeprefix("--include=")
+        for argument in arguments
+        if argument.startswith("--include=")
+    ]
     lines = [line.split("#")[0].strip() for line in rooted.packages.read_text().splitlines()]
     assert included.split(",") == [line for line in lines if line]
     assert "trixie" in arguments
@@ -257,7 +303,10 @@ def test_a_new_environment_compiles_what_the_demos_need(with_demos):
     assert with_demos.run("echo", "done").stdout == "done\n"
     assert with_demos.run("true").stderr == ""
     first, second = (with_demos.record / "demos").read_text().splitlines()
-    assert first.startswith(f"run {with_demos.folder}/demos/one.toml --no-report ") and "two.toml" in second
+    assert (
+        first.startswith(f"run {with_demos.folder}/demos/one.toml --no-report ")
+        and "two.toml" in second
+    )
     folder = Path(first.split(" -o ")[1]).parent
     assert not folder.exists() and not folder.is_relative_to(with_demos.folder)
 
@@ -291,7 +340,10 @@ def test_two_clones_at_once_make_one(rooted, tmp_path):
     other = Clone(tmp_path / "other", cache=rooted.cache)
     first = rooted.building("held")
     second = other.start("echo", "second")
-    assert second.stderr.readline() == "with-fenicsx: another run is making the environment: waiting for it\n"
+    assert (
+        second.stderr.readline()
+        == "with-fenicsx: another run is making the environment: waiting for it\n"
+    )
     (rooted.record / "go").touch()
     assert second.communicate(timeout=LONG)[0] == "second\n"
     assert second.returncode == 0
@@ -299,7 +351,9 @@ def test_two_clones_at_once_make_one(rooted, tmp_path):
     assert (len(rooted.builds()), len(other.builds())) == (1, 0)
 
 
-@pytest.mark.parametrize("number, group", [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, False)])
+@pytest.mark.parametrize(
+    "number, group", [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, False)]
+)
 def test_build_ends_with_the_launcher(rooted, number, group):
     process = rooted.building("hang")
     (os.killpg if group else os.kill)(process.pid, number)
@@ -332,7 +386,10 @@ def killed_build(rooted, environment: dict[str, str]) -> Path:
     process.wait()
     rooted.kill_builder()
     (lock,) = (rooted.cache / "remodel-fenicsx").glob("*.lock")
-    wait_for(lambda: subprocess.run(["flock", "-n", lock, "true"]).returncode == 0, "the end of all that held the lock")
+    wait_for(
+        lambda: subprocess.run(["flock", "-n", lock, "true"]).returncode == 0,
+        "the end of all that held the lock",
+    )
     (left,) = Path(environment["TMPDIR"]).glob("remodel-fenicsx-build-*")
     assert list(left.glob("*/half"))
     # as owned by a mapped user: rm alone does not get rid of it
@@ -414,7 +471,9 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
         rooted.packages.write_text(f"{original}package-{number}\n")
         assert rooted.run("true").returncode == 0
         keys += [name for name in rooted.roots() if name not in [used, *keys]]
-    assert rooted.roots() == sorted([used, *keys[1:]])  # four were made; the oldest is old, but in use
+    assert rooted.roots() == sorted(
+        [used, *keys[1:]]
+    )  # four were made; the oldest is old, but in use
     busy.communicate("\n")
     assert busy.returncode == 0
     rooted.packages.write_text(f"{original}package-4\n")
@@ -427,13 +486,22 @@ def test_older_roots_are_pruned_unless_in_use(rooted):
     "environment, words",
     [
         ({"XDG_CACHE_HOME": "some/where"}, "XDG_CACHE_HOME=some/where: must be an absolute path"),
-        ({"XDG_CACHE_HOME": "/dev/null"}, "cannot write to /dev/null/remodel-fenicsx: set XDG_CACHE_HOME"),
-        ({"XDG_CACHE_HOME": None, "HOME": "/dev/null"}, "cannot write to /dev/null/.cache/remodel-fenicsx"),
+        (
+            {"XDG_CACHE_HOME": "/dev/null"},
+            "cannot write to /dev/null/remodel-fenicsx: set XDG_CACHE_HOME",
+        ),
+        (
+            {"XDG_CACHE_HOME": None, "HOME": "/dev/null"},
+            "cannot write to /dev/null/.cache/remodel-fenicsx",
+        ),
         ({"WITH_FENICSX": "magic"}, "WITH_FENICSX=magic: allowed are native, root and container"),
         ({"WITH_FENICSX_SUITE": "sid"}, "WITH_FENICSX_SUITE=sid: allowed are trixie and unstable"),
         ({"WITH_FENICSX_ADD": "window"}, "WITH_FENICSX_ADD=window: allowed is browser"),
         ({"WITH_FENICSX_ADD": "../x"}, "WITH_FENICSX_ADD=../x: allowed is browser"),
-        ({"WITH_FENICSX": "container"}, "WITH_FENICSX=container: neither docker nor podman can start a container"),
+        (
+            {"WITH_FENICSX": "container"},
+            "WITH_FENICSX=container: neither docker nor podman can start a container",
+        ),
     ],
 )
 def test_one_line_and_exit_5(rooted, environment, words):
@@ -456,12 +524,19 @@ def test_no_namespaces(clone, way):
 ])  # fmt: skip
 def test_native_version(clone, tmp_path, version, suite, usable):
     for name in "dolfinx mpi4py petsc4py gmsh pydantic pint tomlkit h5py rich scipy meshio".split():
-        script(tmp_path / "site" / name / "__init__.py", "raise SystemExit('the launcher must not import this')")
+        script(
+            tmp_path / "site" / name / "__init__.py",
+            "raise SystemExit('the launcher must not import this')",
+        )
     script(
         tmp_path / "site" / f"fenics_dolfinx-{version}.dist-info" / "METADATA",
         f"Metadata-Version: 2.1\nName: fenics-dolfinx\nVersion: {version}\n",
     )
-    environment = {"WITH_FENICSX": "native", "PYTHONPATH": str(tmp_path / "site"), "WITH_FENICSX_SUITE": suite}
+    environment = {
+        "WITH_FENICSX": "native",
+        "PYTHONPATH": str(tmp_path / "site"),
+        "WITH_FENICSX_SUITE": suite,
+    }
     result = clone.run("sh", "-c", 'echo "$PYTHONPATH"; exit 7', environment=environment)
     assert result.returncode == (7 if usable else 5)
     assert result.stdout == (f"{clone.folder}:{tmp_path / 'site'}\n" if usable else "")
@@ -469,30 +544,50 @@ def test_native_version(clone, tmp_path, version, suite, usable):
 
 def test_inside_an_environment_it_is_native():
     """This very test runs where dolfinx is: the launcher must take it as it is, silently."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("WITH_FENICSX")}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("WITH_FENICSX")
+    }
     result = subprocess.run(
-        [PROJECT / "with-fenicsx", "-v", "sh", "-c", "echo inside"], env=environment, capture_output=True, text=True
+        [PROJECT / "with-fenicsx", "-v", "sh", "-c", "echo inside"],
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     assert (result.returncode, result.stdout) == (0, "inside\n")
-    assert result.stderr == f"with-fenicsx: running in this machine's own Python ({shutil.which('python3')})\n"
+    assert (
+        result.stderr
+        == f"with-fenicsx: running in this machine's own Python ({shutil.which('python3')})\n"
+    )
 
 
 # ---------------------------------------------------------------- a container engine
 def test_container(clone, tmp_path):
-    environment = {"WITH_FENICSX": "container", "STUB_ENGINE": "able", "KEPT": "yes", "LD_LIBRARY_PATH": "/x"}
+    environment = {
+        "WITH_FENICSX": "container",
+        "STUB_ENGINE": "able",
+        "KEPT": "yes",
+        "LD_LIBRARY_PATH": "/x",
+    }
     assert clone.run("some", "a b", cwd=tmp_path, environment=environment).returncode == 0
     calls = clone.engine_calls()
-    assert [call[:2] for call in calls] == [["docker", word] for word in ("image", "run", "build", "run")]
+    assert [call[:2] for call in calls] == [
+        ["docker", word] for word in ("image", "run", "build", "run")
+    ]
     build, run = calls[2], calls[3]
     assert build[build.index("--target") + 1] == "environment" and build[-1] == str(clone.folder)
     image = build[build.index("-t") + 1]
     assert run[-3:] == [image, "some", "a b"]
     pairs = list(zip(run, run[1:]))
-    assert ("--user", f"{os.getuid()}:{os.getgid()}") in pairs and ("--workdir", str(tmp_path)) in pairs
+    assert ("--user", f"{os.getuid()}:{os.getgid()}") in pairs and (
+        "--workdir",
+        str(tmp_path),
+    ) in pairs
     for folder in (tmp_path, clone.folder, clone.environment["HOME"]):
         assert ("--volume", f"{folder}:{folder}") in pairs
     assert ("--env", "KEPT") in pairs and ("--env", "LD_LIBRARY_PATH") not in pairs
 
 
 def test_a_temporary_folder_that_is_none_is_said(ready):
-    one_line(ready.run("true", environment={"TMPDIR": "/etc/passwd"}), "TMPDIR=/etc/passwd: is no folder")
+    one_line(
+        ready.run("true", environment={"TMPDIR": "/etc/passwd"}), "TMPDIR=/etc/passwd: is no folder"
+    )

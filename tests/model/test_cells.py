@@ -48,13 +48,16 @@ def test_random_cells_are_the_seeds() -> None:
 def test_antithetic_seeds_are_isotropic_in_threes_and_as_random_each() -> None:
     """1 to 3 and 4 to 6: A of the mean is r0^2/3 I in every element; two threes are strangers."""
     found = [
-        Cells(initial="random", seed=s, antithetic=True, end_to_end_length=R0).dimensions(2000) for s in range(1, 7)
+        Cells(initial="random", seed=s, antithetic=True, end_to_end_length=R0).dimensions(2000)
+        for s in range(1, 7)
     ]
     for three in (found[:3], found[3:]):
         np.testing.assert_allclose(np.square(three).mean(axis=0), R0**2 / 3, rtol=1e-12)
     alone = Cells(initial="random", seed=1, end_to_end_length=R0).dimensions(2000)
     for one in found:
-        np.testing.assert_allclose(np.square(one).mean(axis=0), np.square(alone).mean(axis=0), atol=0.03 * R0**2)
+        np.testing.assert_allclose(
+            np.square(one).mean(axis=0), np.square(alone).mean(axis=0), atol=0.03 * R0**2
+        )
     assert abs(np.corrcoef(found[0][:, 0], found[3][:, 0])[0, 1]) < 0.1
 
 
@@ -73,7 +76,9 @@ def test_cylindrical_axes_are_circumferential_axial_and_radial() -> None:
     x, y, z = np.eye(3)
     np.testing.assert_allclose(axes, [[y, z, x], [-x, z, y]], atol=1e-15)
     anywhere = cylindrical_axes(places())
-    np.testing.assert_allclose(anywhere @ np.swapaxes(anywhere, 1, 2), np.tile(np.eye(3), (40, 1, 1)), atol=1e-14)
+    np.testing.assert_allclose(
+        anywhere @ np.swapaxes(anywhere, 1, 2), np.tile(np.eye(3), (40, 1, 1)), atol=1e-14
+    )
     outwards = np.sum(anywhere[:, 2] * places(), axis=1)
     np.testing.assert_allclose(outwards, np.hypot(places()[:, 0], places()[:, 1]), rtol=1e-14)
     np.testing.assert_array_equal(global_axes(places()), np.tile(np.eye(3), (40, 1, 1)))
@@ -91,7 +96,10 @@ def test_structure_tensor_is_the_sum_of_the_dyads() -> None:
 def test_pitch_is_0_around_the_tube_and_90_along_it(pitch: float) -> None:
     """The same helix as one chain direction, and as a cell with dimensions around and along; radial chains are not."""
     at, (along, around) = places(), (np.sin(np.radians(pitch)), np.cos(np.radians(pitch)))
-    circumferential = np.stack([-at[:, 1], at[:, 0], 0 * at[:, 0]], axis=1) / np.hypot(at[:, 0], at[:, 1])[:, None]
+    circumferential = (
+        np.stack([-at[:, 1], at[:, 0], 0 * at[:, 0]], axis=1)
+        / np.hypot(at[:, 0], at[:, 1])[:, None]
+    )
     helix = around * circumferential + along * np.array([0.0, 0.0, 1.0])
     across = np.cross(helix, circumferential + [0.0, 0.0, 2.0])
     axes = np.stack([helix, across, across], axis=1)
@@ -99,7 +107,9 @@ def test_pitch_is_0_around_the_tube_and_90_along_it(pitch: float) -> None:
         pitch_angle(np.tile([R0, 0.0, 0.0], (40, 1)), axes, cylindrical_axes(at)), pitch, atol=1e-6
     )
     cell = np.tile([R0 * around, R0 * along, 0.7], (40, 1))
-    np.testing.assert_allclose(pitch_angle(cell, cylindrical_axes(at), cylindrical_axes(at)), pitch, atol=1e-6)
+    np.testing.assert_allclose(
+        pitch_angle(cell, cylindrical_axes(at), cylindrical_axes(at)), pitch, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 30.0, 90.0])
@@ -113,7 +123,9 @@ def test_angle_to_an_axis_is_that_of_the_chain(angle: float) -> None:
 def random_cells(count: int) -> UnitCell:
     """Any dimensions, any axes."""
     rng = np.random.default_rng(7)
-    return UnitCell(rng.uniform(0.05, 2.0, (count, 3)), np.linalg.qr(rng.normal(size=(count, 3, 3)))[0])
+    return UnitCell(
+        rng.uniform(0.05, 2.0, (count, 3)), np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    )
 
 
 def test_it_is_that_of_bures() -> None:
@@ -121,10 +133,21 @@ def test_it_is_that_of_bures() -> None:
     first = random_cells(50)
     size = np.linspace(0.1, 3.0, 50)
     about = np.random.default_rng(3).normal(size=(50, 3))
-    turns = Rotation.from_rotvec(np.radians(size)[:, None] * about / np.linalg.norm(about, axis=1)[:, None]).as_matrix()
-    second = UnitCell(first.dimensions * (1 + np.radians(size))[:, None] ** [1, -1, 2], first.axes @ turns)
-    roots = [np.swapaxes(axes, 1, 2) @ (lengths[:, :, None] * axes) for lengths, axes, _ in (first, second)]
+    turns = Rotation.from_rotvec(
+        np.radians(size)[:, None] * about / np.linalg.norm(about, axis=1)[:, None]
+    ).as_matrix()
+    second = UnitCell(
+        first.dimensions * (1 + np.radians(size))[:, None] ** [1, -1, 2], first.axes @ turns
+    )
+    roots = [
+        np.swapaxes(axes, 1, 2) @ (lengths[:, :, None] * axes)
+        for lengths, axes, _ in (first, second)
+    ]
     sizes = [np.linalg.norm(lengths, axis=1) for lengths, _, _ in (first, second)]
-    cosine = np.linalg.svd(roots[0] @ roots[1], compute_uv=False).sum(axis=1) / (sizes[0] * sizes[1])
-    np.testing.assert_allclose(angle_between(first, second), np.degrees(np.arccos(cosine)), rtol=0.03)
+    cosine = np.linalg.svd(roots[0] @ roots[1], compute_uv=False).sum(axis=1) / (
+        sizes[0] * sizes[1]
+    )
+    np.testing.assert_allclose(
+        angle_between(first, second), np.degrees(np.arccos(cosine)), rtol=0.03
+    )
     np.testing.assert_allclose(angle_between(first, first), 0.0, atol=1e-12)

@@ -29,7 +29,12 @@ POWER = 2.0**-30  # about metres
 BASES: dict[str, dict[str, Any]] = {
     "point": {"model.kinematics": "point", "time.end": 12.0, "time.step": 2.0},
     "random": {"mesh.refinement": 2, "cells.initial": "random", "time.end": 6.0, "time.step": 2.0},
-    "radial": {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 30.0, "time.step": 5.0},
+    "radial": {
+        "model.kinematics": "radial",
+        "cells.initial": "isotropic",
+        "time.end": 30.0,
+        "time.step": 5.0,
+    },
 }
 CASES = {
     name: (preset, shape, BASES[base] | values_of(changes))
@@ -48,7 +53,9 @@ class Run(NamedTuple):
 
 def scene_in(unit: float, preset: str, shape: str, changes: dict[str, Any]) -> Scene:
     """Of a case, with lengths of chains in another unit; one nm is `unit` of it."""
-    scene = preset_scene(preset, shape).with_values({"output.columns": ["pass_residual"], **changes})
+    scene = preset_scene(preset, shape).with_values(
+        {"output.columns": ["pass_residual"], **changes}
+    )
     lengths = {
         "material.contour_length": scene.material.contour_length,
         "material.persistence_length": scene.material.persistence_length,
@@ -63,10 +70,18 @@ def run(name: str, unit: float, caplog: pytest.LogCaptureFixture) -> Run:
         simulation = Simulation(scene_in(unit, *CASES[name]), MPI.COMM_SELF)
         steps = list(simulation.steps())
     said = [r.getMessage() for r in caplog.records if "compil" not in r.getMessage()]
-    rows = {column: np.array([step.row[column] for step in steps], dtype=float) for column in steps[0].row}
+    rows = {
+        column: np.array([step.row[column] for step in steps], dtype=float)
+        for column in steps[0].row
+    }
     rows["pass_residual"] = rows["pass_residual"] / unit**2
     del rows["seconds"]
-    return Run(rows, [step.work.newton_iterations for step in steps], said, simulation.cells.dimension_values / unit)
+    return Run(
+        rows,
+        [step.work.newton_iterations for step in steps],
+        said,
+        simulation.cells.dimension_values / unit,
+    )
 
 
 IN_NANOMETRES: dict[str, Run] = {}  # runs of the cases as they are, each made once
@@ -75,11 +90,18 @@ IN_NANOMETRES: dict[str, Run] = {}  # runs of the cases as they are, each made o
 def assert_same(found: Run, expected: Run, digits: float) -> None:
     assert found.iterations == expected.iterations
     assert found.said == expected.said
-    np.testing.assert_allclose(found.lengths, expected.lengths, rtol=0, atol=digits * expected.lengths.max())
+    np.testing.assert_allclose(
+        found.lengths, expected.lengths, rtol=0, atol=digits * expected.lengths.max()
+    )
     for column, values in expected.rows.items():
-        if values.size > 1 or column not in ("remodeling_power", "pass_residual"):  # of an equilibrium: rounding
+        if values.size > 1 or column not in (
+            "remodeling_power",
+            "pass_residual",
+        ):  # of an equilibrium: rounding
             size = np.nanmax(np.abs(values), initial=0.0)
-            np.testing.assert_allclose(found.rows[column], values, rtol=0, atol=digits * size, err_msg=column)
+            np.testing.assert_allclose(
+                found.rows[column], values, rtol=0, atol=digits * size, err_msg=column
+            )
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -95,7 +117,9 @@ def test_a_swing_is_warned_of_alike(caplog: pytest.LogCaptureFixture) -> None:
     said = []
     for unit in (1.0, POWER):
         caplog.clear()
-        simulation = Simulation(scene_in(unit, PAPER, "cube", {"loads.force.value": 0.01, "time.end": 35.0}))
+        simulation = Simulation(
+            scene_in(unit, PAPER, "cube", {"loads.force.value": 0.01, "time.end": 35.0})
+        )
         list(simulation.steps([Tilt(simulation, 20.0, 1e-8)]))
         said.append([r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING])
     assert said[1] == said[0] and "overshoots" in said[0][0]
@@ -114,9 +138,13 @@ def test_the_rounding_of_a_stress_is_one() -> None:
         tissue = Tissue(0.0, 0.0, 1.57 / unit, 1.594 * unit, 1.1 * unit)
         assert tissue.chain is not None
         for r in np.array([0.3, 1.0, 1.5]) * unit:
-            up, down = (tissue.chain.stiffness(r * s, 1.594 * unit) * r * s for s in (1 + 1e-6, 1 - 1e-6))
+            up, down = (
+                tissue.chain.stiffness(r * s, 1.594 * unit) * r * s for s in (1 + 1e-6, 1 - 1e-6)
+            )
             tension = 1.57 / unit * (up - down) * r / 2e-6  # c dF/d(ln r) r
-            initial = 1.57 / unit * tissue.chain.stiffness(1.1 * unit, 1.594 * unit) * (1.1 * unit) ** 2
+            initial = (
+                1.57 / unit * tissue.chain.stiffness(1.1 * unit, 1.594 * unit) * (1.1 * unit) ** 2
+            )
             assert tissue.stiffness(r) == pytest.approx(tension + initial, rel=1e-5)
 
 

@@ -21,7 +21,9 @@ def test_boltzmann_constant_as_printed() -> None:
 def test_force_is_the_slope_of_the_energy(contour_length: float) -> None:
     r = lengths(contour_length)
     h = 1e-5 * (contour_length - r)
-    slope = (WORMLIKE.energy(r + h, contour_length) - WORMLIKE.energy(r - h, contour_length)) / (2 * h)
+    slope = (WORMLIKE.energy(r + h, contour_length) - WORMLIKE.energy(r - h, contour_length)) / (
+        2 * h
+    )
     np.testing.assert_allclose(WORMLIKE.force(r, contour_length, 1.0), slope, rtol=1e-7)
 
 

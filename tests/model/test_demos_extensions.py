@@ -23,7 +23,12 @@ FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
 def parts() -> Iterator[None]:
     """Those of the files, as the command line loads them."""
     with patch.dict(CHAINS), patch.dict(DRIVERS), patch.dict(LAWS), patch.dict(MATRICES):
-        for name in ("freely_jointed_chain", "mandel_driver", "kappa_by_temperature", "second_network"):
+        for name in (
+            "freely_jointed_chain",
+            "mandel_driver",
+            "kappa_by_temperature",
+            "second_network",
+        ):
             assert len((FOLDER / f"{name}.py").read_text().splitlines()) < 60
             runpy.run_path(str(FOLDER / f"{name}.py"))
         yield
@@ -32,21 +37,26 @@ def parts() -> Iterator[None]:
 def scene(preset: str = "kuhl-holzapfel-2007", **changes: Any) -> Scene:
     """The cube as a point: its kernels compile fastest."""
     values = {"time.end": 3.0, "model.kinematics": "point"}
-    return preset_scene(preset, "cube").with_values(values | {k.replace("__", "."): v for k, v in changes.items()})
+    return preset_scene(preset, "cube").with_values(
+        values | {k.replace("__", "."): v for k, v in changes.items()}
+    )
 
 
 def rows(scene: Scene, name: str = "mean_fibre_angle") -> list[float]:
     return [step.row[name] for step in Simulation(scene).steps()]
 
 
-FREELY_JOINTED = {"material__chain": "freely-jointed", "material__links_per_persistence_length": 0.6}
+FREELY_JOINTED = {
+    "material__chain": "freely-jointed",
+    "material__links_per_persistence_length": 0.6,
+}
 
 
 def test_the_force_is_the_slope_of_the_energy() -> None:
     """Of a freely jointed chain: beta = x (3 - x^2)/(1 - x^2)."""
-    chain, r = CHAINS["freely-jointed"].with_parameters({"links_per_persistence_length": 0.6}), np.linspace(
-        0.05, 1.5, 9
-    )
+    chain, r = CHAINS["freely-jointed"].with_parameters(
+        {"links_per_persistence_length": 0.6}
+    ), np.linspace(0.05, 1.5, 9)
     slope = (chain.energy(r + 1e-6, 1.6) - chain.energy(r - 1e-6, 1.6)) / 2e-6
     x = r / 1.6
     np.testing.assert_allclose(slope, chain.force(r, 1.6, 1.0), rtol=1e-8)
@@ -81,7 +91,11 @@ def test_a_stiffness_of_an_experiment_is_that_of_the_chain() -> None:
     """A chain with twice the links has twice the stiffness: half of the density has the measured slope."""
     densities = []
     for links in (0.5, 1.0):
-        material = {"chain": "freely-jointed", "links_per_persistence_length": links, "initial_stiffness": 2.0}
+        material = {
+            "chain": "freely-jointed",
+            "links_per_persistence_length": links,
+            "initial_stiffness": 2.0,
+        }
         found = Scene(geometry={"shape": "cube"}, material=material, time={"end": 1.0})
         densities.append(found.material.chain_density)
     assert densities[0] == pytest.approx(2 * densities[1])
@@ -91,36 +105,52 @@ def test_a_stiffness_of_an_experiment_is_that_of_the_chain() -> None:
 def test_the_mandel_stress_is_taken_by_every_coupling(coupling: str) -> None:
     """In a pulled cube it has the axes of Cauchy's stress, and so the same target."""
     driven = [
-        scene("consistent", remodeling__driver=name, remodeling__coupling=coupling) for name in ("mandel", "cauchy")
+        scene("consistent", remodeling__driver=name, remodeling__coupling=coupling)
+        for name in ("mandel", "cauchy")
     ]
     np.testing.assert_allclose(*map(rows, driven), atol=1e-9)
 
 
 def test_kappa_depends_on_the_temperature_of_each_region() -> None:
     """exp(-E/R (1/theta - 1/theta_0)); cells remodel by it."""
-    warm = scene(remodeling__law="arrhenius", material__temperature=320.0, remodeling__activation_energy=6e4)
+    warm = scene(
+        remodeling__law="arrhenius", material__temperature=320.0, remodeling__activation_energy=6e4
+    )
     kappa = warm.remodeling.kappa * np.exp(-6e4 / 8.314 * (1 / 320 - 1 / 310))
     assert warm.properties()[""].kappa == pytest.approx(kappa, rel=1e-12)
     plain = scene(material__temperature=320.0, remodeling__kappa=kappa)
     np.testing.assert_allclose(rows(warm), rows(plain), atol=1e-12)
     layers = {"a": {"outer_radius": 2.0, "material": {"temperature": 300.0}}, "b": {}}
-    tube = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"remodeling.law": "arrhenius", "regions": layers})
+    tube = preset_scene("kuhl-holzapfel-2007", "tube").with_values(
+        {"remodeling.law": "arrhenius", "regions": layers}
+    )
     cool, usual = (one.kappa for one in tube.properties().values())
     assert cool < usual == tube.remodeling.kappa
 
 
-SECOND = {"material__matrix": "with-second-network", "material__repulsion": "log", "remodeling__law": "none"}
+SECOND = {
+    "material__matrix": "with-second-network",
+    "material__repulsion": "log",
+    "remodeling__law": "none",
+}
 
 
 def test_a_second_network_like_the_first_is_as_good_as_twice_the_chains() -> None:
     """Of isotropic cells, in the units of the first, whose length without load is 1."""
     half = scene(**SECOND)
     tissue = Simulation(half).tissue
-    second = {"second_modulus": tissue.network_modulus, "second_contour_length": tissue.contour_length}
+    second = {
+        "second_modulus": tissue.network_modulus,
+        "second_contour_length": tissue.contour_length,
+    }
     two = scene(**SECOND, **{f"material__{name}": float(value) for name, value in second.items()})
     one = {"repulsion": "log", "chain_density": 2 * half.material.chain_density}
-    one_of_twice = scene(remodeling__law="none", **{f"material__{name}": value for name, value in one.items()})
-    np.testing.assert_allclose(rows(two, "mean_stretch"), rows(one_of_twice, "mean_stretch"), rtol=1e-9)
+    one_of_twice = scene(
+        remodeling__law="none", **{f"material__{name}": value for name, value in one.items()}
+    )
+    np.testing.assert_allclose(
+        rows(two, "mean_stretch"), rows(one_of_twice, "mean_stretch"), rtol=1e-9
+    )
     assert abs(rows(two, "mean_stretch")[-1] / rows(half, "mean_stretch")[-1] - 1) > 1e-3
 
 

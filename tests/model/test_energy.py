@@ -34,7 +34,14 @@ def bracket(end_to_end_length: npt.ArrayLike) -> Array:
 
 def stress_by_hand(F: Array, l: Array, n: Array, omega: int = 1) -> Array:  # noqa: E741
     """Eq. (7) with erratum 5, parameters of the tendon; F, n (points, 3, 3), rows of n are the axes; l (points, 3)."""
-    lame_lambda, lame_mu, k, theta, chains, persistence_length = 27.293, 3.103, 1.381e-23, 310.0, 2e21, 1.365
+    lame_lambda, lame_mu, k, theta, chains, persistence_length = (
+        27.293,
+        3.103,
+        1.381e-23,
+        310.0,
+        2e21,
+        1.365,
+    )
     J = np.linalg.det(F)[:, None, None]
     b = F @ np.swapaxes(F, 1, 2)
     deformed = n @ np.swapaxes(F, 1, 2)
@@ -52,7 +59,9 @@ class Points:
     """W, S and the Cauchy stress for omega = 1 and 4 at the 64 quadrature points of eight cells, F, l, n free."""
 
     def __init__(self) -> None:
-        self.mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_SELF, 2, 2, 2, dolfinx.mesh.CellType.hexahedron)
+        self.mesh = dolfinx.mesh.create_unit_cube(
+            MPI.COMM_SELF, 2, 2, 2, dolfinx.mesh.CellType.hexahedron
+        )
         self.count = 8 * POINTS_PER_CELL
         self.F, self.l, self.n = self.function((3, 3)), self.function((3,)), self.function((3, 3))
         outputs = []
@@ -61,7 +70,10 @@ class Points:
             tensors = tissue.stresses(self.F, cell)
             outputs.append(tissue.strain_energy(self.F, cell))
             outputs += [
-                t[i, j] for t in (tensors.second_piola_kirchhoff, tensors.cauchy) for i in range(3) for j in range(3)
+                t[i, j]
+                for t in (tensors.second_piola_kirchhoff, tensors.cauchy)
+                for i in range(3)
+                for j in range(3)
             ]
         points, _ = basix.make_quadrature(basix.CellType.hexahedron, 2)
         self.expression = jit.expression(ufl.as_vector(outputs), points)
@@ -70,13 +82,21 @@ class Points:
         element = basix.ufl.quadrature_element("hexahedron", value_shape=shape, degree=2)
         return dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, element))
 
-    def evaluate(self, F: Array, l: Array, n: Array) -> dict[int, tuple[Array, Array, Array]]:  # noqa: E741
+    def evaluate(
+        self, F: Array, l: Array, n: Array
+    ) -> dict[int, tuple[Array, Array, Array]]:  # noqa: E741
         """omega -> (W, S, sigma); fewer points than there are are repeated."""
         for function, values in (self.F, F), (self.l, l), (self.n, n):
             function.x.array[:] = np.resize(values, (self.count, *values.shape[1:])).ravel()
-        result = self.expression.eval(self.mesh, np.arange(8, dtype=np.int32)).reshape(self.count, 2, 19)[: len(F)]
+        result = self.expression.eval(self.mesh, np.arange(8, dtype=np.int32)).reshape(
+            self.count, 2, 19
+        )[: len(F)]
         return {
-            omega: (result[:, i, 0], result[:, i, 1:10].reshape(-1, 3, 3), result[:, i, 10:].reshape(-1, 3, 3))
+            omega: (
+                result[:, i, 0],
+                result[:, i, 1:10].reshape(-1, 3, 3),
+                result[:, i, 10:].reshape(-1, 3, 3),
+            )
             for i, omega in enumerate((1, 4))
         }
 
@@ -127,13 +147,21 @@ def test_energy_of_the_matrix_and_of_the_undeformed_network() -> None:
     """What no stress shows: the matrix alone has none at F = I, and only psi of eq. (4b) is left of the network."""
     F, l, n = random_state("orthotropic")  # noqa: E741
     J = np.linalg.det(F)
-    matrix = 27.293 / 2 * np.log(J) ** 2 + 3.103 / 2 * (np.sum(F**2, axis=(1, 2)) - 3) - 3.103 * np.log(J)
+    matrix = (
+        27.293 / 2 * np.log(J) ** 2
+        + 3.103 / 2 * (np.sum(F**2, axis=(1, 2)) - 3)
+        - 3.103 * np.log(J)
+    )
     alone = Material(chain_density=0.0).tissue(R0)
     assert alone.locking_length is None
-    np.testing.assert_allclose(alone.strain_energy(F, [UnitCell(l, n)]), matrix, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(
+        alone.strain_energy(F, [UnitCell(l, n)]), matrix, rtol=1e-13, atol=1e-13
+    )
     x, big_l = 1 / 1.594, 1.594
     psi = 1.381e-23 * 310.0 * 2e21 / (4 * 1.365) * big_l / 4 * (2 * x**2 + 1 / (1 - x) - x)
-    undeformed = MATERIAL.tissue(R0).strain_energy(np.broadcast_to(np.eye(3), F.shape), [UnitCell(l, n)])
+    undeformed = MATERIAL.tissue(R0).strain_energy(
+        np.broadcast_to(np.eye(3), F.shape), [UnitCell(l, n)]
+    )
     np.testing.assert_allclose(undeformed, psi, rtol=1e-13)
 
 
@@ -142,7 +170,9 @@ def test_stiffness_of_matrix_and_network() -> None:
     big_l, matrix, c = 1.594, 27.293 + 2 * 3.103, 1.381e-23 * 310.0 * 2e21 / (4 * 1.365)
     r = big_l * np.array([0.1, 1 / big_l, 0.9, 1 - 1e-4])
     slope = 1 / big_l + 1 / (2 * big_l * (1 - r / big_l) ** 3)
-    np.testing.assert_allclose(MATERIAL.tissue(R0).stiffness(r), matrix + c * (r**2 * slope + bracket(R0)), rtol=1e-5)
+    np.testing.assert_allclose(
+        MATERIAL.tissue(R0).stiffness(r), matrix + c * (r**2 * slope + bracket(R0)), rtol=1e-5
+    )
     assert Material(chain_density=0.0).tissue(R0).stiffness(1.0) == matrix
 
 
@@ -150,10 +180,13 @@ def test_energy_increment_is_the_slope_from_the_old_to_the_new_cell() -> None:
     """By central differences along the straight way between two cells, of which r^2 and W_rep are the shares."""
     F, l, n = random_state("orthotropic")  # noqa: E741
     rng = np.random.default_rng(8)
-    old, new = UnitCell(l, n), UnitCell(l[rng.permutation(len(l))], random_rotations(np.random.default_rng(9), len(l)))
+    old, new = UnitCell(l, n), UnitCell(
+        l[rng.permutation(len(l))], random_rotations(np.random.default_rng(9), len(l))
+    )
     tissue, h = MATERIAL.tissue(R0), 1e-5
     energies = [
-        tissue.strain_energy(F, [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)]) for theta in (h, -h)
+        tissue.strain_energy(F, [UnitCell(*old[:2], 1 - theta), UnitCell(*new[:2], theta)])
+        for theta in (h, -h)
     ]
     slope = (energies[0] - energies[1]) / (2 * h)
     found = tissue.energy_increment(F, old, new)

@@ -38,7 +38,9 @@ class Bar:
             domain.mesh.geometry.x[:] = domain.mesh.geometry.x @ turned_reference.T
         self.body = made = parts.body(domain, Cells(initial="random", seed=4))
         if turned_reference is not None:
-            made.cells.set(made.cells.dimension_values.copy(), made.cells.axis_values @ turned_reference.T)
+            made.cells.set(
+                made.cells.dimension_values.copy(), made.cells.axis_values @ turned_reference.T
+            )
         self.support = dolfinx.fem.Function(made.displacement.function_space)
         facets = domain.facet_tags.find(domain.faces["z0"])
         dofs = dolfinx.fem.locate_dofs_topological(made.displacement.function_space, 2, facets)
@@ -64,7 +66,10 @@ class Bar:
             factor = min(time / RAMP, 1.0)
             force = factor * self.FORCE * self.turn[:, 2]
             self.body.loading.set(
-                {**dict(zip(("force_x", "force_y", "force_z"), force)), "pressure": factor * self.PRESSURE}
+                {
+                    **dict(zip(("force_x", "force_y", "force_z"), force)),
+                    "pressure": factor * self.PRESSURE,
+                }
             )
             self.problem.solve()
             self.remodeling.apply(float(time - 1), float(time))
@@ -104,10 +109,16 @@ def pair(driver: str, frame: str, turn: np.ndarray) -> tuple[Bar, Bar]:
 
 
 @pytest.mark.parametrize("turn", [QUARTER, OBLIQUE], ids=["quarter", "oblique"])
-@pytest.mark.parametrize("driver, frame", [*((driver, "material") for driver in DRIVERS), ("pk2", "spatial")])
-def test_turning_the_body_during_the_hold_changes_nothing(driver: str, frame: str, turn: np.ndarray) -> None:
+@pytest.mark.parametrize(
+    "driver, frame", [*((driver, "material") for driver in DRIVERS), ("pk2", "spatial")]
+)
+def test_turning_the_body_during_the_hold_changes_nothing(
+    driver: str, frame: str, turn: np.ndarray
+) -> None:
     still, turned = pair(driver, frame, turn)
-    assert np.ptp(still.lengths) > 0.5 and np.abs(still.position - still.body.nodes).max() > 0.3  # it did something
+    assert (
+        np.ptp(still.lengths) > 0.5 and np.abs(still.position - still.body.nodes).max() > 0.3
+    )  # it did something
     np.testing.assert_allclose(turned.lengths, still.lengths, rtol=0, atol=1e-10)
     np.testing.assert_allclose(turned.tensor, still.tensor, rtol=0, atol=1e-10)
     np.testing.assert_allclose(turned.position, still.position, rtol=0, atol=1e-10)
@@ -124,17 +135,24 @@ def test_turning_the_body_during_the_hold_changes_everything_in_the_spatial_fram
     assert abs(turned.problem.stored_energy() / still.problem.stored_energy() - 1) > 0.05
     # the chains follow the observer: their mean reference angle to the axis of the bar goes from 50 to 64 degrees
     axis = np.array([0.0, 0.0, 1.0])
-    angles = [float(np.mean(angle_to_axis(bar.lengths, bar.body.cells.axis_values, axis))) for bar in (still, turned)]
+    angles = [
+        float(np.mean(angle_to_axis(bar.lengths, bar.body.cells.axis_values, axis)))
+        for bar in (still, turned)
+    ]
     assert angles[0] == pytest.approx(50.1, abs=1.0) and angles[1] == pytest.approx(64.3, abs=1.0)
 
 
 @pytest.mark.parametrize("frame", ["material", "spatial"])
 @pytest.mark.parametrize("driver", ["cauchy", "pk2", "finger"])
-def test_turning_reference_loads_and_first_axes_together_turns_the_answer(driver: str, frame: str) -> None:
+def test_turning_reference_loads_and_first_axes_together_turns_the_answer(
+    driver: str, frame: str
+) -> None:
     straight, turned = unturned(driver, frame), Bar(driver, frame, turned_reference=OBLIQUE)
     turned.march(0, END)
     np.testing.assert_allclose(turned.lengths, straight.lengths, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(turned.tensor, OBLIQUE @ straight.tensor @ OBLIQUE.T, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        turned.tensor, OBLIQUE @ straight.tensor @ OBLIQUE.T, rtol=0, atol=1e-8
+    )
     np.testing.assert_allclose(turned.position, straight.position, rtol=0, atol=1e-9)
     assert np.abs(turned.tensor - straight.tensor).max() > 0.3
 
@@ -171,7 +189,9 @@ def test_material_frame(seed: int) -> None:
     F = F[np.linalg.det(F) > 0.1]
     spatial = spatial[: len(F)]
     axes = material_frame(F, spatial)
-    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        axes @ np.swapaxes(axes, 1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-12
+    )
     np.testing.assert_allclose(np.linalg.det(axes), 1.0, atol=1e-12)
     carried = axes @ np.swapaxes(F, 1, 2)
     along = np.sum(carried[:, 0] * spatial[:, 0], axis=1) / np.linalg.norm(carried[:, 0], axis=1)
@@ -181,4 +201,6 @@ def test_material_frame(seed: int) -> None:
     turned = material_frame(turn @ F, spatial @ np.swapaxes(turn, 1, 2))
     np.testing.assert_allclose(turned, axes, atol=1e-10)
     # a rotation alone is undone
-    np.testing.assert_allclose(material_frame(turn, spatial @ np.swapaxes(turn, 1, 2)), spatial, atol=1e-12)
+    np.testing.assert_allclose(
+        material_frame(turn, spatial @ np.swapaxes(turn, 1, 2)), spatial, atol=1e-12
+    )

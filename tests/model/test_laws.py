@@ -35,7 +35,9 @@ def cells() -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("law", ["rate", "relaxation"])
 @pytest.mark.parametrize("steps", [1, 7, 150])
-def test_laws_are_eq_11_when_the_target_is_constant(law: str, steps: int, cells: tuple[Array, Array]) -> None:
+def test_laws_are_eq_11_when_the_target_is_constant(
+    law: str, steps: int, cells: tuple[Array, Array]
+) -> None:
     l0, target = cells
     inner = np.sort(np.random.default_rng(steps).uniform(0.0, 150.0, steps - 1))
     times = np.concatenate([[0.0], inner, [150.0]])
@@ -64,7 +66,9 @@ def test_laws_differ_when_the_target_changes() -> None:
     np.testing.assert_allclose(ends["explicit"], second[0], atol=1e-14)
     np.testing.assert_allclose(ends["relaxation"], second[0], atol=1e-14)
     weight = 1 - np.exp(-1.0)  # of the first target: kappa times 40 is one
-    np.testing.assert_allclose(ends["rate"], weight * first[0] + (1 - weight) * second[0], atol=1e-14)
+    np.testing.assert_allclose(
+        ends["rate"], weight * first[0] + (1 - weight) * second[0], atol=1e-14
+    )
 
 
 def uniaxial_drive(count: int, l0: Array) -> Drive:
@@ -72,17 +76,25 @@ def uniaxial_drive(count: int, l0: Array) -> Drive:
     tensor = np.zeros((count, 3, 3))
     tensor[:, 0, 0] = 2.0
     F = np.broadcast_to(np.eye(3), (count, 3, 3))
-    return Drive(F, tensor, DRIVERS["cauchy"], FRAMES["material"], 0.0, l0, np.full(count, 1.3), KAPPA)
+    return Drive(
+        F, tensor, DRIVERS["cauchy"], FRAMES["material"], 0.0, l0, np.full(count, 1.3), KAPPA
+    )
 
 
-def test_laws_turn_the_axes_at_once_and_the_dimensions_gradually(cells: tuple[Array, Array]) -> None:
+def test_laws_turn_the_axes_at_once_and_the_dimensions_gradually(
+    cells: tuple[Array, Array],
+) -> None:
     l0, _ = cells
     axes = np.broadcast_to(np.eye(3)[[2, 0, 1]], (len(l0), 3, 3))  # rows: z, x, y
     for name, function in FUNCTIONS.items():
         new = LAWS[name].update(UnitCell(l0, axes), uniaxial_drive(len(l0), l0), 3.0, 4.0)
-        np.testing.assert_allclose(np.abs(new.axes[:, 0]), np.broadcast_to([1.0, 0.0, 0.0], l0.shape), atol=1e-14)
+        np.testing.assert_allclose(
+            np.abs(new.axes[:, 0]), np.broadcast_to([1.0, 0.0, 0.0], l0.shape), atol=1e-14
+        )
         target = np.broadcast_to([1.3, 0.0, 0.0], l0.shape)
-        np.testing.assert_allclose(new.dimensions, function(l0, l0, target, KAPPA, 3.0, 4.0), atol=1e-14)
+        np.testing.assert_allclose(
+            new.dimensions, function(l0, l0, target, KAPPA, 3.0, 4.0), atol=1e-14
+        )
 
 
 def test_points_without_tension_keep_their_cells(cells: tuple[Array, Array]) -> None:
@@ -102,17 +114,23 @@ def random_cells(rng: np.random.Generator, count: int = 50) -> UnitCell:
     return UnitCell(1.3 * octant(rng, count), parts.random_rotations(rng, count))
 
 
-def drive(tensor: Array, F: Array, frame: str, driver: str = "cauchy", threshold: float = 0.0) -> Drive:
+def drive(
+    tensor: Array, F: Array, frame: str, driver: str = "cauchy", threshold: float = 0.0
+) -> Drive:
     """A drive on cells that began with equal dimensions, r0 = 1.3."""
     count = len(tensor)
     l0 = np.full((count, 3), 1.3 / np.sqrt(3))
-    return Drive(F, tensor, DRIVERS[driver], FRAMES[frame], threshold, l0, np.full(count, 1.3), KAPPA)
+    return Drive(
+        F, tensor, DRIVERS[driver], FRAMES[frame], threshold, l0, np.full(count, 1.3), KAPPA
+    )
 
 
 @pytest.mark.parametrize(("driver", "frame"), [
     ("cauchy", "material"), ("finger", "material"), ("cauchy", "spatial"), ("pk2", "material"), ("pk2", "spatial"),
 ])  # fmt: skip
-def test_equal_principal_values_keep_the_axes_whatever_the_deformation(driver: str, frame: str) -> None:
+def test_equal_principal_values_keep_the_axes_whatever_the_deformation(
+    driver: str, frame: str
+) -> None:
     """What the tensor does not decide, the previous axes do: in space as the deformation has carried them there."""
     rng = np.random.default_rng(3)
     old = random_cells(rng)
@@ -129,14 +147,22 @@ def test_frames_make_material_axes_of_spatial_directions_and_leave_material_ones
     tensor = np.diag([1.0, 3.0, 2.0])[None]
     old = UnitCell(np.array([[0.9, 0.8, 0.5]]), np.eye(3)[None])
     x, y, z = np.eye(3)
-    expected = {("cauchy", "material"): [x, z, y], ("cauchy", "spatial"): [y, z, x], ("pk2", "material"): [y, z, x]}
+    expected = {
+        ("cauchy", "material"): [x, z, y],
+        ("cauchy", "spatial"): [y, z, x],
+        ("pk2", "material"): [y, z, x],
+    }
     for (driver, frame), axes in expected.items():
         new = LAWS["explicit"].update(old, drive(tensor, turn, frame, driver), 3.0, 4.0)
-        np.testing.assert_allclose(np.abs(new.axes[0]), axes, atol=1e-14, err_msg=f"{driver} {frame}")
+        np.testing.assert_allclose(
+            np.abs(new.axes[0]), axes, atol=1e-14, err_msg=f"{driver} {frame}"
+        )
         # by rank: the target is r0 (3, 2, 1) / sqrt 14, approached from the equal dimensions of the start
         e = 1.3 * np.array([3.0, 2.0, 1.0]) / np.sqrt(14)
         start = 1.3 / np.sqrt(3)
-        np.testing.assert_allclose(new.dimensions[0], start + (e - start) * (1 - np.exp(-KAPPA * 4.0)), atol=1e-14)
+        np.testing.assert_allclose(
+            new.dimensions[0], start + (e - start) * (1 - np.exp(-KAPPA * 4.0)), atol=1e-14
+        )
 
 
 def test_below_the_threshold_values_are_zero_and_differences_are_none() -> None:
@@ -155,6 +181,8 @@ def test_below_the_threshold_values_are_zero_and_differences_are_none() -> None:
     projected /= np.linalg.norm(projected, axis=1)[:, None]
     np.testing.assert_allclose(new.axes[:, 0], projected, atol=1e-12)
     # the second value is no tension
-    np.testing.assert_allclose(updated([0.02, 0.0009, -0.02]).dimensions, np.tile([1.3, 0.0, 0.0], (50, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        updated([0.02, 0.0009, -0.02]).dimensions, np.tile([1.3, 0.0, 0.0], (50, 1)), atol=1e-12
+    )
     for name, values in zip(("dimensions", "axes"), updated([0.0009, -0.02, -0.03])):
         np.testing.assert_array_equal(values, getattr(old, name))

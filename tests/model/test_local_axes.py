@@ -22,7 +22,11 @@ def local_axes(places: np.ndarray, axes: np.ndarray | None = None) -> LocalAxes:
     tube = Tube(inner_radius=1.0, outer_radius=3.0, length=8.0)
     found = tube.axes_at(places) if axes is None else axes
     return LocalAxes(
-        places, lambda: found, lambda: tube.depth(places), lambda: tube.station(places), lambda: tube.depth(places)
+        places,
+        lambda: found,
+        lambda: tube.depth(places),
+        lambda: tube.station(places),
+        lambda: tube.depth(places),
     )
 
 
@@ -40,10 +44,18 @@ def test_a_tube_that_swells_stretches_and_twists_keeps_its_directions() -> None:
     grown, slope = 1.3 * radius + 0.1 * radius**2, 1.3 + 0.2 * radius
     turn = twist * places[:, 2]
     c, s = np.cos(turn), np.sin(turn)
-    x, y = (grown / radius * v for v in (c * places[:, 0] - s * places[:, 1], s * places[:, 0] + c * places[:, 1]))
+    x, y = (
+        grown / radius * v
+        for v in (c * places[:, 0] - s * places[:, 1], s * places[:, 0] + c * places[:, 1])
+    )
     after = cylindrical_axes(np.stack([x, y, stretch * places[:, 2]], axis=-1))
     inner = np.zeros((len(places), 3, 3))  # F from circumferential, axial, radial to the same
-    inner[:, 0, 0], inner[:, 1, 1], inner[:, 2, 2], inner[:, 0, 1] = grown / radius, stretch, slope, grown * twist
+    inner[:, 0, 0], inner[:, 1, 1], inner[:, 2, 2], inner[:, 0, 1] = (
+        grown / radius,
+        stretch,
+        slope,
+        grown * twist,
+    )
     before = local_axes(places)
     F = np.swapaxes(after, -1, -2) @ inner @ before.axes
     np.testing.assert_allclose(before.deformed(F), after, atol=1e-13)

@@ -14,7 +14,9 @@ def absolute_cosines(a: Array, b: Array) -> Array:
 
 
 def assert_orthonormal(axes: Array) -> None:
-    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-14)
+    np.testing.assert_allclose(
+        axes @ np.swapaxes(axes, 1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-200, 1e200])
@@ -26,7 +28,9 @@ def test_distinct_values(size: float) -> None:
     values, axes = principal(tensors, previous)
     assert np.all(np.diff(values, axis=1) <= 0)
     assert_orthonormal(axes)
-    np.testing.assert_allclose(np.swapaxes(axes, 1, 2) @ (values[:, :, None] / size * axes), tensors / size, atol=1e-13)
+    np.testing.assert_allclose(
+        np.swapaxes(axes, 1, 2) @ (values[:, :, None] / size * axes), tensors / size, atol=1e-13
+    )
     cosines = np.sum(axes * previous, axis=2)
     assert np.all(cosines[np.abs(cosines) > 1e-3] > 0)
 
@@ -34,11 +38,15 @@ def test_distinct_values(size: float) -> None:
 def test_only_the_symmetric_part_counts() -> None:
     rng = np.random.default_rng(2)
     tensors, previous = rng.normal(size=(COUNT, 3, 3)), random_rotations(rng, COUNT)
-    for one, other in zip(principal(tensors, previous), principal(np.swapaxes(tensors, 1, 2), previous)):
+    for one, other in zip(
+        principal(tensors, previous), principal(np.swapaxes(tensors, 1, 2), previous)
+    ):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("values, single, pair", [([5.0, 5.0, -2.0], 2, (0, 1)), ([5.0, -2.0, -2.0], 0, (1, 2))])
+@pytest.mark.parametrize(
+    "values, single, pair", [([5.0, 5.0, -2.0], 2, (0, 1)), ([5.0, -2.0, -2.0], 0, (1, 2))]
+)
 def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     values: list[float], single: int, pair: tuple[int, int]
 ) -> None:
@@ -49,7 +57,10 @@ def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     assert_orthonormal(axes)
     normal = true[:, single]
     np.testing.assert_allclose(absolute_cosines(axes[:, single], normal), 1.0, atol=1e-14)
-    first, second = (previous[:, rank] - np.sum(previous[:, rank] * normal, axis=1)[:, None] * normal for rank in pair)
+    first, second = (
+        previous[:, rank] - np.sum(previous[:, rank] * normal, axis=1)[:, None] * normal
+        for rank in pair
+    )
     first /= np.linalg.norm(first, axis=1)[:, None]
     second -= np.sum(first * second, axis=1)[:, None] * first
     second /= np.linalg.norm(second, axis=1)[:, None]
@@ -58,7 +69,15 @@ def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
 
 
 @pytest.mark.parametrize(
-    "values", [[3.0, 3.0, 1.0], [3.0, 1.0, 1.0], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0], [-1.0, -1.0, -1.0], [0.0, 0.0, -4.0]]
+    "values",
+    [
+        [3.0, 3.0, 1.0],
+        [3.0, 1.0, 1.0],
+        [2.0, 2.0, 2.0],
+        [0.0, 0.0, 0.0],
+        [-1.0, -1.0, -1.0],
+        [0.0, 0.0, -4.0],
+    ],
 )
 def test_previous_axes_that_are_principal_stay(values: list[float]) -> None:
     previous = random_rotations(np.random.default_rng(4), COUNT)
@@ -76,7 +95,9 @@ def test_rounding_does_not_choose_the_axes(values: list[float]) -> None:
     # the noise does turn LAPACK's vectors, so there is something to be protected from
     bare = np.linalg.eigh(exact)[1], np.linalg.eigh(exact + noise)[1]
     assert np.min(np.abs(np.sum(bare[0] * bare[1], axis=1))) < 0.9
-    np.testing.assert_allclose(principal(exact + noise, previous)[1], principal(exact, previous)[1], atol=1e-9)
+    np.testing.assert_allclose(
+        principal(exact + noise, previous)[1], principal(exact, previous)[1], atol=1e-9
+    )
 
 
 def test_values_that_agree_in_a_chain_are_one_cluster() -> None:
@@ -92,17 +113,25 @@ def test_noise_below_the_scale_is_the_zero_tensor() -> None:
     rng = np.random.default_rng(8)
     true, previous = random_rotations(rng, COUNT), random_rotations(rng, COUNT)
     noise = symmetric([3e-16, 1e-16, -2e-16], true)
-    np.testing.assert_allclose(principal(noise, previous, threshold=ROUNDING)[1], previous, atol=1e-14)
-    np.testing.assert_allclose(absolute_cosines(principal(noise, previous)[1], true), 1.0, atol=1e-12)
+    np.testing.assert_allclose(
+        principal(noise, previous, threshold=ROUNDING)[1], previous, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        absolute_cosines(principal(noise, previous)[1], true), 1.0, atol=1e-12
+    )
 
 
 def test_previous_axis_across_the_eigenspace_is_passed_over() -> None:
     previous = np.array([[[0.0, 0.0, 1.0], [0.6, 0.8, 0.0], [-0.8, 0.6, 0.0]]])
     _, axes = principal(np.diag([2.0, 2.0, 1.0])[None], previous)
-    np.testing.assert_allclose(axes[0], [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], atol=1e-15)
+    np.testing.assert_allclose(
+        axes[0], [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], atol=1e-15
+    )
     # almost across: the same choice, not a direction made of rounding
     previous[0, 0] = [1e-9, -1e-9, 1.0]
-    np.testing.assert_allclose(principal(np.diag([2.0, 2.0, 1.0])[None], previous)[1][0], axes[0], atol=1e-9)
+    np.testing.assert_allclose(
+        principal(np.diag([2.0, 2.0, 1.0])[None], previous)[1][0], axes[0], atol=1e-9
+    )
     _, axes = principal(np.diag([1.0, 1.0, 2.0])[None], np.eye(3)[[0, 2, 1]][None])
     np.testing.assert_array_equal(axes[0], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 
@@ -116,7 +145,9 @@ def test_swapped_ranks_take_their_sign_from_the_other_previous_axes() -> None:
 
 def test_without_previous_axes_the_coordinate_axes_decide() -> None:
     nothing = np.zeros((2, 3, 3))
-    np.testing.assert_array_equal(principal(np.zeros((2, 3, 3)), nothing)[1], np.broadcast_to(np.eye(3), (2, 3, 3)))
+    np.testing.assert_array_equal(
+        principal(np.zeros((2, 3, 3)), nothing)[1], np.broadcast_to(np.eye(3), (2, 3, 3))
+    )
     for values in ([2.0, 2.0, 1.0], [2.0, 1.0, 1.0]):
         true = random_rotations(np.random.default_rng(9), COUNT)
         _, axes = principal(symmetric(values, true), np.zeros_like(true))
@@ -152,7 +183,9 @@ def test_positive_direction(values: list[float], direction: list[float]) -> None
     np.testing.assert_allclose(found[0], direction, atol=1e-12)
 
 
-@pytest.mark.parametrize("values", [[0.0, 0.0, 0.0], [-1.0, -2.0, -3.0], [1e-16, -1.0, -1.0], [0.0, -1e-300, -1e-300]])
+@pytest.mark.parametrize(
+    "values", [[0.0, 0.0, 0.0], [-1.0, -2.0, -3.0], [1e-16, -1.0, -1.0], [0.0, -1e-300, -1e-300]]
+)
 def test_nothing_positive_is_inactive(values: list[float]) -> None:
     with np.errstate(all="raise", under="ignore"):
         found, active = positive_direction([values, [1.0, 0.0, 0.0]])

@@ -16,7 +16,13 @@ from remodel_fenicsx.model.cells import UnitCell, structure_tensor
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS, Drive
-from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, switch_threshold, relax_exactly, target
+from remodel_fenicsx.model.tensor_law import (
+    ABOVE_ROUNDING,
+    Target,
+    switch_threshold,
+    relax_exactly,
+    target,
+)
 from remodel_fenicsx.model.tensors import MANDEL, logarithm, second_divided_differences
 
 Array = NDArray[np.float64]
@@ -32,7 +38,14 @@ def right_cauchy_green() -> Array:
     F = np.eye(3) + 0.15 * RNG.standard_normal((20, 3, 3))
     R = Rotation.random(6, random_state=RNG).as_matrix()
     values = np.array(
-        [[1, 1, 1], [2, 2, 2], [0.5, 0.5, 3], [1, 1 + 4e-4, 1 + 9e-4], [1, 1 + 6e-4, 1 + 1.1e-3], [1, 1 + 1e-9, 1.5]]
+        [
+            [1, 1, 1],
+            [2, 2, 2],
+            [0.5, 0.5, 3],
+            [1, 1 + 4e-4, 1 + 9e-4],
+            [1, 1 + 6e-4, 1 + 1.1e-3],
+            [1, 1 + 1e-9, 1.5],
+        ]
     )
     special = R @ (values[:, :, None] * np.swapaxes(R, 1, 2))
     return np.concatenate([np.swapaxes(F, 1, 2) @ F, special])
@@ -68,7 +81,9 @@ def test_second_derivative_against_central_differences() -> None:
     A, H, h = structures(len(C)), symmetric(RNG.standard_normal(C.shape)), 1e-5
     _, second = energy.log_derivatives(C, A)
     assert second is not None
-    number = (energy.log_derivatives(C + h * H, A)[0] - energy.log_derivatives(C - h * H, A)[0]) / (2 * h)
+    number = (energy.log_derivatives(C + h * H, A)[0] - energy.log_derivatives(C - h * H, A)[0]) / (
+        2 * h
+    )
     found = from_mandel(np.einsum("nab,nb->na", second, to_mandel(H)))
     error = np.abs(found - number).max(axis=(1, 2)) / np.abs(number).max(axis=(1, 2))
     assert np.median(error) < 1e-8 and error.max() < 1e-7
@@ -107,7 +122,9 @@ def test_log_is_the_papers_repulsion_where_cell_and_stretch_are_coaxial() -> Non
     stretches = RNG.uniform(0.5, 2.0, (8, 3))
     U = np.swapaxes(axes, 1, 2) @ (stretches[:, :, None] * axes)
     F = Rotation.random(8, random_state=RNG).as_matrix() @ U
-    np.testing.assert_allclose(energy.log_sum(F, [cells], 1.0), energy.axes_sum(F, [cells], 1.0), rtol=1e-12)
+    np.testing.assert_allclose(
+        energy.log_sum(F, [cells], 1.0), energy.axes_sum(F, [cells], 1.0), rtol=1e-12
+    )
     turned = F @ Rotation.random(8, random_state=RNG).as_matrix()
     differences = energy.log_sum(turned, [cells], 1.0) - energy.axes_sum(turned, [cells], 1.0)
     assert np.abs(differences).max() > 0.1
@@ -120,33 +137,49 @@ def test_energy_is_stress_free_unloaded_for_every_structure(name: str) -> None:
     A = structures(5) if name == "log" else np.tile(np.eye(3) / 3, (5, 1, 1))
     for _ in range(6):
         H, h = RNG.standard_normal((5, 3, 3)), 1e-6
-        up, down = (tissue.strain_energy(np.eye(3) + sign * h * H, [cells_of(A)]) for sign in (1, -1))
+        up, down = (
+            tissue.strain_energy(np.eye(3) + sign * h * H, [cells_of(A)]) for sign in (1, -1)
+        )
         np.testing.assert_allclose((up - down) / (2 * h), 0, atol=2e-8)
 
 
 def drive(F: Array, tensor: Array, driver: str = "cauchy", kappa: float = 0.025) -> Drive:
     n = len(F)
-    return Drive(F, tensor, DRIVERS[driver], FRAMES["material"], 1e-14, np.zeros((n, 3)), np.ones(n), kappa)
+    return Drive(
+        F, tensor, DRIVERS[driver], FRAMES["material"], 1e-14, np.zeros((n, 3)), np.ones(n), kappa
+    )
 
 
 @pytest.mark.parametrize("driver", ["cauchy", "finger"])
 def test_the_law_is_objective(driver: str) -> None:
     """A rotation after the deformation turns a spatial driver with it; A, in material space, stays."""
     F = np.eye(3) + 0.2 * RNG.standard_normal((10, 3, 3))
-    tensor = F @ np.swapaxes(F, 1, 2) if driver == "finger" else symmetric(RNG.standard_normal((10, 3, 3)))
+    tensor = (
+        F @ np.swapaxes(F, 1, 2)
+        if driver == "finger"
+        else symmetric(RNG.standard_normal((10, 3, 3)))
+    )
     Q = Rotation.random(10, random_state=RNG).as_matrix()
     cells = cells_of(structures(10))
     turned = drive(Q @ F, Q @ tensor @ np.swapaxes(Q, 1, 2), driver)
     new = [LAWS["tensor"].update(cells, d, 0.0, 3.0) for d in (drive(F, tensor, driver), turned)]
-    np.testing.assert_allclose(structure_tensor(*new[0][:2]), structure_tensor(*new[1][:2]), atol=1e-12)
+    np.testing.assert_allclose(
+        structure_tensor(*new[0][:2]), structure_tensor(*new[1][:2]), atol=1e-12
+    )
 
 
 def test_the_trace_stays_and_the_axes_do_not_matter() -> None:
     n = 20
-    F, tensor = np.tile(np.eye(3), (n, 1, 1)), np.abs(RNG.standard_normal((n, 1, 1))) * structures(n)
+    F, tensor = np.tile(np.eye(3), (n, 1, 1)), np.abs(RNG.standard_normal((n, 1, 1))) * structures(
+        n
+    )
     A = np.tile(np.eye(3) / 3, (n, 1, 1))
-    some = UnitCell(np.full((n, 3), 1 / np.sqrt(3)), Rotation.random(n, random_state=RNG).as_matrix())
-    new = [LAWS["tensor"].update(cells, drive(F, tensor), 0.0, 40.0) for cells in (cells_of(A), some)]
+    some = UnitCell(
+        np.full((n, 3), 1 / np.sqrt(3)), Rotation.random(n, random_state=RNG).as_matrix()
+    )
+    new = [
+        LAWS["tensor"].update(cells, drive(F, tensor), 0.0, 40.0) for cells in (cells_of(A), some)
+    ]
     results = [structure_tensor(*cells[:2]) for cells in new]
     np.testing.assert_allclose(np.trace(results[0], axis1=1, axis2=2), 1.0, atol=1e-13)
     np.testing.assert_allclose(results[0], results[1], atol=1e-13)
@@ -156,7 +189,11 @@ def test_follow_is_the_solution_of_its_differential_equation() -> None:
     A, E = structures(2)
     s, kappa, r0 = 0.7, 0.05, 1.3
     solution: Any = solve_ivp(
-        lambda t, y: (kappa * s * (r0**2 * E - y.reshape(3, 3))).ravel(), (0, 30), A.ravel(), rtol=1e-11, atol=1e-12
+        lambda t, y: (kappa * s * (r0**2 * E - y.reshape(3, 3))).ravel(),
+        (0, 30),
+        A.ravel(),
+        rtol=1e-11,
+        atol=1e-12,
     )
     found = relax_exactly(A[None], Target(E[None], np.array([s])), r0, kappa * 30)[0]
     np.testing.assert_allclose(found, solution.y[:, -1].reshape(3, 3), atol=1e-9)
@@ -176,7 +213,9 @@ def test_what_is_out_of_balance_counts_once() -> None:
     """The rounding is widened for Newton's method; a residual, which may be large, is not: half there, and no more."""
     tension = np.diag([1e-3, 0.0, 0.0])[None]
     assert target(tension, switch_threshold(1e-3, 0.0)).switch[0] == pytest.approx(0.5)
-    assert target(tension, switch_threshold(0.0, 1e-3 / ABOVE_ROUNDING)).switch[0] == pytest.approx(0.5)
+    assert target(tension, switch_threshold(0.0, 1e-3 / ABOVE_ROUNDING)).switch[0] == pytest.approx(
+        0.5
+    )
 
 
 def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is_one() -> None:
@@ -192,13 +231,17 @@ def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is
     for weight, share in ((1.5, 1.0), (0.5, 0.5), (-0.5, 0.0), (0.0, 0.0)):
         found = none.towards(first, weight)
         assert found.switch[0] == pytest.approx(share, abs=1e-14)
-        np.testing.assert_allclose(found.switch[0] * (found.direction[0] - ends[0]), 0.0, atol=1e-14)
+        np.testing.assert_allclose(
+            found.switch[0] * (found.direction[0] - ends[0]), 0.0, atol=1e-14
+        )
 
 
 def test_the_switch() -> None:
     """One under tension, nothing under compression or noise; no jump between."""
     floor = switch_threshold(0.0, 1e-14)
-    tensors = np.array([np.diag(v) for v in ([1, 0, 0], [-1, -1, -1], [1e-14, -1, 0], [1e-15, 0, 0], [0.0, 0, 0])])
+    tensors = np.array(
+        [np.diag(v) for v in ([1, 0, 0], [-1, -1, -1], [1e-14, -1, 0], [1e-15, 0, 0], [0.0, 0, 0])]
+    )
     np.testing.assert_allclose(target(tensors, floor).switch, [1, 0, 0, 0, 0], atol=1e-6)
     sizes = np.logspace(-13, 0, 400)
     shares = target(np.array([np.diag([size, -1.0, -1.0]) for size in sizes]), floor).switch

@@ -40,7 +40,9 @@ def drawn(recorded: Recorded, drawn_by_forks: None) -> Drawn:
 def panel(picture: np.ndarray) -> np.ndarray:
     """What lies between title and loads: the largest run of rows with something in them."""
     filled = np.concatenate([[False], np.any(picture < 245, axis=(1, 2)), [False]])
-    starts, ends = np.flatnonzero(~filled[:-1] & filled[1:]), np.flatnonzero(filled[:-1] & ~filled[1:])
+    starts, ends = np.flatnonzero(~filled[:-1] & filled[1:]), np.flatnonzero(
+        filled[:-1] & ~filled[1:]
+    )
     longest = int(np.argmax(ends - starts))
     return picture[starts[longest] : ends[longest]]
 
@@ -54,7 +56,10 @@ def outline(part: np.ndarray) -> tuple[int, int]:
 
 def levels(part: np.ndarray, least: float = 0.004) -> set[int]:
     """Which steps of the scale, unshaded, fill more than a share of it."""
-    scale = np.rint(255 * np.array([[int(text[i : i + 2], 16) / 255 for i in (1, 3, 5)] for text in ANGLE_COLOURS]))
+    scale = np.rint(
+        255
+        * np.array([[int(text[i : i + 2], 16) / 255 for i in (1, 3, 5)] for text in ANGLE_COLOURS])
+    )
     return {k for k, colour in enumerate(scale) if np.all(part == colour, axis=2).mean() > least}
 
 
@@ -97,19 +102,28 @@ def test_a_cut_shows_the_inside_and_layers_are_taken_off(recorded: Recorded, dra
     expected = levels_of(angle)
     assert len(expected) >= 2 and levels_of(angle[:3]) < expected
     middle = slice(100, -100)
-    outside = panel(drawn("radial", f"--view={np.sin(np.pi / 16)},{-np.cos(np.pi / 16)},0"))  # onto one of 16 sides
+    outside = panel(
+        drawn("radial", f"--view={np.sin(np.pi / 16)},{-np.cos(np.pi / 16)},0")
+    )  # onto one of 16 sides
     cut = panel(drawn("radial", FROM_THE_FRONT, "--cut", "half"))
     peeled = panel(drawn("radial", FROM_THE_FRONT, "--cut", "half", "--layers", "3"))
     assert levels(outside[middle]) == levels_of(angle[-1:])
-    assert levels(cut[middle], 0.02) == expected and levels(peeled[middle], 0.02) == levels_of(angle[:3])
+    assert levels(cut[middle], 0.02) == expected and levels(peeled[middle], 0.02) == levels_of(
+        angle[:3]
+    )
     # 3 of 8 layers from 1 to 3: to 1.75, and so much wider is the same length
-    assert np.divide(*outline(peeled)) / np.divide(*outline(cut)) == pytest.approx(3.0 / 1.75, rel=0.03)
+    assert np.divide(*outline(peeled)) / np.divide(*outline(cut)) == pytest.approx(
+        3.0 / 1.75, rel=0.03
+    )
 
 
 @pytest.mark.parametrize(
-    ("name", "dark"), [("tetrahedra", True), ("quadratic", True), ("point", True), ("angles alone", False)]
+    ("name", "dark"),
+    [("tetrahedra", True), ("quadratic", True), ("point", True), ("angles alone", False)],
 )
-def test_all_elements_are_drawn_and_chains_where_they_were_recorded(drawn: Drawn, name: str, dark: bool) -> None:
+def test_all_elements_are_drawn_and_chains_where_they_were_recorded(
+    drawn: Drawn, name: str, dark: bool
+) -> None:
     body = panel(drawn(name))
     rows, columns = outline(body)
     assert 0.4 < (np.ptp(body, axis=2) > 12).sum() / (rows * columns) <= 1.0
@@ -120,17 +134,23 @@ def test_all_elements_are_drawn_and_chains_where_they_were_recorded(drawn: Drawn
 @pytest.fixture
 def empty_sheets(monkeypatch: pytest.MonkeyPatch) -> None:
     """In place of what is drawn, where the file alone is looked at."""
-    monkeypatch.setattr(rendering, "render", lambda job: [np.zeros((9, 9, 3), np.uint8) for _ in job.sheets])
+    monkeypatch.setattr(
+        rendering, "render", lambda job: [np.zeros((9, 9, 3), np.uint8) for _ in job.sheets]
+    )
 
 
 @pytest.mark.usefixtures("empty_sheets")
-def test_a_picture_says_what_it_is_and_where_it_comes_from(recorded: Recorded, tmp_path: Path) -> None:
+def test_a_picture_says_what_it_is_and_where_it_comes_from(
+    recorded: Recorded, tmp_path: Path
+) -> None:
     folder = shutil.copytree(recorded("cube"), tmp_path / "run")
     for name in ("cube-t4.png", "cube-t4-2.png"):
         assert cli.main(["picture", str(folder), "--time", "4.2"]) == 0
         with Image.open(folder / name) as picture:
             assert picture.info["Title"] == "cube: angle of the collagen"
-            assert "dolfinx" in picture.info["Source"] and "1 elements" in picture.info["Description"]
+            assert (
+                "dolfinx" in picture.info["Source"] and "1 elements" in picture.info["Description"]
+            )
     path = tmp_path / "cube.PDF"
     assert cli.main(["picture", str(folder), "-o", str(path)]) == 0
     assert path.read_bytes().startswith(b"%PDF") and b"/Width 9" in path.read_bytes()
@@ -142,7 +162,9 @@ def test_an_animation_has_so_many_frames_that_differ(
     recorded: Recorded, tmp_path: Path, ending: str, frames: int, expected: int
 ) -> None:
     path = tmp_path / f"film.{ending}"
-    assert cli.main(["animate", str(recorded("cube")), "--frames", str(frames), "-o", str(path)]) == 0
+    assert (
+        cli.main(["animate", str(recorded("cube")), "--frames", str(frames), "-o", str(path)]) == 0
+    )
     with Image.open(path) as film:
         assert film.n_frames == expected  # type: ignore[attr-defined]
         found = []
@@ -180,7 +202,9 @@ def test_bad_input_is_one_line_and_writes_nothing(
 # ---------------------------------------------------------------- what belongs to others
 @pytest.mark.usefixtures("empty_sheets")
 @pytest.mark.parametrize("kind", ["file", "link"])
-def test_nothing_is_overwritten(recorded: Recorded, kind: str, tmp_path: Path, refused: Refused) -> None:
+def test_nothing_is_overwritten(
+    recorded: Recorded, kind: str, tmp_path: Path, refused: Refused
+) -> None:
     """What the default name is taken by stays, and no link is followed."""
     folder, victim = shutil.copytree(recorded("cube"), tmp_path / "run"), tmp_path / "victim"
     places = [folder / "cube-t10.png", tmp_path / "mine.png"]
@@ -188,7 +212,9 @@ def test_nothing_is_overwritten(recorded: Recorded, kind: str, tmp_path: Path, r
         place.write_bytes(b"a year of work") if kind == "file" else place.symlink_to(victim)
     assert cli.main(["picture", str(folder)]) == 0 and (folder / "cube-t10-2.png").exists()
     assert f"{places[1]}: already exists" in refused("picture", folder, "-o", places[1])
-    assert all(p.is_symlink() if kind == "link" else p.read_bytes() == b"a year of work" for p in places)
+    assert all(
+        p.is_symlink() if kind == "link" else p.read_bytes() == b"a year of work" for p in places
+    )
     assert not victim.exists()
 
 
@@ -200,7 +226,9 @@ def test_no_module_of_the_working_folder_runs_and_no_backend_of_a_notebook(
     for name in ("pyvista", "numpy", "remodel_fenicsx"):
         (theirs / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
     monkeypatch.chdir(theirs)
-    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")  # as in a kernel of Jupyter
+    monkeypatch.setenv(
+        "MPLBACKEND", "module://matplotlib_inline.backend_inline"
+    )  # as in a kernel of Jupyter
     assert cli.main(["picture", str(recorded("cube")), "-o", str(tmp_path / "x.png")]) == 0
     assert not (tmp_path / "ran").exists() and sorted(os.listdir(theirs)) == sorted(
         ["numpy.py", "pyvista.py", "remodel_fenicsx.py"]

@@ -34,7 +34,9 @@ np.save(target, plotter.screenshot(return_img=True, window_size=(400, 400)))
 """
 
 
-def plotted(recording: Recording, target: Path, display: dict[str, str], **options: Any) -> np.ndarray:
+def plotted(
+    recording: Recording, target: Path, display: dict[str, str], **options: Any
+) -> np.ndarray:
     """What the plotter shows, (400, 400, 3)."""
     words = PLOT, recording.path, target, json.dumps(options)
     done = forked("python", *words, variables=os.environ | display, imports=("pyvista.plotting",))
@@ -50,11 +52,18 @@ def black(pixels: np.ndarray) -> int:
 def test_a_notebook_shows_the_page_in_a_frame_that_reaches_nothing(recorded: Recorded) -> None:
     recording = Recording(recorded("cube"))
     html = recording._repr_html_()
-    found = re.fullmatch(r'<iframe srcdoc="([^"]*)" sandbox="([a-z -]*)" [^<>]*></iframe>', html, re.DOTALL)
+    found = re.fullmatch(
+        r'<iframe srcdoc="([^"]*)" sandbox="([a-z -]*)" [^<>]*></iframe>', html, re.DOTALL
+    )
     assert found is not None
-    assert found[2].split() == ["allow-scripts", "allow-downloads"]  # no origin that it shares with the notebook
+    assert found[2].split() == [
+        "allow-scripts",
+        "allow-downloads",
+    ]  # no origin that it shares with the notebook
     page = unescape(found[1])
-    assert page == recording.report(recording.path.parent / "cube-in-a-notebook.html").read_text()  # below 5 MB
+    assert (
+        page == recording.report(recording.path.parent / "cube-in-a-notebook.html").read_text()
+    )  # below 5 MB
     assert repr(recording) == f"Recording({str(recording.path)!r})"
 
 
@@ -69,7 +78,9 @@ def test_the_grid_has_what_was_recorded(recorded: Recorded, name: str) -> None:
         assert set(grid.cell_data) == {"layer", *fields}
         for field, values in fields.items():
             np.testing.assert_array_equal(grid.cell_data[field], values)
-        corners = {tuple(place): moved for place, moved in zip(recording.points, displacement, strict=True)}
+        corners = {
+            tuple(place): moved for place, moved in zip(recording.points, displacement, strict=True)
+        }
         found = [corners[tuple(place)] for place in np.asarray(grid.points, dtype=float)]
         np.testing.assert_array_equal(grid.point_data["displacement"], found)
     volume = np.prod(np.ptp(recording.points, axis=0))  # of cubes
@@ -84,7 +95,9 @@ def test_the_grid_of_a_reduction_is_the_whole_tube(recorded: Recorded, name: str
     assert grid.volume == pytest.approx(np.pi * (3**2 - 1**2) * 8, rel=0.03)  # faceted
     deformed = grid.warp_by_vector("displacement")
     radius = np.linalg.norm(np.asarray(deformed.points)[:, :2], axis=1)
-    assert radius.min() == pytest.approx(Recording(recorded(name)).history["inner_radius"][-1], rel=1e-4)
+    assert radius.min() == pytest.approx(
+        Recording(recorded(name)).history["inner_radius"][-1], rel=1e-4
+    )
 
 
 # ---------------------------------------------------------------- plot and screenshot
@@ -93,7 +106,14 @@ def test_a_plot_has_the_colours_and_the_chains_of_all_pictures(
 ) -> None:
     recording = Recording(recorded("artery"))
     with_chains = plotted(recording, tmp_path / "chains.npy", display)
-    without = plotted(recording, tmp_path / "none.npy", display, chains=False, show_edges=False, show_scalar_bar=False)
+    without = plotted(
+        recording,
+        tmp_path / "none.npy",
+        display,
+        chains=False,
+        show_edges=False,
+        show_scalar_bar=False,
+    )
     body = without[(without < 250).any(axis=-1)].astype(float)
     assert 0.05 < len(body) / without[..., 0].size < 0.95
     # every colour is one of the scale, as bright as its face is lit
@@ -111,7 +131,9 @@ def test_a_plot_shows_the_deformed_body(recorded: Recorded) -> None:
     plotter = recording.plot(chains=False)
     deformed = recording.points + recording.fields(float(recording.times[-1]))["displacement"]
     bounds = np.reshape(list(plotter.bounds), (3, 2)).T
-    np.testing.assert_allclose(bounds, [deformed.min(axis=0), deformed.max(axis=0)], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        bounds, [deformed.min(axis=0), deformed.max(axis=0)], rtol=1e-6, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,7 +141,9 @@ def test_a_plot_shows_the_deformed_body(recorded: Recorded) -> None:
     [({"time": 2.5}, "time 2.5"), ({"name": "stress"}, "no field 'stress'"), ({"layers": 9}, "layers 9: "),
      ({"elements": [True]}, "a mask of all 1536"), ({"cut": "all"}, "cut all: ")],
 )  # fmt: skip
-def test_what_cannot_be_shown_is_one_line(recorded: Recorded, options: dict[str, Any], words: str) -> None:
+def test_what_cannot_be_shown_is_one_line(
+    recorded: Recorded, options: dict[str, Any], words: str
+) -> None:
     with pytest.raises(ValueError, match=words) as error:
         Recording(recorded("artery")).plot(**options)
     assert "\n" not in str(error.value)
@@ -138,7 +162,10 @@ def test_a_screenshot_is_the_picture_of_the_command(recorded: Recorded, tmp_path
     path = Recording(recorded("cube")).screenshot(tmp_path / "cube.png", [0.0, 10.0], view="above")
     assert path.read_bytes().startswith(b"\x89PNG")
     recording = Recording(recorded("cube"))
-    for said, wish in ((".*cube.png: already exists", {}), ("view behind: must be", {"view": "behind"})):
+    for said, wish in (
+        (".*cube.png: already exists", {}),
+        ("view behind: must be", {"view": "behind"}),
+    ):
         with pytest.raises(ValueError, match=f"^{said}"):  # by the arguments of this method
             recording.screenshot(**{"path": tmp_path / "new.png" if wish else path} | wish)
 

@@ -42,8 +42,12 @@ def material(scene: Scene) -> RadialMaterial:
     m = scene["material"]
     modulus = BOLTZMANN * m["temperature"] * m["chain_density"] / (4 * m["persistence_length"])
     modulus *= m.get("energy_factor", 1) / STRESS_UNITS[m.get("stress_unit", "Pa")]
-    length = m["contour_length"] if m["chain_density"] else 1e9  # where there are no chains, none locks
-    return RadialMaterial(m["lame_lambda"], m["lame_mu"], modulus, length, scene["cells"]["end_to_end_length"])
+    length = (
+        m["contour_length"] if m["chain_density"] else 1e9
+    )  # where there are no chains, none locks
+    return RadialMaterial(
+        m["lame_lambda"], m["lame_mu"], modulus, length, scene["cells"]["end_to_end_length"]
+    )
 
 
 def factor(ramp: Sequence[Sequence[float]], time: Array) -> Array:
@@ -80,14 +84,19 @@ def initial(scene: Scene) -> Array:
     cells = scene["cells"]
     if isinstance(cells["initial"], str):
         along = cells.get("aligned_axis", 3)
-        pattern = {"isotropic": np.full(3, 3**-0.5), "aligned": np.eye(3)[along - 1]}[cells["initial"]]
+        pattern = {"isotropic": np.full(3, 3**-0.5), "aligned": np.eye(3)[along - 1]}[
+            cells["initial"]
+        ]
         return np.asarray(cells["end_to_end_length"] * pattern)
     return np.array(cells["initial"], dtype=float)
 
 
 def slowed(scene: Scene) -> bool:
     """Whether the relaxed pass meets a law with a memory: then its own scheme is no reference, the law is."""
-    return scene["remodeling"]["coupling"] == "relaxed" and scene["remodeling"]["law"] in ("rate", "relaxation")
+    return scene["remodeling"]["coupling"] == "relaxed" and scene["remodeling"]["law"] in (
+        "rate",
+        "relaxation",
+    )
 
 
 # ---------------------------------------------------------------- bodies
@@ -113,7 +122,9 @@ class Bar:
             done, part = 0.0, 0.5
             while done < 1.0:
                 at = min(1.0, done + part)
-                found = self.equilibrium(stretches, *((1 - at) * a + at * b for a, b in zip(start, end, strict=True)))
+                found = self.equilibrium(
+                    stretches, *((1 - at) * a + at * b for a, b in zip(start, end, strict=True))
+                )
                 if found is not None:
                     stretches, done, part = found, at, 2 * part
                 elif (part := part / 2) < 1e-10:
@@ -135,7 +146,9 @@ class Bar:
 
         smallest = np.inf
         for _ in range(300):
-            tangent = np.stack([residual(stretches + 1e-30j * axis).imag / 1e-30 for axis in np.eye(3)], axis=1)
+            tangent = np.stack(
+                [residual(stretches + 1e-30j * axis).imag / 1e-30 for axis in np.eye(3)], axis=1
+            )
             step = -np.linalg.solve(tangent, residual(stretches).real)
             while not self.admissible(stretches + step, squares):
                 step = step / 2
@@ -160,7 +173,9 @@ class Wall:
 
     def __init__(self, scene: Scene, elements: int = 40):
         geometry = scene["geometry"]
-        self.tube = Tube(geometry["inner_radius"], geometry["outer_radius"], elements, material(scene))
+        self.tube = Tube(
+            geometry["inner_radius"], geometry["outer_radius"], elements, material(scene)
+        )
         self.scene, self.start, self.points = scene, self.tube.nodes.copy(), len(self.tube.points)
 
     def loads(self, time: float) -> tuple[float, float]:
@@ -222,21 +237,28 @@ class Pass:
         self.ranked, self.ranks = self.start.copy(), np.tile([0, 1, 2], (points, 1))
         relaxed = coupling == "relaxed" and not slowed(scene)
         self.share = self.r.get("relaxation_factor", 0.5) if relaxed else 1.0
-        self.targets: list[tuple[float, Array]] = []  # time and sE of solved states, the last one first
+        self.targets: list[tuple[float, Array]] = (
+            []
+        )  # time and sE of solved states, the last one first
         self.begun = np.zeros(points, bool)  # points whose last target stands alone
 
     def values(self, stretches: Array, squares: Array) -> tuple[Array, float]:
         """Of the driver by direction, and what of them is rounding."""
         driver = self.r["driver"]
         noise = 0.0 if driver == "finger" else stress_noise(stretches, squares, self.material)
-        return driving_values(driver, stretches, cauchy_stress(stretches, squares, self.material)), noise
+        return (
+            driving_values(driver, stretches, cauchy_stress(stretches, squares, self.material)),
+            noise,
+        )
 
     def target(self, stretches: Array, squares: Array) -> Array:
         """sE of the law `tensor`."""
         values, noise = self.values(stretches, squares)
         tension, compression = np.maximum(values, 0) ** 2, np.minimum(values, 0) ** 2
         total = tension.sum(axis=1) + COMPRESSION**2 * compression.sum(axis=1) + (100 * noise) ** 2
-        return np.divide(tension, total[:, None], out=np.zeros_like(tension), where=total[:, None] > 0)
+        return np.divide(
+            tension, total[:, None], out=np.zeros_like(tension), where=total[:, None] > 0
+        )
 
     def followed(self, squares: Array, target: Array, step: float) -> Array:
         """dA/dt = kappa (r0^2 sE - s A) with sE kept."""
@@ -245,19 +267,32 @@ class Pass:
         done = -np.expm1(-self.r["kappa"] * step * share)
         return np.where(share > 0, squares + (self.r0**2 * direction - squares) * done, squares)
 
-    def after(self, stretches: Array, squares: Array, old: Array, time: float, step: float) -> tuple[Array, Any]:
+    def after(
+        self, stretches: Array, squares: Array, old: Array, time: float, step: float
+    ) -> tuple[Array, Any]:
         """Squares that a pass makes of `old` under the stress of a state, and what to keep if it is the last one."""
         if self.law == "tensor":
             asked = self.followed(old, self.target(stretches, squares), step)
             return old + self.share * (asked - old), (self.ranked, self.ranks)
         values, noise = self.values(stretches, squares)
         ranked, ranks = remodel(
-            self.ranked, values, self.ranks, self.start, self.law, self.r["kappa"], time, step, self.r0, noise
+            self.ranked,
+            values,
+            self.ranks,
+            self.start,
+            self.law,
+            self.r["kappa"],
+            time,
+            step,
+            self.r0,
+            noise,
         )
         asked = np.empty_like(ranked)
         np.put_along_axis(asked, ranks, ranked, axis=1)
         new = old + self.share * (asked**2 - old)
-        if self.share < 1.0:  # rank is the order of A's eigenvalues; where they agree the pass's ranks stay
+        if (
+            self.share < 1.0
+        ):  # rank is the order of A's eigenvalues; where they agree the pass's ranks stay
             by_rank = np.take_along_axis(new, ranks, axis=1)
             order = np.argsort(-np.round(by_rank / self.r0**2, 12), axis=1, kind="stable")
             ranks = np.take_along_axis(ranks, order, axis=1)
@@ -273,12 +308,17 @@ class Pass:
         return now + np.where(self.begun[:, None], 0.0, slope * (now - earlier[0][1]))
 
 
-def march(scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, coupling: str = "") -> Path:
+def march(
+    scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, coupling: str = ""
+) -> Path:
     """The way of a body; times and coupling are the scene's where none are given."""
     coupling = coupling or scene["remodeling"]["coupling"]
     cells, path = Pass(scene, body.points, coupling), Path()
     unknown, squares, before = body.start, cells.start**2, 0.0
-    solved, loads = squares, body.unloaded  # of the last state: the way to the next one begins there
+    solved, loads = (
+        squares,
+        body.unloaded,
+    )  # of the last state: the way to the next one begins there
     for time in map(float, step_times(scene) if times is None else times):
         new: Any = body.loads(time)
         step, start = time - before, squares
@@ -297,12 +337,18 @@ def march(scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, 
                 had = cells.targets[0][1] if cells.targets else np.zeros_like(found)
                 cells.begun = (had.sum(axis=1) < COUNTS) & (found.sum(axis=1) >= COUNTS)
                 if cells.begun.any():
-                    other = cells.followed(start, np.where(cells.begun[:, None], found, expected), step)
+                    other = cells.followed(
+                        start, np.where(cells.begun[:, None], found, expected), step
+                    )
                     unknown, squares = body.solve(unknown, (squares, new), (other, new)), other
                     found = cells.target(body.stretches(unknown, new), squares)
                 cells.targets = [(time, found), *cells.targets[:1]]
         except NoEquilibrium as error:
-            path.ended = str(error) if str(error).startswith("unknown") else f"no equilibrium at t = {time:g}: {error}"
+            path.ended = (
+                str(error)
+                if str(error).startswith("unknown")
+                else f"no equilibrium at t = {time:g}: {error}"
+            )
             return path
         path.times.append(time)
         path.unknowns.append(unknown)
@@ -310,5 +356,7 @@ def march(scene: Scene, body: Bar | Wall, times: Iterable[float] | None = None, 
         solved, loads, before = squares, new, time
         if coupling in ("staggered", "relaxed"):
             stretches = body.stretches(unknown, new)
-            squares, (cells.ranked, cells.ranks) = cells.after(stretches, squares, squares, time, step)
+            squares, (cells.ranked, cells.ranks) = cells.after(
+                stretches, squares, squares, time, step
+            )
     return path

@@ -15,7 +15,10 @@ COMPRESSION = 0.1  # weight of what pushes in the law `tensor`
 def cauchy(F: Array, A: Array, repulsion: Array, m: RadialMaterial) -> Array:
     """sigma of W_iso, of chains of length r, r^2 = A : C, and of a repulsion - c/2 g(r0) `repulsion` : C."""
     C, J = F.T @ F, np.linalg.det(F)
-    g, g0 = (secant_stiffness(r, m.contour_length) for r in (np.sqrt(np.sum(A * C)), np.array(m.end_to_end_length)))
+    g, g0 = (
+        secant_stiffness(r, m.contour_length)
+        for r in (np.sqrt(np.sum(A * C)), np.array(m.end_to_end_length))
+    )
     inner = m.lame_mu * np.eye(3) + m.network_modulus * (g * A - g0 * repulsion)
     return np.asarray(((m.lame_lambda * np.log(J) - m.lame_mu) * np.eye(3) + F @ inner @ F.T) / J)
 
@@ -83,7 +86,9 @@ def prescribed_path(
     return np.array(found)
 
 
-def _tensor_path(m: RadialMaterial, F: Array, times: Array, start: Array, driver: str, kappa: float) -> Array:
+def _tensor_path(
+    m: RadialMaterial, F: Array, times: Array, start: Array, driver: str, kappa: float
+) -> Array:
     A, before, r0, found = np.diag(start**2), 0.0, m.end_to_end_length, []
     for time, gradient in zip(times, F, strict=True):
         found.append(A)

@@ -31,7 +31,9 @@ CIRCUMFERENTIAL, AXIAL, RADIAL = 0, 1, 2
 # Gauss points and weights on (0, 1), and the quadratic shape functions of the nodes 0, 1/2, 1 and their slopes there
 POINTS = 0.5 + 0.5 * np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
 WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
-SHAPES = np.stack([(1 - POINTS) * (1 - 2 * POINTS), 4 * POINTS * (1 - POINTS), POINTS * (2 * POINTS - 1)], axis=1)
+SHAPES = np.stack(
+    [(1 - POINTS) * (1 - 2 * POINTS), 4 * POINTS * (1 - POINTS), POINTS * (2 * POINTS - 1)], axis=1
+)
 SLOPES = np.stack([4 * POINTS - 3, 4 - 8 * POINTS, 4 * POINTS - 1], axis=1)
 
 
@@ -104,10 +106,19 @@ def cauchy_stress(stretches: Array, squares: Array, material: RadialMaterial) ->
     jacobian = (stretches[:, 0] * stretches[:, 1] * stretches[:, 2])[:, None]
     r = np.sqrt(np.sum(squares * stretches**2, axis=1))[:, None]
     matrix = (m.lame_lambda * np.log(jacobian) - m.lame_mu + m.lame_mu * stretches**2) / jacobian
-    chains = m.network_modulus / jacobian * secant_stiffness(r, m.contour_length) * squares * stretches**2
+    chains = (
+        m.network_modulus
+        / jacobian
+        * secant_stiffness(r, m.contour_length)
+        * squares
+        * stretches**2
+    )
     # n(x)n / I_I is the unit dyad along the direction: the stretch cancels
     repulsion = (
-        -m.network_modulus / jacobian * secant_stiffness(np.array(m.end_to_end_length), m.contour_length) * squares
+        -m.network_modulus
+        / jacobian
+        * secant_stiffness(np.array(m.end_to_end_length), m.contour_length)
+        * squares
     )
     return matrix + chains + repulsion
 
@@ -145,13 +156,18 @@ class Tube:
     def admissible(self, stretches: Array, squares: Array) -> bool:
         """Whether every point has J > 0 and r < L."""
         chain = np.sqrt(np.sum(squares * stretches**2, axis=1))
-        return bool(np.all(stretches > 0) and np.all(chain < np.ravel(self.material.contour_length)))
+        return bool(
+            np.all(stretches > 0) and np.all(chain < np.ravel(self.material.contour_length))
+        )
 
     def residual(self, radii: Array, squares: Array, pressure: float, axial: float) -> Array:
         """Return internal minus external forces at the nodes, per radian and unit length of the axis."""
         stress = first_piola_kirchhoff(self.stretches(radii, axial), squares, self.material)
         along, across = (stress * self.areas[:, None])[:, [RADIAL, CIRCUMFERENTIAL]].T
-        local = along.reshape(-1, 3) @ SLOPES / self.length + (across / self.points).reshape(-1, 3) @ SHAPES
+        local = (
+            along.reshape(-1, 3) @ SLOPES / self.length
+            + (across / self.points).reshape(-1, 3) @ SHAPES
+        )
         forces = np.zeros(len(self.nodes))
         np.add.at(forces, self.connectivity, local)
         forces[0] -= pressure * axial * radii[0]
@@ -166,9 +182,13 @@ class Tube:
         for column, direction in enumerate(directions):
             shifted = stretches.astype(complex)
             shifted[:, direction] += 1j * tiny
-            moduli[:, :, column] = first_piola_kirchhoff(shifted, squares, self.material).imag[:, directions] / tiny
+            moduli[:, :, column] = (
+                first_piola_kirchhoff(shifted, squares, self.material).imag[:, directions] / tiny
+            )
         moduli *= self.areas[:, None, None]
-        gradients = np.zeros((self.elements, 3, 2, 3))  # element, point, (radial, circumferential), node
+        gradients = np.zeros(
+            (self.elements, 3, 2, 3)
+        )  # element, point, (radial, circumferential), node
         gradients[:, :, 0] = SLOPES / self.length
         gradients[:, :, 1] = SHAPES / self.points.reshape(-1, 3, 1)
         at_points = moduli.reshape(self.elements, 3, 2, 2)
@@ -196,7 +216,9 @@ class Tube:
                 return radii
         return None
 
-    def advance(self, radii: Array, old: tuple[Array, float, float], new: tuple[Array, float, float]) -> Array:
+    def advance(
+        self, radii: Array, old: tuple[Array, float, float], new: tuple[Array, float, float]
+    ) -> Array:
         """Return the equilibrium with the new (l^2, pressure, axial stretch), in parts where one solve fails.
 
         First the cells are exchanged at the old loads, then the loads are raised: both linearly, the energy is linear
@@ -225,18 +247,27 @@ class Tube:
 def driving_values(driver: str, stretches: Array, cauchy: Array) -> Array:
     """Return the driver's eigenvalues by direction, (points, 3)."""
     jacobian = np.prod(stretches, axis=1, keepdims=True)
-    return {"cauchy": cauchy, "pk2": jacobian * cauchy / stretches**2, "finger": stretches**2}[driver]
+    return {"cauchy": cauchy, "pk2": jacobian * cauchy / stretches**2, "finger": stretches**2}[
+        driver
+    ]
 
 
 def stress_noise(stretches: Array, squares: Array, material: RadialMaterial) -> float:
     """Return the size up to which a stress may be the solver's error: strains are accepted to 1e-11."""
     m = material
     r = np.sqrt(np.sum(squares * stretches**2, axis=1, keepdims=True))
-    network = m.network_modulus * secant_stiffness(r, m.contour_length) * r**2 / (1 - r / m.contour_length)
+    network = (
+        m.network_modulus
+        * secant_stiffness(r, m.contour_length)
+        * r**2
+        / (1 - r / m.contour_length)
+    )
     return 1e-11 * float(np.max(m.lame_lambda + 2 * m.lame_mu) + np.max(network))
 
 
-def sorted_directions(values: Array, previous: Array, tolerance: float = 1e-8, noise: float = 0.0) -> Array:
+def sorted_directions(
+    values: Array, previous: Array, tolerance: float = 1e-8, noise: float = 0.0
+) -> Array:
     """Return the directions by descending value; values that agree keep their previous order."""
     ranks = previous.copy()
     rows = np.arange(len(ranks))
@@ -248,7 +279,9 @@ def sorted_directions(values: Array, previous: Array, tolerance: float = 1e-8, n
     return ranks
 
 
-def updated(law: str, old: Array, start: Array, target: Array, kappa: Any, time: float, step: float) -> Array:
+def updated(
+    law: str, old: Array, start: Array, target: Array, kappa: Any, time: float, step: float
+) -> Array:
     """Return the dimensions by rank at `time` (eq. 11, eq. 10 integrated over the step, or the autonomous form)."""
     if law == "explicit":
         return start + (target - start) * (1 - np.exp(-kappa * time))
@@ -279,7 +312,12 @@ def remodel(
     if law == "tensor":
         by_direction = np.empty_like(ranked)
         np.put_along_axis(by_direction, ranks, ranked, axis=1)
-        return np.take_along_axis(np.sqrt(structure(by_direction**2, values, kappa * step, r0)), ranks, axis=1), ranks
+        return (
+            np.take_along_axis(
+                np.sqrt(structure(by_direction**2, values, kappa * step, r0)), ranks, axis=1
+            ),
+            ranks,
+        )
     largest = np.max(np.abs(values), axis=1, keepdims=True)
     positive = np.where(values > np.maximum(1e-14 * largest, noise), values, 0.0)
     norm = np.linalg.norm(positive, axis=1, keepdims=True)
@@ -344,7 +382,9 @@ def solve_radial(
     tube = Tube(inner_radius, outer_radius, elements, material)
     count = len(tube.points)
     number_of_steps = round(end / step)
-    start = np.full((count, 3), material.end_to_end_length / np.sqrt(3)) if initial is None else initial
+    start = (
+        np.full((count, 3), material.end_to_end_length / np.sqrt(3)) if initial is None else initial
+    )
     ranked: Array = start.copy()
     ranks: Array = np.tile(np.array([CIRCUMFERENTIAL, AXIAL, RADIAL]), (count, 1))
     radii = tube.nodes.copy()

@@ -25,7 +25,9 @@ def piola(F: Array, squares: Array, m: RadialMaterial) -> Array:
     g = secant_stiffness(r, m.contour_length)[:, None]
     g0 = secant_stiffness(np.array(m.end_to_end_length), m.contour_length)
     chain = m.network_modulus * squares * (g - g0 / stretch)
-    return np.asarray(m.lame_mu * F + (m.lame_lambda * np.log(J) - m.lame_mu) * inverse + F * chain[:, None, :])
+    return np.asarray(
+        m.lame_mu * F + (m.lame_lambda * np.log(J) - m.lame_mu) * inverse + F * chain[:, None, :]
+    )
 
 
 def gradients() -> tuple[Array, Array]:

@@ -59,7 +59,11 @@ class Wall:
         self.R: Array = (inner + outer) / 2 + half * x
         self.slope, self.weights = slopes @ inverse / half, half * areas @ inverse
         self.G = np.ones((3, n))
-        self.state: State = np.full((3, n), self.material.end_to_end_length**2 / 3), np.ones(n), np.ones(n)
+        self.state: State = (
+            np.full((3, n), self.material.end_to_end_length**2 / 3),
+            np.ones(n),
+            np.ones(n),
+        )
         self.r, self.length = self.R.copy(), 1.0
         if self.opening_angle:
             self._close()
@@ -75,7 +79,10 @@ class Wall:
         of, J = self.material, stretches[0] * stretches[1] * stretches[2]
         r = np.sqrt((A * stretches**2).sum(axis=0)) / rho
         network = (
-            m * of.network_modulus * A * (self.chain(r) / rho**2 * stretches**2 - self.chain(of.end_to_end_length))
+            m
+            * of.network_modulus
+            * A
+            * (self.chain(r) / rho**2 * stretches**2 - self.chain(of.end_to_end_length))
         )
         return (of.lame_lambda * np.log(J) - of.lame_mu + of.lame_mu * stretches**2 + network) / J
 
@@ -102,7 +109,9 @@ class Wall:
 
         def residual(values: Array, turn: float) -> Array:
             stresses = self.stresses(gradient(values, turn), self.state)
-            return np.append(self._balance(stresses, self.R, 0.0), self.weights @ (stresses[1] * self.R))
+            return np.append(
+                self._balance(stresses, self.R, 0.0), self.weights @ (stresses[1] * self.R)
+            )
 
         values = np.append(self.R, 1.0)
         for turn in np.linspace(1.0, whole, 9)[1:]:
@@ -124,7 +133,11 @@ class Wall:
         tension = np.maximum(stress, 0.0) ** 2
         size = tension.sum(axis=0)
         share = size / (size + 0.01 * (np.minimum(stress, 0.0) ** 2).sum(axis=0) + 1e-8)
-        turned = self.kappa * share * (of.end_to_end_length**2 * tension / np.where(size > 0, size, 1.0) - A)
+        turned = (
+            self.kappa
+            * share
+            * (of.end_to_end_length**2 * tension / np.where(size > 0, size, 1.0) - A)
+        )
         stretch = np.sqrt((A * stretches**2).sum(axis=0)) / rho / of.end_to_end_length
 
         def fibre(some: Array | float) -> Array:
@@ -133,7 +146,11 @@ class Wall:
         relative = fibre(stretch) / fibre(self.deposition_stretch)
         steepness = np.log(fibre(stretch * (1 + 1e-30j))).imag / 1e-30
         produced = np.maximum(1 + self.gain * (relative - 1), 0.0)
-        return turned, m * (produced - 1) / self.time, rho * produced * (1 - 1 / relative) / (steepness * self.time)
+        return (
+            turned,
+            m * (produced - 1) / self.time,
+            rho * produced * (1 - 1 / relative) / (steepness * self.time),
+        )
 
     def run(self, pressure: float, elongation: float, ramp: float, end: float, step: float) -> None:
         """The loads rise to the end of the ramp, and stay."""
@@ -144,7 +161,9 @@ class Wall:
             return self._rates(state)
 
         def ahead(rate: State, duration: float) -> State:
-            a, m, rho = (value + duration * change for value, change in zip(self.state, rate, strict=True))
+            a, m, rho = (
+                value + duration * change for value, change in zip(self.state, rate, strict=True)
+            )
             return a, m, rho
 
         for number in range(round(end / step)):
@@ -164,7 +183,9 @@ class Wall:
         stress = self.stresses(self.stretches(r, self.length, self.state), self.state) / growth
         slope, volume, (_, content, length) = self.slope @ r, weights @ self.R, self.state
         means = {"content": content, "natural_length": length, "growth": growth}
-        return {name: float(weights @ (self.R * values) / volume) for name, values in means.items()} | {
+        return {
+            name: float(weights @ (self.R * values) / volume) for name, values in means.items()
+        } | {
             "inner_radius": float(r[0]),
             "wall_thickness": float(r[-1] - r[0]),
             "mean_hoop_stress": float(weights @ (stress[0] * slope) / (r[-1] - r[0])),
@@ -173,7 +194,9 @@ class Wall:
 
     def cut(self) -> float:
         """By how many degrees the unloaded wall opens when it is cut."""
-        growth, start = self.growth(self.state), np.concatenate([self.r, [self.length, 1 - self.opening_angle / 360]])
+        growth, start = self.growth(self.state), np.concatenate(
+            [self.r, [self.length, 1 - self.opening_angle / 360]]
+        )
 
         def residual(values: Array) -> Array:
             r, axial, k = values[:-2], values[-2], values[-1]

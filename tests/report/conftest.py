@@ -31,7 +31,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
             if not place.exists():
                 demo, settings = RUNS[name]
                 changes = [f"--set={setting}" for setting in settings]
-                done = forked("remodel-fenicsx", "run", DEMOS / f"{demo}.toml", *changes, "-o", place, "-q")
+                done = forked(
+                    "remodel-fenicsx", "run", DEMOS / f"{demo}.toml", *changes, "-o", place, "-q"
+                )
                 assert done.returncode == (3 if name in ("failed", "one time") else 0), done.stderr
         return place
 

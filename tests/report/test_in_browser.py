@@ -70,7 +70,10 @@ def test_a_run_without_fields_has_its_curves(browser: Browser, recorded: Recorde
     assert browser.value("document.querySelectorAll('.curve canvas').length") >= 5
     before = browser.screenshot("#curve-0")
     browser.press("ArrowLeft")
-    assert browser.value("REPORT.clock.time") == 2.0 and (browser.screenshot("#curve-0") != before).any()
+    assert (
+        browser.value("REPORT.clock.time") == 2.0
+        and (browser.screenshot("#curve-0") != before).any()
+    )
     assert quiet(browser, page)
 
 
@@ -87,7 +90,9 @@ def test_profile_and_rose_are_volume_means(browser: Browser, recorded: Recorded,
         np.testing.assert_allclose(shown, expected, atol=0.2)
         rose = browser.value(f"Array.from(REPORT.clock.roseAt({index}))")
         assert sum(rose) == pytest.approx(1.0, abs=1e-9)
-        counted = np.histogram(angle, bins=np.linspace(0, 90, len(ANGLE_COLOURS) + 1), weights=volume)[0]
+        counted = np.histogram(
+            angle, bins=np.linspace(0, 90, len(ANGLE_COLOURS) + 1), weights=volume
+        )[0]
         np.testing.assert_allclose(rose, counted, atol=1e-5)
 
 
@@ -98,7 +103,9 @@ def test_the_slider_leads_through_time_and_back(browser: Browser, recorded: Reco
     end = browser.screenshot("#body")
     browser.click("#time", across=0.001)
     assert browser.value("document.querySelector('#clock').textContent") == "t = 0"
-    assert browser.value("document.querySelector('#time').getAttribute('aria-valuetext')") == "t = 0"
+    assert (
+        browser.value("document.querySelector('#time').getAttribute('aria-valuetext')") == "t = 0"
+    )
     assert (browser.screenshot("#body") != end).mean() > 0.02
     browser.click("#time", across=0.999)
     np.testing.assert_array_equal(browser.screenshot("#body"), end)
@@ -117,14 +124,18 @@ def test_a_click_on_a_curve_goes_to_its_time(browser: Browser, recorded: Recorde
     assert "t = 4" in words and f"{radius:.4g}" in words
 
 
-def test_peeled_to_its_last_layer_an_artery_is_another_colour(browser: Browser, recorded: Recorded) -> None:
+def test_peeled_to_its_last_layer_an_artery_is_another_colour(
+    browser: Browser, recorded: Recorded
+) -> None:
     """Its inner layer has turned towards the circumference, red, its outer one has not."""
     browser.open(recorded("artery") / REPORT)
     browser.choose("#shown", "angle")
 
     def mean_angle() -> float:
         pixels = drawn(body(browser)).astype(float)
-        scale = np.array([[int(one[k : k + 2], 16) for k in (1, 3, 5)] for one in ANGLE_COLOURS], dtype=float)
+        scale = np.array(
+            [[int(one[k : k + 2], 16) for k in (1, 3, 5)] for one in ANGLE_COLOURS], dtype=float
+        )
         level = np.linalg.norm(pixels[:, None] - scale, axis=2).argmin(axis=1)
         return float(level.mean() * 5)
 
@@ -137,7 +148,9 @@ def test_peeled_to_its_last_layer_an_artery_is_another_colour(browser: Browser, 
 
 @pytest.mark.parametrize("control", ["#cut half", "#cut quarter", "#shown coloured", "#shown alone", "#shown angle",
                                      "#shown extension", "#shown shape"])  # fmt: skip
-def test_a_choice_changes_the_picture_and_back(browser: Browser, recorded: Recorded, control: str) -> None:
+def test_a_choice_changes_the_picture_and_back(
+    browser: Browser, recorded: Recorded, control: str
+) -> None:
     browser.open(recorded("artery") / REPORT)
     before = body(browser)
     selector, value = control.split()
@@ -148,7 +161,9 @@ def test_a_choice_changes_the_picture_and_back(browser: Browser, recorded: Recor
     np.testing.assert_array_equal(body(browser), before)
 
 
-def test_downloads_are_the_files_of_the_run(browser: Browser, recorded: Recorded, tmp_path: Path) -> None:
+def test_downloads_are_the_files_of_the_run(
+    browser: Browser, recorded: Recorded, tmp_path: Path
+) -> None:
     folder = recorded("cube")
     browser.open(folder / REPORT)
     browser.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
@@ -175,7 +190,11 @@ def test_every_control_has_a_name(browser: Browser, recorded: Recorded) -> None:
     browser.open(recorded("artery") / REPORT)
     nodes = browser.call("Accessibility.getFullAXTree")["nodes"]
     roles = ("button", "slider", "combobox", "link", "image", "img")
-    found = [(node["role"]["value"], node.get("name", {}).get("value")) for node in nodes if not node["ignored"]]
+    found = [
+        (node["role"]["value"], node.get("name", {}).get("value"))
+        for node in nodes
+        if not node["ignored"]
+    ]
     controls = [one for one in found if one[0] in roles]
     assert len(controls) > 15 and all(name for _, name in controls)
 

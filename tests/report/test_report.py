@@ -40,10 +40,14 @@ class Decoded:
         block = gzip.decompress(base64.b64decode(self.script("page-arrays")))
         self.arrays: dict[str, np.ndarray] = {}
         for name, entry in self.data["arrays"].items():
-            values = np.frombuffer(block, entry["type"], int(np.prod(entry["shape"])), entry["start"])
+            values = np.frombuffer(
+                block, entry["type"], int(np.prod(entry["shape"])), entry["start"]
+            )
             values = values.reshape(entry["shape"])
             if entry["differences"]:
-                values = np.cumsum(values, axis=0, dtype=values.dtype)  # modulo the range of the type
+                values = np.cumsum(
+                    values, axis=0, dtype=values.dtype
+                )  # modulo the range of the type
             self.arrays[name] = values
         self.view: dict[str, Any] = self.data["parts"].get("view", {})
 
@@ -52,13 +56,18 @@ class Decoded:
         return cls((folder / REPORT).read_text(encoding="utf-8"))
 
     def script(self, name: str) -> str:
-        found = re.search(rf'<script type="[a-z/]+" id="{name}">(.*?)</script>', self.text, re.DOTALL)
+        found = re.search(
+            rf'<script type="[a-z/]+" id="{name}">(.*?)</script>', self.text, re.DOTALL
+        )
         assert found is not None
         return found[1]
 
     @property
     def position(self) -> np.ndarray:
-        return np.array(self.view["origin"]) + self.view["position_step"] * self.arrays["view.position"]
+        return (
+            np.array(self.view["origin"])
+            + self.view["position_step"] * self.arrays["view.position"]
+        )
 
     @property
     def angle(self) -> np.ndarray:
@@ -68,21 +77,29 @@ class Decoded:
 
 # ---------------------------------------------------------------- the data
 @pytest.mark.parametrize("kinematics", ["radial", "sector"])
-def test_stresses_through_the_wall_are_those_of_the_columns(kinematics: str, tmp_path: Path) -> None:
+def test_stresses_through_the_wall_are_those_of_the_columns(
+    kinematics: str, tmp_path: Path
+) -> None:
     """Two layers mid-wall, at each time; the mean over the wall as it is now is Laplace's."""
     names = [f"{name}_stress_middle" for name in ("hoop", "axial", "radial")]
     changes = {
         "cells.initial": "isotropic", "model.kinematics": kinematics, "time.end": 3.0, "loads.pressure.value": 2.0,
         "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "output.columns": [*names, "inner_radius", "outer_radius"],
     }  # fmt: skip
-    folder = run_scene(preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes), tmp_path / "run")
+    folder = run_scene(
+        preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes), tmp_path / "run"
+    )
     parts, history = Decoded.from_run(folder).data["parts"], Recording(folder).history
     found = parts["stress"]
     assert "content" not in parts
     layers = np.array(found["layers"])
-    assert layers.shape == (4, 8, 3) and found["through"] == "through the wall (0 inside, 1 outside)"
+    assert (
+        layers.shape == (4, 8, 3) and found["through"] == "through the wall (0 inside, 1 outside)"
+    )
     for component, name in enumerate(("hoop", "axial", "radial")):
-        middle = np.average(layers[:, 3:5, component], axis=1, weights=[1.875, 2.125])  # by their radii
+        middle = np.average(
+            layers[:, 3:5, component], axis=1, weights=[1.875, 2.125]
+        )  # by their radii
         column = history[f"{name}_stress_middle"]
         np.testing.assert_allclose(middle, column, rtol=0.02, atol=0.001 * layers.max())
     inner, outer = (history[f"{face}_radius"][-1] for face in ("inner", "outer"))
@@ -97,7 +114,9 @@ def test_content_and_growth_through_the_wall(tmp_path: Path) -> None:
     }  # fmt: skip
     folder = run_scene(preset_scene("consistent", "tube").with_values(changes), tmp_path / "run")
     found, history = Decoded.from_run(folder).data["parts"]["content"], Recording(folder).history
-    areas, layers = np.diff(np.linspace(1.0, 3.0, len(found["depth"]) + 1) ** 2), np.array(found["layers"])
+    areas, layers = np.diff(np.linspace(1.0, 3.0, len(found["depth"]) + 1) ** 2), np.array(
+        found["layers"]
+    )
     assert found["names"] == ["content", "growth"] and history["growth"][-1] < 0.98
     for number, name in enumerate(found["names"]):
         means = np.average(layers[:, :, number], axis=1, weights=areas)
@@ -118,7 +137,10 @@ def test_the_page_holds_what_was_recorded(recorded: Recorded, name: str) -> None
         fields = run.fields(t)
         places = (run.points + fields["displacement"])[used]
         assert np.abs(found.position[index] - places).max() <= 0.51 * found.view["position_step"]
-        assert np.nanmax(np.abs(found.angle[index] - fields["fibre_angle_deformed"])) < 0.51 * 90 / ANGLE_STEPS
+        assert (
+            np.nanmax(np.abs(found.angle[index] - fields["fibre_angle_deformed"]))
+            < 0.51 * 90 / ANGLE_STEPS
+        )
         stored = found.arrays["view.extension"][index] / 255
         assert np.abs(stored - fields["chain_extension"]).max() < 0.51 / 255 and stored.max() <= 1
         axes = np.stack([fields[f"axis_{k}"] for k in (1, 2, 3)], axis=1)
@@ -133,14 +155,19 @@ def test_the_page_holds_what_was_recorded(recorded: Recorded, name: str) -> None
 def worst_direction(first: np.ndarray, second: np.ndarray) -> float:
     """Largest angle in degrees between two vectors of a row."""
     lengths = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-    return float(np.degrees(np.arccos(np.clip(np.sum(first * second, axis=1) / lengths, -1, 1))).max())
+    return float(
+        np.degrees(np.arccos(np.clip(np.sum(first * second, axis=1) / lengths, -1, 1))).max()
+    )
 
 
 def test_regions_are_shown_by_name(recorded: Recorded) -> None:
     """A curve for each beside those of the body, where each lies in the profile, and what differs in words."""
     found = Decoded.from_run(recorded("layers"))
     regions = found.data["parts"]["angles"]["regions"]
-    assert regions == [{"name": "media", "from": 0.0, "to": 0.5}, {"name": "adventitia", "from": 0.5, "to": 1.0}]
+    assert regions == [
+        {"name": "media", "from": 0.0, "to": 0.5},
+        {"name": "adventitia", "from": 0.5, "to": 1.0},
+    ]
     drawn = found.data["parts"]["curves"]["curves"]
     curves = {curve["title"]: [one["name"] for one in curve["series"]] for curve in drawn}
     places = ("inner", "middle", "outer", "media", "adventitia")
@@ -165,7 +192,11 @@ def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
     assert not [words for words in expected if words not in text]
     radial = html.unescape(Decoded.from_run(recorded("radial")).text)
     said = re.sub("<.*?>", " ", radial[radial.index("What was run"):radial.index("Warnings (")])  # fmt: skip
-    expected = ["cells.initial = isotropic for random", "time.end = 3 for 150", "model.kinematics = radial for full"]
+    expected = [
+        "cells.initial = isotropic for random",
+        "time.end = 3 for 150",
+        "model.kinematics = radial for full",
+    ]
     assert not [words for words in [*expected, "ends free", "law explicit"] if words not in said]
     assert not [words for words in ("Output", "Solver", "turnover") if words in said]
     assert "fibre angle inner (reference)" in radial and "outer radius (reference)" not in radial
@@ -186,7 +217,9 @@ def test_volumes_and_layers_are_those_of_the_body(recorded: Recorded) -> None:
         volume, layer = found.arrays["view.volume"], found.arrays["view.layer"]
         assert volume.sum() == pytest.approx(1.0, rel=1e-5) and set(layer) == set(range(layers))
         depth = found.data["parts"]["angles"]["depth"]
-        np.testing.assert_allclose(depth, (np.arange(layers) + 0.5) / layers, atol=0.03)  # edges are chords
+        np.testing.assert_allclose(
+            depth, (np.arange(layers) + 0.5) / layers, atol=0.03
+        )  # edges are chords
     # rings of equal thickness: their volumes grow like their radii
     found = Decoded.from_run(recorded("artery"))
     shares = np.bincount(found.arrays["view.layer"], weights=found.arrays["view.volume"])
@@ -198,7 +231,9 @@ def test_volumes_and_layers_are_those_of_the_body(recorded: Recorded) -> None:
 def test_reductions_are_shown_as_whole_bodies(recorded: Recorded, name: str) -> None:
     """Their surfaces have the radii, lengths and stretches of the history; chains stay at their angle."""
     run, found = Recording(recorded(name)), Decoded.from_run(recorded(name))
-    assert KINEMATICS[run.scene.model.kinematics].reduced and "shown as the whole body" in found.text
+    assert (
+        KINEMATICS[run.scene.model.kinematics].reduced and "shown as the whole body" in found.text
+    )
     start, end = found.position[0], found.position[-1]
     history = run.history
     length = np.ptp(end[:, 2]) / np.ptp(start[:, 2])
@@ -249,14 +284,26 @@ STARTED = "2026-01-02 03:04:05,678 INFO scene two on 2 ranks, results in x\n"
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A run of two elements and three of its ten steps."""
-    scene = preset_scene("kuhl-holzapfel-2007", "tendon").with_values({"name": "two", "time.end": 10.0})
-    points = np.array([[x, y, z] for z in (0, 1, 2) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=float)
-    (tmp_path / "scene.toml").write_text(scene.to_toml(f"as run\nremodel_fenicsx 9.8.7\nsystem {HOSTILE}"))
-    (tmp_path / "history.csv").write_text("time,force,mean_stretch,odd\n0,0,1,\n1,25,1.1,\n2,50,1.2,\n")
+    scene = preset_scene("kuhl-holzapfel-2007", "tendon").with_values(
+        {"name": "two", "time.end": 10.0}
+    )
+    points = np.array(
+        [[x, y, z] for z in (0, 1, 2) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=float
+    )
+    (tmp_path / "scene.toml").write_text(
+        scene.to_toml(f"as run\nremodel_fenicsx 9.8.7\nsystem {HOSTILE}")
+    )
+    (tmp_path / "history.csv").write_text(
+        "time,force,mean_stretch,odd\n0,0,1,\n1,25,1.1,\n2,50,1.2,\n"
+    )
     (tmp_path / "run.log").write_text(STARTED)
-    with TransientGrid(tmp_path / "fields.vtkhdf", points, np.array([np.arange(8), np.arange(4, 12)]), 12) as grid:
+    with TransientGrid(
+        tmp_path / "fields.vtkhdf", points, np.array([np.arange(8), np.arange(4, 12)]), 12
+    ) as grid:
         for t in (0.0, 1.0, 2.0):
-            grid.append(t, {"displacement": 0.1 * t * points}, {"fibre_angle_deformed": [10 * t, np.nan]})
+            grid.append(
+                t, {"displacement": 0.1 * t * points}, {"fibre_angle_deformed": [10 * t, np.nan]}
+            )
     return tmp_path
 
 
@@ -266,7 +313,9 @@ def folder(tmp_path: Path) -> Path:
     ("INFO ended: SIGTERM", "", "stopped", "at t = 2 of 10: SIGTERM"),
     ("INFO finished", "10,250,1.5,\n", "finished", ""),
 ])  # fmt: skip
-def test_the_state_of_a_run_is_said(folder: Path, lines: str, rows: str, state: str, words: str) -> None:
+def test_the_state_of_a_run_is_said(
+    folder: Path, lines: str, rows: str, state: str, words: str
+) -> None:
     with (folder / "run.log").open("a") as log:
         log.write(f"2026-01-02 03:05:05,678 {lines}\n" if lines else "")
     with (folder / "history.csv").open("a") as history:
@@ -286,18 +335,28 @@ def test_a_run_that_goes_on_is_said_to(folder: Path) -> None:
 
 def test_warnings_come_once_with_their_number(folder: Path) -> None:
     with (folder / "run.log").open("a") as log:
-        log.write("2026-01-02 03:04:06,000 WARNING before all\n2026-01-02 03:04:06,000 INFO time 1, force 25\n")
-        log.write("2026-01-02 03:04:07,000 WARNING locks at 3 points\n2026-01-02 03:04:07,000 INFO time 2, force 50\n")
-        log.write("2026-01-02 03:04:08,000 WARNING locks at 12 points\n2026-01-02 03:04:08,000 WARNING two\nlines\n")
+        log.write(
+            "2026-01-02 03:04:06,000 WARNING before all\n2026-01-02 03:04:06,000 INFO time 1, force 25\n"
+        )
+        log.write(
+            "2026-01-02 03:04:07,000 WARNING locks at 3 points\n2026-01-02 03:04:07,000 INFO time 2, force 50\n"
+        )
+        log.write(
+            "2026-01-02 03:04:08,000 WARNING locks at 12 points\n2026-01-02 03:04:08,000 WARNING two\nlines\n"
+        )
     found = ReportedRun(Recording(folder)).warnings
     assert found == {"before all": 1, "locks at 3 points": 2, "two\nlines": 1}
     text = write_report(folder).read_text()
-    assert "<h2>Warnings (4)</h2>" in text and 'locks at 3 points <span class="note">(2 times)' in text
+    assert (
+        "<h2>Warnings (4)</h2>" in text and 'locks at 3 points <span class="note">(2 times)' in text
+    )
 
 
 def test_text_of_others_is_text(folder: Path) -> None:
     with (folder / "run.log").open("a") as log:
-        log.write(f"2026-01-02 03:04:06,000 WARNING {HOSTILE}\n2026-01-02 03:04:06,000 INFO failed: {HOSTILE}\n")
+        log.write(
+            f"2026-01-02 03:04:06,000 WARNING {HOSTILE}\n2026-01-02 03:04:06,000 INFO failed: {HOSTILE}\n"
+        )
     with (folder / "scene.toml").open("a") as scene:
         scene.write(f"# {HOSTILE} <!--\n")
     history = (folder / "history.csv").read_text()
@@ -310,7 +369,11 @@ def test_text_of_others_is_text(folder: Path) -> None:
 def test_values_that_are_missing_are_left_out(folder: Path) -> None:
     """A column without a number, elements without an angle, fields that were not recorded."""
     found = Decoded(write_report(folder).read_text())
-    names = [series["name"] for curve in found.data["parts"]["curves"]["curves"] for series in curve["series"]]
+    names = [
+        series["name"]
+        for curve in found.data["parts"]["curves"]["curves"]
+        for series in curve["series"]
+    ]
     assert sorted(names) == ["force", "mean stretch"]
     assert np.isnan(found.angle[:, 1]).all() and "view.edges" not in found.arrays
 
@@ -322,9 +385,16 @@ def test_the_policy_names_what_is_in_the_page(folder: Path) -> None:
     assert found is not None
     rules = dict(rule.strip().split(" ", 1) for rule in found[1].split(";"))
     assert rules["default-src"] == rules["connect-src"] == "'none'"
-    for kind, pattern in (("script-src", r"<script>(.*?)</script>"), ("style-src", r"<style>(.*?)</style>")):
-        hashes = [hashlib.sha256(part.encode()).digest() for part in re.findall(pattern, text, re.DOTALL)]
-        assert rules[kind].split() == [f"'sha256-{base64.b64encode(one).decode()}'" for one in hashes]
+    for kind, pattern in (
+        ("script-src", r"<script>(.*?)</script>"),
+        ("style-src", r"<style>(.*?)</style>"),
+    ):
+        hashes = [
+            hashlib.sha256(part.encode()).digest() for part in re.findall(pattern, text, re.DOTALL)
+        ]
+        assert rules[kind].split() == [
+            f"'sha256-{base64.b64encode(one).decode()}'" for one in hashes
+        ]
 
 
 # ---------------------------------------------------------------- the command, and the end of a run
@@ -340,7 +410,15 @@ def test_only_its_own_page_is_made_anew(folder: Path, refused: Refused) -> None:
 
 @pytest.mark.parametrize("words", [["--no-report"], ["--set", "output.report=false"]])
 def test_a_run_leaves_none_where_none_is_wanted(tmp_path: Path, words: list[str]) -> None:
-    command = ["run", DEMOS / "cube.toml", "--set", "time.end=1", "--set", "output.fields=false", *words]
+    command = [
+        "run",
+        DEMOS / "cube.toml",
+        "--set",
+        "time.end=1",
+        "--set",
+        "output.fields=false",
+        *words,
+    ]
     assert forked("remodel-fenicsx", *command, "-o", tmp_path / "run").returncode == 0
     assert (tmp_path / "run" / "history.csv").exists() and not (tmp_path / "run" / REPORT).exists()
 
@@ -352,7 +430,15 @@ def test_a_report_that_fails_is_one_warning(tmp_path: Path) -> None:
         "def fail(*_): raise ValueError('no\\nroom')\n"
         "page.page_of = fail; sys.exit(cli.main(sys.argv[1:]))"
     )
-    command = ["run", str(DEMOS / "cube.toml"), "--set", "time.end=1", "-o", str(tmp_path / "run"), "-q"]
+    command = [
+        "run",
+        str(DEMOS / "cube.toml"),
+        "--set",
+        "time.end=1",
+        "-o",
+        str(tmp_path / "run"),
+        "-q",
+    ]
     done = forked("python", program, *command)
     assert done.returncode == 0 and done.stderr == "WARNING: no report.html: no room\n"
     assert ReportedRun(Recording(tmp_path / "run")).warnings == {"no report.html: no room": 1}

@@ -32,7 +32,9 @@ def observed(made: parts.Body, **size: float) -> Any:
 def wall() -> tuple[parts.Body, Any]:
     """A short tube of four layers."""
     size = {"inner_radius": INNER, "outer_radius": OUTER, "length": LENGTH}
-    made = parts.body(tube(**size, divisions=(8, 4, 1), comm=MPI.COMM_SELF), Cells(initial="isotropic"))
+    made = parts.body(
+        tube(**size, divisions=(8, 4, 1), comm=MPI.COMM_SELF), Cells(initial="isotropic")
+    )
     return made, observed(made, **size)
 
 
@@ -55,7 +57,9 @@ def test_radii_are_means_over_the_deformed_area(wall: tuple[parts.Body, Any]) ->
 def test_layer_angles_are_those_of_the_elements_at_the_radius(wall: tuple[parts.Body, Any]) -> None:
     """A pitch for each layer of elements: the middle radius lies between the second and the third."""
     made, row = wall
-    radius = np.hypot(*made.quadrature.coordinates[..., :2].mean(axis=1).T)  # of the elements' middles
+    radius = np.hypot(
+        *made.quadrature.coordinates[..., :2].mean(axis=1).T
+    )  # of the elements' middles
     layer = np.argsort(np.argsort(radius)) // 8
     pitch = np.radians(np.array([10.0, 30.0, 60.0, 80.0]))[layer][:, None]
     cells = np.stack(np.broadcast_arrays(np.cos(pitch), np.sin(pitch), 0.0), axis=-1)
@@ -88,8 +92,12 @@ def test_chains_out_of_the_wall_have_no_angle(wall: tuple[parts.Body, Any]) -> N
     assert found["fibre_angle_inner"] == pytest.approx(10.0, abs=1e-9)
     assert found["fibre_angle_middle"] == pytest.approx(60.0, abs=1e-9)
     assert np.isnan(found["fibre_angle_outer"])
-    assert found["radial_share"] == pytest.approx((0.5 * 1.25 + 1.75 + (1 - 1e-7) * 2.75) / 8.0, abs=1e-9)
-    for angles in ElementFields(shape, observer.stepper, ("fibre_angle", "fibre_angle_deformed"))().values():
+    assert found["radial_share"] == pytest.approx(
+        (0.5 * 1.25 + 1.75 + (1 - 1e-7) * 2.75) / 8.0, abs=1e-9
+    )
+    for angles in ElementFields(
+        shape, observer.stepper, ("fibre_angle", "fibre_angle_deformed")
+    )().values():
         assert np.isnan(angles[(layer == 1) | (layer == 3)]).all()
         np.testing.assert_allclose(angles[layer == 2], 60.0, atol=1e-9)
 

@@ -21,13 +21,23 @@ FORCES = ["axial_force", "reduced_axial_force"]
 
 
 def scene(kinematics: str, **tables: Any) -> Scene:
-    base = {"loads": ramped(END, pressure=2.4, elongation=0.05), "remodeling": {"kappa": 0.1}, "time": {"end": END}}
-    return scene_from_dict(isotropic(kinematics=kinematics, **base | {"output": {"columns": FORCES}} | tables))
+    base = {
+        "loads": ramped(END, pressure=2.4, elongation=0.05),
+        "remodeling": {"kappa": 0.1},
+        "time": {"end": END},
+    }
+    return scene_from_dict(
+        isotropic(kinematics=kinematics, **base | {"output": {"columns": FORCES}} | tables)
+    )
 
 
-def rows_of(made: Scene, look: Any = None, domain: Any = None) -> tuple[list[dict[str, float]], list[Any]]:
+def rows_of(
+    made: Scene, look: Any = None, domain: Any = None
+) -> tuple[list[dict[str, float]], list[Any]]:
     simulation, seen = Simulation(made, SELF, domain), []
-    for step in simulation.steps([AtSolved(lambda step: seen.append(look(simulation)))] if look else []):
+    for step in simulation.steps(
+        [AtSolved(lambda step: seen.append(look(simulation)))] if look else []
+    ):
         seen.append(step.row)
     simulation.close()
     rows = [found for found in seen if isinstance(found, dict)]
@@ -42,7 +52,9 @@ def test_the_force_is_that_of_the_one_dimensional_reference() -> None:
     thrust = reference.pressures * np.pi * reference.inner_radii**2
     rows, _ = rows_of(scene("radial", mesh={"refinement": 4, "degree": 2}))
     np.testing.assert_allclose([row["axial_force"] for row in rows], wall, rtol=1e-6)
-    np.testing.assert_allclose([row["reduced_axial_force"] for row in rows], wall - thrust, rtol=1e-6)
+    np.testing.assert_allclose(
+        [row["reduced_axial_force"] for row in rows], wall - thrust, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("tables", [{}, {"supports": {"ends": "clamped"}}])
@@ -52,7 +64,10 @@ def test_the_half_plane_and_the_quarter_carry_the_force_of_the_ray(tables: dict[
     for name, tolerance in (("axisymmetric", 1e-9), ("sector", 0.04)):
         rows, _ = rows_of(scene(name, **tables))
         for column in FORCES:
-            assert rows[-1][column] == pytest.approx(rays[-1][column], rel=tolerance), (name, column)
+            assert rows[-1][column] == pytest.approx(rays[-1][column], rel=tolerance), (
+                name,
+                column,
+            )
 
 
 def reaction(simulation: Simulation) -> tuple[float, float]:
@@ -78,10 +93,14 @@ def test_random_cells_pull_at_the_end_with_the_reaction_of_its_nodes(formulation
         assert row["axial_force"] == pytest.approx(top, rel=1e-9)
         assert abs(top + bottom) > 1e-6 * abs(top)
         lumen = (row["axial_force"] - row["reduced_axial_force"]) / row["pressure"]
-        assert lumen == pytest.approx(12 / 2 * np.sin(np.pi / 6) * row["inner_radius"] ** 2, rel=0.02)
+        assert lumen == pytest.approx(
+            12 / 2 * np.sin(np.pi / 6) * row["inner_radius"] ** 2, rel=0.02
+        )
 
 
-@pytest.mark.parametrize("kinematics", ["radial", pytest.param("axisymmetric", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kinematics", ["radial", pytest.param("axisymmetric", marks=pytest.mark.slow)]
+)
 def test_closed_ends_need_no_force_and_a_load_is_what_a_machine_measures(kinematics: str) -> None:
     for force in (0.0, 5.0):
         loads = ramped(END, pressure=2.4, elongation=0.0, axial_force=force)
@@ -89,14 +108,20 @@ def test_closed_ends_need_no_force_and_a_load_is_what_a_machine_measures(kinemat
         given = [force * row["time"] / END for row in rows]
         np.testing.assert_allclose([row["reduced_axial_force"] for row in rows], given, atol=1e-8)
         thrust = [row["pressure"] * np.pi * row["inner_radius"] ** 2 for row in rows]
-        np.testing.assert_allclose([row["axial_force"] for row in rows], np.add(given, thrust), atol=1e-8)
-    rows, _ = rows_of(scene(kinematics, loads=loads))  # free ends: the load is the force of the wall
+        np.testing.assert_allclose(
+            [row["axial_force"] for row in rows], np.add(given, thrust), atol=1e-8
+        )
+    rows, _ = rows_of(
+        scene(kinematics, loads=loads)
+    )  # free ends: the load is the force of the wall
     np.testing.assert_allclose([row["axial_force"] for row in rows], given, atol=1e-8)
 
 
 def test_the_tensor_law_pulls_with_what_its_energy_says() -> None:
     """dW/de at fixed radii and cells is the work of stresses along the axis: a difference of two energies."""
-    made = scene("radial", remodeling={"law": "tensor", "kappa": 0.1}, material={"repulsion": "log"})
+    made = scene(
+        "radial", remodeling={"law": "tensor", "kappa": 0.1}, material={"repulsion": "log"}
+    )
     simulation = Simulation(made, SELF)
     column = next(column for column in simulation.observer.columns if column.name == "axial_force")
     energies = []
@@ -121,9 +146,14 @@ def test_a_column_that_a_scene_cannot_have_is_refused_before_anything_runs(
     """In `validate` and in `run`, in one line that names what is allowed; fields too."""
     place = tmp_path / "scene.toml"
     place.write_text('preset = "kuhl-holzapfel-2007"\n[geometry]\nshape = "cube"\n')
-    for key, name, allowed in (("columns", "axial_force", "'force'"), ("fields", "stress", "'cauchy_stress'")):
+    for key, name, allowed in (
+        ("columns", "axial_force", "'force'"),
+        ("fields", "stress", "'cauchy_stress'"),
+    ):
         for command in (["validate"], ["run", "-o", str(tmp_path / "out")]):
-            code = cli.main([command[0], str(place), f"--set=output.{key}=['{name}']", *command[1:]])
+            code = cli.main(
+                [command[0], str(place), f"--set=output.{key}=['{name}']", *command[1:]]
+            )
             error = capfd.readouterr().err
             assert code == 2 and error.count("\n") == 1 and not (tmp_path / "out").exists()
             assert f"'{name}'" in error and f"output.{key}" in error and allowed in error

@@ -33,7 +33,20 @@ MESHES = {
 }
 # nodes of an element that lie between two of its corners: Abaqus, C3D20 and C3D10; FEBio counts like it
 BETWEEN = {
-    20: [(1, 2), (2, 3), (3, 4), (4, 1), (5, 6), (6, 7), (7, 8), (8, 5), (1, 5), (2, 6), (3, 7), (4, 8)],
+    20: [
+        (1, 2),
+        (2, 3),
+        (3, 4),
+        (4, 1),
+        (5, 6),
+        (6, 7),
+        (7, 8),
+        (8, 5),
+        (1, 5),
+        (2, 6),
+        (3, 7),
+        (4, 8),
+    ],
     10: [(1, 2), (2, 3), (3, 1), (1, 4), (2, 4), (3, 4)],
 }
 
@@ -62,10 +75,14 @@ def start(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "history.csv").write_text("time\n")
     domain = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
     points, elements = domain.gather_mesh()
-    cell_type, cells = vtk_cells(domain.mesh.topology.cell_name(), domain.mesh.geometry.cmap.degree, elements)
+    cell_type, cells = vtk_cells(
+        domain.mesh.topology.cell_name(), domain.mesh.geometry.cmap.degree, elements
+    )
     draw = np.random.default_rng(1).standard_normal
     axes = np.linalg.qr(draw((len(cells), 3, 3)))[0]
-    values = dict(zip(CELLS, [np.abs(draw((len(cells), 3))), *np.moveaxis(axes, 1, 0)], strict=True))
+    values = dict(
+        zip(CELLS, [np.abs(draw((len(cells), 3))), *np.moveaxis(axes, 1, 0)], strict=True)
+    )
     with TransientGrid(tmp_path / "fields.vtkhdf", points, cells, cell_type) as grid:
         grid.append(0.0, {"displacement": draw(points.shape)}, values)
     return tmp_path
@@ -79,7 +96,8 @@ def recorded_tensors(recording: Recording, time: float) -> np.ndarray:
     fields = recording.fields(time)
     axes = [fields[f"axis_{i + 1}"] for i in range(3)]
     return sum(
-        fields["cell_dimensions"][:, i, None, None] ** 2 * axes[i][:, :, None] * axes[i][:, None, :] for i in range(3)
+        fields["cell_dimensions"][:, i, None, None] ** 2 * axes[i][:, :, None] * axes[i][:, None, :]
+        for i in range(3)
     )
 
 
@@ -105,11 +123,15 @@ class Solid:
     def tensors(self) -> np.ndarray:
         """A of the elements by their number, which begins with 1."""
         order = range(1, len(self.elements) + 1)
-        return from_axes(*(np.array([values[n] for n in order]) for values in (self.a, self.d, self.dimensions)))
+        return from_axes(
+            *(np.array([values[n] for n in order]) for values in (self.a, self.d, self.dimensions))
+        )
 
     def places(self) -> np.ndarray:
         """Of the nodes of each element."""
-        return np.array([[self.nodes[n] for n in self.elements[e]] for e in range(1, len(self.elements) + 1)])
+        return np.array(
+            [[self.nodes[n] for n in self.elements[e]] for e in range(1, len(self.elements) + 1)]
+        )
 
 
 def read_febio(path: Path) -> Solid:
@@ -122,8 +144,12 @@ def read_febio(path: Path) -> Solid:
     )
     solid, (nodes, elements) = Solid(), root[0]
     assert (nodes.tag, elements.tag) == ("Nodes", "Elements")
-    solid.nodes = {int(node.attrib["id"]): numbers(node.text) for node in nodes if node.tag == "node"}
-    solid.elements = {int(e.attrib["id"]): [int(n) for n in (e.text or "").split(",")] for e in elements}
+    solid.nodes = {
+        int(node.attrib["id"]): numbers(node.text) for node in nodes if node.tag == "node"
+    }
+    solid.elements = {
+        int(e.attrib["id"]): [int(n) for n in (e.text or "").split(",")] for e in elements
+    }
     solid.kind, part = elements.attrib["type"], list(solid.elements)
     for data in root[1]:
         assert (data.tag, data.attrib["elem_set"]) == ("ElementData", elements.attrib["name"])
@@ -147,14 +173,19 @@ def read_abaqus(path: Path) -> Solid:
     """Abaqus Keywords Reference Guide: keyword lines, data lines, ** comments; after a comma a data line goes on."""
     solid, text = Solid(), path.read_text()
     assert text.isascii() and max(map(len, text.splitlines())) <= 256
-    blocks = re.findall(r"^\*(\w[^,\n]*)(.*)\n((?:[^*].*\n)*)", re.sub(r"^\*\*.*\n", "", text, flags=re.M), re.M)
+    blocks = re.findall(
+        r"^\*(\w[^,\n]*)(.*)\n((?:[^*].*\n)*)", re.sub(r"^\*\*.*\n", "", text, flags=re.M), re.M
+    )
     found = {keyword: body.replace(",\n", ",").splitlines() for keyword, _, body in blocks}
     options = {keyword: said for keyword, said, _ in blocks}
     rows = {keyword: [line.split(",") for line in lines] for keyword, lines in found.items()}
     solid.kind = options["ELEMENT"].split("TYPE=")[1].split(",")[0]
     solid.nodes = {int(line[0]): [float(x) for x in line[1:]] for line in rows["NODE"]}
     solid.elements = {int(line[0]): [int(n) for n in line[1:]] for line in rows["ELEMENT"]}
-    assert found["DISTRIBUTION TABLE"] == ["COORD3D, COORD3D"] and "LOCATION=ELEMENT" in options["DISTRIBUTION"]
+    assert (
+        found["DISTRIBUTION TABLE"] == ["COORD3D, COORD3D"]
+        and "LOCATION=ELEMENT" in options["DISTRIBUTION"]
+    )
     assert "DEFINITION=COORDINATES" in options["ORIENTATION"]
     default, *axes = rows["DISTRIBUTION"]
     assert default[0] == "", "the first line is the default"
@@ -168,26 +199,38 @@ def read_abaqus(path: Path) -> Solid:
 
 
 @pytest.mark.parametrize(("kind", "reader"), [("febio", read_febio), ("abaqus", read_abaqus)])
-def test_other_programs_get_the_structure_tensor_of_each_element(kind: str, reader: Any, recorded: Path) -> None:
+def test_other_programs_get_the_structure_tensor_of_each_element(
+    kind: str, reader: Any, recorded: Path
+) -> None:
     recording = Recording(recorded)
     for time in (0.0, 2.0):
         path = recorded / f"{kind}-{time}"
-        assert cli.main(["export", str(recorded), "--format", kind, "-o", str(path), "--time", str(time)]) == 0
+        assert (
+            cli.main(
+                ["export", str(recorded), "--format", kind, "-o", str(path), "--time", str(time)]
+            )
+            == 0
+        )
         found = reader(path).tensors()
         np.testing.assert_allclose(found, recorded_tensors(recording, time), rtol=0, atol=1e-6)
     assert np.abs(recorded_tensors(recording, 0.0) - recorded_tensors(recording, 2.0)).max() > 0.01
-    np.testing.assert_allclose(reader(exported(recorded, kind)).tensors(), found, rtol=0, atol=0)  # the last one
+    np.testing.assert_allclose(
+        reader(exported(recorded, kind)).tensors(), found, rtol=0, atol=0
+    )  # the last one
 
 
 @pytest.mark.parametrize(("kind", "reader"), [("febio", read_febio), ("abaqus", read_abaqus)])
-def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(kind: str, reader: Any, start: Path) -> None:
+def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(
+    kind: str, reader: Any, start: Path
+) -> None:
     """Corners turn around so that the volume is positive; nodes of edges lie between the corners that manuals name."""
     recording, solid = Recording(start), reader(exported(start, kind))
     places, corners = solid.places(), 8 if solid.kind in ("hex8", "hex20", "C3D8", "C3D20") else 4
     assert int("".join(filter(str.isdigit, solid.kind[3:]))) == places.shape[1]
     assert set(solid.nodes) == {node for nodes in solid.elements.values() for node in nodes}
     np.testing.assert_array_equal(
-        places.mean(axis=1).round(9), recording.points[recording.elements[:, : places.shape[1]]].mean(axis=1).round(9)
+        places.mean(axis=1).round(9),
+        recording.points[recording.elements[:, : places.shape[1]]].mean(axis=1).round(9),
     )
     last = places[:, 4 if corners == 8 else 3]
     sides = [places[:, 1], places[:, 3 if corners == 8 else 2], last]
@@ -195,10 +238,14 @@ def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(kind: str,
     for node, (i, j) in enumerate(BETWEEN.get(places.shape[1], []), start=corners):
         ends = places[:, i - 1], places[:, j - 1]
         chord = np.linalg.norm(ends[1] - ends[0], axis=1)
-        assert (np.linalg.norm(places[:, node] - (ends[0] + ends[1]) / 2, axis=1) < 0.25 * chord).all(), (node, i, j)
+        assert (
+            np.linalg.norm(places[:, node] - (ends[0] + ends[1]) / 2, axis=1) < 0.25 * chord
+        ).all(), (node, i, j)
 
 
-def test_what_means_of_elements_leave_out_is_said(start: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_means_of_elements_leave_out_is_said(
+    start: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """The largest difference of A from the mean at a node, which elements with one point do not lose."""
     mesh = meshio.read(exported(start, "vtu"), file_format="vtu")
     said = re.findall(r"they differ by up to ([\d.]+) % of tr A", caplog.text)
@@ -222,8 +269,12 @@ def test_vtu_and_csv_hold_the_same(start: Path) -> None:
     (elements,) = mesh.cells
     np.testing.assert_array_equal(mesh.points, recording.points)
     np.testing.assert_array_equal(elements.data, recording.elements)
-    np.testing.assert_array_equal(mesh.point_data["displacement"], recording.fields(0.0)["displacement"])
-    np.testing.assert_allclose(mesh.cell_data["structure_tensor"][0].reshape(-1, 3, 3), tensors, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(
+        mesh.point_data["displacement"], recording.fields(0.0)["displacement"]
+    )
+    np.testing.assert_allclose(
+        mesh.cell_data["structure_tensor"][0].reshape(-1, 3, 3), tensors, rtol=0, atol=1e-15
+    )
     for name in CELLS:
         np.testing.assert_array_equal(mesh.cell_data[name][0], recording.fields(0.0)[name])
     rows = list(csv.DictReader(exported(start, "csv").read_text().splitlines()))
@@ -231,10 +282,14 @@ def test_vtu_and_csv_hold_the_same(start: Path) -> None:
     found = [[float(row[f"structure_tensor_{i}{j}"]) for i in "xyz" for j in "xyz"] for row in rows]
     np.testing.assert_allclose(np.reshape(found, (-1, 3, 3)), tensors, rtol=0, atol=1e-15)
     middle = [[float(row[i]) for i in "xyz"] for row in rows]
-    np.testing.assert_allclose(middle, recording.points[recording.elements].mean(axis=1), atol=1e-12)
+    np.testing.assert_allclose(
+        middle, recording.points[recording.elements].mean(axis=1), atol=1e-12
+    )
 
 
-def test_what_cannot_be_exported_is_said_in_a_line(recorded: Path, tmp_path: Path, refused: Refused) -> None:
+def test_what_cannot_be_exported_is_said_in_a_line(
+    recorded: Path, tmp_path: Path, refused: Refused
+) -> None:
     def said(*words: str | Path, folder: Path = recorded) -> str:
         found = refused("export", folder, "--format", "csv", "-o", tmp_path / "new.csv", *words)
         assert not (tmp_path / "new.csv").exists()
@@ -245,6 +300,9 @@ def test_what_cannot_be_exported_is_said_in_a_line(recorded: Path, tmp_path: Pat
     assert "old.csv: already exists" in said("-o", tmp_path / "old.csv")
     assert (tmp_path / "old.csv").read_text() == "dear"
     cube = {"geometry": {"shape": "cube"}, "model": {"kinematics": "point"}, "time": {"end": 1.0}}
-    for name, table in (("kinematics", {}), ("fields", {"model": {}, "output": {"fields": ["displacement"]}})):
+    for name, table in (
+        ("kinematics", {}),
+        ("fields", {"model": {}, "output": {"fields": ["displacement"]}}),
+    ):
         folder = run(Scene(preset="kuhl-holzapfel-2007", **cube | table), tmp_path / name)
         assert name in said(folder=folder)

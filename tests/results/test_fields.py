@@ -24,10 +24,16 @@ SIZE = {"inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0}
 
 
 # ---------------------------------------------------------------- which steps
-def recorded(folder: Path, end: float, every: int) -> tuple[dict[float, float], dict[float, Step], Simulation]:
+def recorded(
+    folder: Path, end: float, every: int
+) -> tuple[dict[float, float], dict[float, Step], Simulation]:
     """Fibre angle of the paper's cube in the fields by time, the steps by time, and the simulation at the end."""
     scene = scene_from_dict(
-        {"preset": "kuhl-holzapfel-2007", "geometry": {"shape": "cube"}, "time": {"end": end, "step": 1.0}}
+        {
+            "preset": "kuhl-holzapfel-2007",
+            "geometry": {"shape": "cube"},
+            "time": {"end": end, "step": 1.0},
+        }
     )
     simulation = Simulation(scene, MPI.COMM_SELF)
     with Fields(folder, scene.geometry, simulation.stepper, every) as fields:
@@ -40,7 +46,9 @@ def recorded(folder: Path, end: float, every: int) -> tuple[dict[float, float], 
 
 
 @pytest.mark.parametrize(("end", "times"), [(3.0, [0.0, 2.0, 3.0]), (4.0, [0.0, 2.0, 4.0])])
-def test_every_second_step_the_first_and_the_last_have_fields(end: float, times: list[float], tmp_path: Path) -> None:
+def test_every_second_step_the_first_and_the_last_have_fields(
+    end: float, times: list[float], tmp_path: Path
+) -> None:
     fields, steps, _ = recorded(tmp_path, end, every=2)
     assert list(fields) == times
     assert list(steps) == [float(k) for k in range(1, int(end) + 1)]
@@ -56,7 +64,9 @@ def test_fields_and_row_belong_to_the_cells_before_the_pass(tmp_path: Path) -> N
     for time, angle in rows.items():
         assert fields[time] == pytest.approx(angle, rel=1e-6)  # fields have seven digits
     cells = simulation.cells
-    now = simulation.scene.geometry.fibre_angle(cells.dimension_values, cells.axis_values, cells.local_axes.axes)
+    now = simulation.scene.geometry.fibre_angle(
+        cells.dimension_values, cells.axis_values, cells.local_axes.axes
+    )
     assert now.max() < rows[3.0] - 0.5
 
 
@@ -73,20 +83,26 @@ def test_what_the_pass_tells_comes_into_the_row_after_it(tmp_path: Path) -> None
 @pytest.fixture
 def wall() -> tuple[parts.Body, ElementFields]:
     """A short tube whose cells are random helices in its wall, with some radial chains."""
-    made = parts.body(tube(**SIZE, divisions=(8, 2, 1), comm=MPI.COMM_SELF), Cells(axes="cylindrical")).supported()
+    made = parts.body(
+        tube(**SIZE, divisions=(8, 2, 1), comm=MPI.COMM_SELF), Cells(axes="cylindrical")
+    ).supported()
     lengths = np.random.default_rng(1).uniform(0.3, 0.8, made.cells.dimension_values.shape)
     made.cells.set(lengths, cylindrical_axes(made.quadrature.coordinates))
     shape: Shape = SHAPES["tube"](shape="tube", **SIZE)
     return made, ElementFields(shape, made.stepper(lambda t: {}))
 
 
-def test_a_turn_about_the_tubes_axis_changes_no_fibre_angle(wall: tuple[parts.Body, ElementFields]) -> None:
+def test_a_turn_about_the_tubes_axis_changes_no_fibre_angle(
+    wall: tuple[parts.Body, ElementFields],
+) -> None:
     """Deformed chains belong to the deformed place: what was circumferential is so after a turn."""
     made, fields = wall
     made.set_displacement(made.nodes @ parts.rotation((0.0, 0.0, 1.0), 70.0).T - made.nodes)
     found = fields()
     assert np.ptp(found["fibre_angle"]) > 1.0
-    np.testing.assert_allclose(found["fibre_angle_deformed"], found["fibre_angle"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        found["fibre_angle_deformed"], found["fibre_angle"], rtol=0, atol=1e-9
+    )
 
 
 def test_elongation_turns_deformed_chains_and_leaves_the_reference_angle(
@@ -102,18 +118,26 @@ def test_elongation_turns_deformed_chains_and_leaves_the_reference_angle(
         np.testing.assert_allclose(found[name], mean, rtol=1e-12, err_msg=name)
 
 
-def test_chain_extension_is_the_largest_in_the_element(wall: tuple[parts.Body, ElementFields]) -> None:
+def test_chain_extension_is_the_largest_in_the_element(
+    wall: tuple[parts.Body, ElementFields],
+) -> None:
     made, fields = wall
     l = made.cells.dimension_values  # noqa: E741
     made.set_displacement(made.nodes * [0.1, 0.1, 0.5])
     length = np.sqrt((1.1 * l[..., 0]) ** 2 + (1.5 * l[..., 1]) ** 2 + (1.1 * l[..., 2]) ** 2)
     found = fields()
-    np.testing.assert_allclose(found["chain_extension"], length.max(axis=1) / parts.MATERIAL.contour_length, rtol=1e-12)
+    np.testing.assert_allclose(
+        found["chain_extension"], length.max(axis=1) / parts.MATERIAL.contour_length, rtol=1e-12
+    )
     gradient = np.diag([1.1, 1.1, 1.5]).ravel()
-    np.testing.assert_allclose(found["deformation_gradient"], np.tile(gradient, (len(length), 1)), atol=1e-13)
+    np.testing.assert_allclose(
+        found["deformation_gradient"], np.tile(gradient, (len(length), 1)), atol=1e-13
+    )
 
 
-def test_the_cell_of_an_element_has_its_mean_structure_tensor(wall: tuple[parts.Body, ElementFields]) -> None:
+def test_the_cell_of_an_element_has_its_mean_structure_tensor(
+    wall: tuple[parts.Body, ElementFields],
+) -> None:
     made, fields = wall
     found = fields()
     lengths = found["cell_dimensions"]

@@ -32,7 +32,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("drawn_by_forks")
-@pytest.mark.parametrize("kept", ["run-0.2.0", "run-0.3.0", "run-0.4.0", "layers-0.3.0", "layers-0.4.0"])
+@pytest.mark.parametrize(
+    "kept", ["run-0.2.0", "run-0.3.0", "run-0.4.0", "layers-0.3.0", "layers-0.4.0"]
+)
 def test_folders_of_each_release_are_whole_for_each_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: str
 ) -> None:
@@ -45,23 +47,41 @@ def test_folders_of_each_release_are_whole_for_each_command(
     np.testing.assert_array_equal(Recording(folder).times, np.arange(5.0))
 
 
-def test_a_run_with_the_coupling_that_went_is_read_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_with_the_coupling_that_went_is_read_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Of 'implicit'; going on is refused with a line that says who can, and what new runs take."""
     folder = unpacked("implicit-0.4.0", tmp_path)
     for words in ("status", "report"):
         assert cli.main([words, str(folder)]) == 0
     assert Recording(folder).scene.remodeling.coupling == "implicit"
     assert cli.main(["run", "--resume", str(folder), "--set", "time.end=3"]) == 2
-    assert "remodeling.coupling = 'implicit': this run can only be continued by version" in capsys.readouterr().err
+    assert (
+        "remodeling.coupling = 'implicit': this run can only be continued by version"
+        in capsys.readouterr().err
+    )
 
 
 def test_it_goes_on_as_if_this_version_had_begun_it(folder: Path, tmp_path: Path) -> None:
     """The same rows, and the log says that the version is another one."""
-    assert cli.main(["run", "--resume", str(folder), "--set", "time.end=5", "-q", "--no-report"]) == 0
-    whole = Recording(run(preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 5.0}), tmp_path / "new"))
+    assert (
+        cli.main(["run", "--resume", str(folder), "--set", "time.end=5", "-q", "--no-report"]) == 0
+    )
+    whole = Recording(
+        run(
+            preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 5.0}),
+            tmp_path / "new",
+        )
+    )
     found, expected = Recording(folder).history, whole.history
     np.testing.assert_array_equal(found["time"], expected["time"])
-    for name in ("force", "mean_stretch", "mean_fibre_angle", "max_chain_extension", "stored_energy"):
+    for name in (
+        "force",
+        "mean_stretch",
+        "mean_fibre_angle",
+        "max_chain_extension",
+        "stored_energy",
+    ):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-7, err_msg=name)
     said = f"resumes with remodel_fenicsx {__version__}, but was started with 0.2.0"
     assert said in (folder / "run.log").read_text()

@@ -18,14 +18,18 @@ from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 
-POINTS = np.array([[x, y, z] for z in (0, 1, 2) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=float)
+POINTS = np.array(
+    [[x, y, z] for z in (0, 1, 2) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=float
+)
 ELEMENTS = np.array([np.arange(8), np.arange(4, 12)])
 TIMES = (0.0, 1.0, 2.0)
 
 
 def scene() -> Scene:
     """The scene of the recording."""
-    return scene_from_dict({"name": "two", "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tendon"}})
+    return scene_from_dict(
+        {"name": "two", "preset": "kuhl-holzapfel-2007", "geometry": {"shape": "tendon"}}
+    )
 
 
 def displacement(time: float) -> np.ndarray:
@@ -40,13 +44,19 @@ def tensor(time: float) -> np.ndarray:
 
 def write_step(grid: TransientGrid, time: float) -> None:
     """As a run does."""
-    grid.append(time, {"displacement": displacement(time)}, {"fibre_angle": [time, 2.0], "stress": tensor(time)})
+    grid.append(
+        time,
+        {"displacement": displacement(time)},
+        {"fibre_angle": [time, 2.0], "stress": tensor(time)},
+    )
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """What a run leaves: two elements, three times."""
-    (tmp_path / "scene.toml").write_text(scene().to_toml("as run\nremodel_fenicsx 9.8.7\nsystem a b c"))
+    (tmp_path / "scene.toml").write_text(
+        scene().to_toml("as run\nremodel_fenicsx 9.8.7\nsystem a b c")
+    )
     (tmp_path / "history.csv").write_text(
         "time,force,substeps,pass_residual\n1.0,0.1,1,\n2.0,0.30000000000000004,3,0.5\n"
     )
@@ -81,7 +91,10 @@ def test_a_time_or_column_that_is_not_there_is_named_with_those_that_are(folder:
     for ask, words in (
         (lambda: recording.fields(1.5), "time 1.5; recorded are 0, 1, 2"),
         (lambda: recording.value("force", 0.0), "time 0; recorded are 1, 2"),
-        (lambda: recording.value("radius", 1.0), "'radius'; there are time, force, substeps, pass_residual"),
+        (
+            lambda: recording.value("radius", 1.0),
+            "'radius'; there are time, force, substeps, pass_residual",
+        ),
     ):
         with pytest.raises(RecordingError, match=f"{words}$"):
             ask()
@@ -102,7 +115,9 @@ def test_a_run_under_way_is_read(tmp_path: Path) -> None:
             recording = Recording(tmp_path)
             assert recording.times.tolist() == [*TIMES[:count]]
             assert recording.history["force"].tolist() == [2 * time for time in TIMES[:count]]
-            np.testing.assert_array_equal(recording.fields(time)["displacement"], displacement(time))
+            np.testing.assert_array_equal(
+                recording.fields(time)["displacement"], displacement(time)
+            )
     history.close()
 
 
@@ -119,7 +134,9 @@ def test_the_history_as_a_frame(folder: Path, monkeypatch: pytest.MonkeyPatch) -
 # ---------------------------------------------------------------- what is no recorded run
 
 
-def test_what_is_no_folder_of_a_run_is_refused(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_what_is_no_folder_of_a_run_is_refused(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     other = tmp_path_factory.mktemp("other")
     for path, words in (
         (other / "nowhere", "no such folder"), (folder / "history.csv", "is a file"), (other, "no scene.toml")
@@ -148,7 +165,11 @@ def test_the_page_shows_what_reads_results_without_dolfinx(
     folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Recording(" in block]
+    (code,) = [
+        block
+        for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+        if "Recording(" in block
+    ]
     place = tmp_path_factory.mktemp("place")
     shutil.copytree(folder, place / "results" / "artery")
     environment = os.environ | {"PYTHONPATH": str(Path(run_folder.__file__).parents[2])}

@@ -31,7 +31,11 @@ VALUES: dict[str, Any] = {
 WHOLE = VALUES | {"model": {"kinematics": "sector"}, "time": {"end": 3.0},
                   "regions": VALUES["regions"] | {"adventitia": {"cells": {"initial": "random"}}}}  # fmt: skip
 ON_ONE_AND_TWO_RANKS = [{"scene": WHOLE}]
-COLUMNS = [f"{name}_{region}" for region in ("media", "adventitia") for name in ("fibre_angle", "max_chain_extension")]
+COLUMNS = [
+    f"{name}_{region}"
+    for region in ("media", "adventitia")
+    for name in ("fibre_angle", "max_chain_extension")
+]
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +49,22 @@ def test_the_columns_of_regions_share_out_those_of_the_body(recorded: Path) -> N
     history = Recording(recorded).history
     names = list(history)
     assert [name for name in names if name in COLUMNS] == COLUMNS, "in the order of the scene"
-    assert names.index("fibre_angle_outer") < names.index(COLUMNS[0]) < names.index("max_chain_extension")
-    larger = np.maximum(history["max_chain_extension_media"], history["max_chain_extension_adventitia"])
+    assert (
+        names.index("fibre_angle_outer")
+        < names.index(COLUMNS[0])
+        < names.index("max_chain_extension")
+    )
+    larger = np.maximum(
+        history["max_chain_extension_media"], history["max_chain_extension_adventitia"]
+    )
     np.testing.assert_allclose(larger, history["max_chain_extension"], rtol=1e-12)
     assert np.all(history["max_chain_extension_media"] != history["max_chain_extension_adventitia"])
     start = [history[f"fibre_angle_{name}"][0] for name in ("media", "adventitia")]
     assert start == pytest.approx([45.0, 90.0])
     recording = Recording(recorded)
-    for row, time in enumerate(recording.times):  # means of elements, as the fields have them: cells of a row are equal
+    for row, time in enumerate(
+        recording.times
+    ):  # means of elements, as the fields have them: cells of a row are equal
         fields = recording.fields(time)
         areas = np.diff(np.sort(recording.points[:, 0]) ** 2)
         for region, name in enumerate(("media", "adventitia"), start=1):
@@ -65,7 +77,10 @@ def test_only_what_is_asked_for_is_measured() -> None:
     with made(Scene(**VALUES | {"output": {"columns": ["fibre_angle_media"]}})) as simulation:
         assert [column.name for column in simulation.observer.columns][-1] == "fibre_angle_media"
         assert len(simulation.observer.columns) == 4, "time, loads and it"
-    with pytest.raises(SceneError, match="output.columns = 'fibre_angle_intima': no such column on request; allowed"):
+    with pytest.raises(
+        SceneError,
+        match="output.columns = 'fibre_angle_intima': no such column on request; allowed",
+    ):
         Scene(**VALUES | {"output": {"columns": ["fibre_angle_intima"]}})
 
 
@@ -90,7 +105,9 @@ def test_it_goes_on_to_the_last_bit(recorded: Path, tmp_path: Path) -> None:
     half = run(Scene(**VALUES | {"time": {"end": 2.0}}), tmp_path / "half")
     resume(half, ["time.end=4.0"])
     assert_same(half, recorded)
-    with pytest.raises(SceneError, match="^regions.media.remodeling.kappa = 0.2: was 0.1; a resumed run may change"):
+    with pytest.raises(
+        SceneError, match="^regions.media.remodeling.kappa = 0.2: was 0.1; a resumed run may change"
+    ):
         resume(half, ["regions.media.remodeling.kappa=0.2"])
 
 

@@ -113,7 +113,9 @@ def test_a_finished_run_is_lengthened(half: Path, whole: Path) -> None:
     go_on(half)
     assert_same(half, whole)
     log = (half / "run.log").read_text()
-    assert "resumes from the checkpoint of time 6, step 6" in log and log.count("INFO finished") == 2
+    assert (
+        "resumes from the checkpoint of time 6, step 6" in log and log.count("INFO finished") == 2
+    )
 
 
 def test_a_run_at_its_end_stays_as_it_is(half: Path) -> None:
@@ -162,7 +164,9 @@ def test_the_generation_before_counts_where_the_newest_is_damaged(half: Path, wh
 
 
 @pytest.mark.parametrize("missing", [(), ("history.csv",), ("fields.vtkhdf", "history.csv")])
-def test_without_a_checkpoint_it_starts_again(half: Path, whole: Path, missing: tuple[str, ...]) -> None:
+def test_without_a_checkpoint_it_starts_again(
+    half: Path, whole: Path, missing: tuple[str, ...]
+) -> None:
     for name in ("checkpoint-a.npz", "checkpoint-b.npz", *missing):
         (half / name).unlink()
     go_on(half)
@@ -194,7 +198,9 @@ def test_a_run_stops_before_its_time_is_over_and_goes_on(tmp_path: Path, whole: 
     assert_same(folder, whole)
 
 
-def test_a_signal_lets_the_step_end(tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_lets_the_step_end(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     solve = Staggered.solve
 
     def signalled(self: Staggered, time: float, loads: dict[str, float]) -> Any:
@@ -215,12 +221,16 @@ def test_a_signal_lets_the_step_end(tmp_path: Path, whole: Path, monkeypatch: py
 
 # ---------------------------------------------------------------- refusals
 @pytest.mark.parametrize(("change", "message"), table(__file__, "other_scenes.txt"))
-def test_another_scene_is_refused_and_nothing_changes(half: Path, change: str, message: str) -> None:
+def test_another_scene_is_refused_and_nothing_changes(
+    half: Path, change: str, message: str
+) -> None:
     before = {path.name: path.read_bytes() for path in half.iterdir() if path.name != "run.log"}
     with pytest.raises((SceneError, RecordingError)) as refusal:
         resume(half, [change], SELF)
     assert message in str(refusal.value) and "\n" not in str(refusal.value)
-    assert {path.name: path.read_bytes() for path in half.iterdir() if path.name != "run.log"} == before
+    assert {
+        path.name: path.read_bytes() for path in half.iterdir() if path.name != "run.log"
+    } == before
 
 
 def test_another_mesh_is_refused(half: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,7 +256,10 @@ def test_what_may_change_changes(half: Path) -> None:
 
 
 def test_a_folder_that_a_run_writes_is_refused(half: Path) -> None:
-    with RunLock(half), pytest.raises(FolderTaken, match=f"half: process {os.getpid()} on .* writes in it"):
+    with (
+        RunLock(half),
+        pytest.raises(FolderTaken, match=f"half: process {os.getpid()} on .* writes in it"),
+    ):
         resume(half, [], SELF)
     assert lock_holder(half) == (None, False)
     resume(half, [], SELF)
@@ -266,7 +279,9 @@ def test_a_scene_that_was_cut_and_is_valid_still_is_refused(half: Path, last: st
     cut = next(number for number, line in enumerate(lines) if line.startswith(last))
     (half / "scene.toml").write_text("".join(lines[:cut]))
     before = (half / "history.csv").read_bytes()
-    with pytest.raises(RecordingError, match=r"scene.toml: lacks (output|solver)\.[a-z_]+, which the run had"):
+    with pytest.raises(
+        RecordingError, match=r"scene.toml: lacks (output|solver)\.[a-z_]+, which the run had"
+    ):
         resume(half, ["time.end=9.0"], SELF)
     assert (half / "history.csv").read_bytes() == before
 
@@ -275,7 +290,10 @@ def test_fields_that_are_gone_begin_with_the_next_step(half: Path) -> None:
     (half / "fields.vtkhdf").unlink()
     resume(half, ["time.end=9.0", "output.every=1"], SELF)
     assert Recording(half).times.tolist() == [7.0, 8.0, 9.0]
-    assert "WARNING fields.vtkhdf is missing: a new one begins with the next step" in (half / "run.log").read_text()
+    assert (
+        "WARNING fields.vtkhdf is missing: a new one begins with the next step"
+        in (half / "run.log").read_text()
+    )
 
 
 # ---------------------------------------------------------------- other numbers of ranks
@@ -288,7 +306,9 @@ def assert_close(found: Path, expected: Path, history: float = 1e-9, values: flo
     assert mine.times.tolist() == others.times.tolist()
     np.testing.assert_array_equal(mine.history["time"], others.history["time"])
     for name in set(others.history) - set(COUNTED):
-        np.testing.assert_allclose(mine.history[name], others.history[name], rtol=history, atol=history, err_msg=name)
+        np.testing.assert_allclose(
+            mine.history[name], others.history[name], rtol=history, atol=history, err_msg=name
+        )
     kept, wanted = read_checkpoint(found), read_checkpoint(expected)
     assert kept is not None and wanted is not None and kept.number == wanted.number
     np.testing.assert_allclose(structure(kept), structure(wanted), rtol=0, atol=values)
@@ -300,7 +320,9 @@ def structure(checkpoint: Checkpoint) -> np.ndarray:
     """A at all points, (elements, points, 3, 3)."""
     shape = len(checkpoint.arrays["elements"]), -1
     dimensions = checkpoint.arrays["function/cell_dimensions"].reshape(*shape, 3)
-    return structure_tensor(dimensions, checkpoint.arrays["function/cell_axes"].reshape(*shape, 3, 3))
+    return structure_tensor(
+        dimensions, checkpoint.arrays["function/cell_axes"].reshape(*shape, 3, 3)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +330,9 @@ def two_ranks(first_half: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     """What tests/on_two_ranks.py makes, and what it says; mpirun ends all when the killed rank is gone."""
     folder = tmp_path_factory.mktemp("two")
     shutil.copytree(first_half, folder / "half")
-    line = mpirun(2, sys.executable, str(Path(__file__).parents[1] / "on_two_ranks.py"), str(folder))
+    line = mpirun(
+        2, sys.executable, str(Path(__file__).parents[1] / "on_two_ranks.py"), str(folder)
+    )
     done = subprocess.run(line, capture_output=True, text=True, timeout=300)
     assert done.returncode != 0 and (folder / "lost").exists(), done.stderr
     return folder, done.stderr
@@ -320,7 +344,9 @@ def test_two_ranks_go_on_to_the_last_bit(two_ranks: tuple[Path, str], whole: Pat
     assert_close(folder / "whole", whole)
 
 
-def test_it_goes_on_with_another_number_of_ranks(two_ranks: tuple[Path, str], tmp_path: Path, whole: Path) -> None:
+def test_it_goes_on_with_another_number_of_ranks(
+    two_ranks: tuple[Path, str], tmp_path: Path, whole: Path
+) -> None:
     """One, then two, then one."""
     half = shutil.copytree(two_ranks[0] / "half", tmp_path / "half")
     assert Recording(half).history["time"][-1] == 8.0
@@ -331,14 +357,18 @@ def test_it_goes_on_with_another_number_of_ranks(two_ranks: tuple[Path, str], tm
 
 def test_a_rank_without_elements_is_no_hindrance(two_ranks: tuple[Path, str]) -> None:
     kept = read_checkpoint(two_ranks[0] / "one element")
-    assert kept is not None and kept.time == 2.0 and kept.arrays["function/displacement"].shape[0] == 1
+    assert (
+        kept is not None and kept.time == 2.0 and kept.arrays["function/displacement"].shape[0] == 1
+    )
 
 
 def test_a_wall_time_that_is_over_is_exit_code_4(two_ranks: tuple[Path, str]) -> None:
     folder, errors = two_ranks
     assert json.loads((folder / "codes.json").read_text()) == {"wall time": 4}
     assert (
-        errors.count("remodel-fenicsx: stopped before --max-wall-time is over at time 8; all steps are saved. Resume: ")
+        errors.count(
+            "remodel-fenicsx: stopped before --max-wall-time is over at time 8; all steps are saved. Resume: "
+        )
         == 1
     )
 
@@ -359,13 +389,18 @@ def test_a_signal_is_exit_code_4_and_one_line_says_how_to_go_on(half: Path, whol
     """While it runs the folder is held; who is killed leaves its name there."""
     words = ["run", "--resume", str(half), "-q", "--set", "time.end=500.0"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "remodel_fenicsx.cli", *words], stderr=subprocess.PIPE, text=True, process_group=0
+        [sys.executable, "-m", "remodel_fenicsx.cli", *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
     )
     deadline = clock.monotonic() + 200
     while clock.monotonic() < deadline and len(rows(half)) < 12:
         clock.sleep(0.02)
         assert process.poll() is None
-    with pytest.raises(FolderTaken, match=f"process {process.pid} on {socket.gethostname()} writes in it"):
+    with pytest.raises(
+        FolderTaken, match=f"process {process.pid} on {socket.gethostname()} writes in it"
+    ):
         resume(half, [], SELF)
     assert f"running: process {process.pid} on " in "\n".join(status(half))
     os.killpg(process.pid, signal.SIGUSR1)
@@ -384,10 +419,15 @@ def test_the_status_of_a_run(half: Path) -> None:
     assert status(half)[0] == f"{half}: scene, step 6 of 6, time 6 of 6"
     assert status(half)[1] == "finished" and status(half)[-1] == "checkpoint at time 6"
     assert re.fullmatch(r"[\d.e-]+ s a step \(mean of the last 6\)", status(half)[2])
-    (half / "scene.toml").write_text((half / "scene.toml").read_text().replace("end = 6.0", "end = 12.0"))
+    (half / "scene.toml").write_text(
+        (half / "scene.toml").read_text().replace("end = 6.0", "end = 12.0")
+    )
     with RunLock(half):
         said = status(half)
-        assert said[1].startswith(f"running: process {os.getpid()} on ") and " left; the last step was done " in said[1]
+        assert (
+            said[1].startswith(f"running: process {os.getpid()} on ")
+            and " left; the last step was done " in said[1]
+        )
         left = (half / "run.lock").read_bytes()
     (half / "run.lock").write_bytes(left)  # as a process leaves it that is killed
     assert status(half)[1].endswith(f"; process {os.getpid()} on {socket.gethostname()} was killed")
@@ -410,7 +450,9 @@ def test_the_status_of_a_run_that_failed_says_why(tmp_path: Path) -> None:
     (None, 49.0, 2.0, 6, False), (None, 51.0, 2.0, 6, True),  # 4 % of the time
     (None, 610.0, 60.0, 6, True), (None, 590.0, 60.0, 6, False),  # what is lost is 10 minutes
 ])  # fmt: skip
-def test_when_a_checkpoint_is_due(every: int | None, seconds: float, cost: float, number: int, due: bool) -> None:
+def test_when_a_checkpoint_is_due(
+    every: int | None, seconds: float, cost: float, number: int, due: bool
+) -> None:
     checkpoints = Checkpoints.__new__(Checkpoints)
     checkpoints.every, checkpoints._cost = every, cost
     checkpoints._written_at = clock.monotonic() - seconds

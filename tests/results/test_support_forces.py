@@ -32,13 +32,20 @@ def scene(file: Path, columns: Any = ENDS, **tables: Any) -> Scene:
 
 @pytest.fixture(scope="module")
 def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tube(tmp_path_factory.mktemp("mesh") / "tube.msh", turn=TURN, shift=(3.0, 4.0, 5.0))
+    return write_tube(
+        tmp_path_factory.mktemp("mesh") / "tube.msh", turn=TURN, shift=(3.0, 4.0, 5.0)
+    )
 
 
-@pytest.mark.parametrize(("kind", "ends"), [("guided", "free"), ("sliding", "free"), ("held", "clamped")])
+@pytest.mark.parametrize(
+    ("kind", "ends"), [("guided", "free"), ("sliding", "free"), ("held", "clamped")]
+)
 def test_ends_pull_with_the_force_of_the_wall(kind: str, ends: str, tube: Path) -> None:
     """Measured otherwise, by a virtual lengthening of a tube by numbers with the same elements; at both ends."""
-    supports = {"inlet": {"kind": "guided" if kind == "sliding" else kind}, "outlet": {"kind": kind}}
+    supports = {
+        "inlet": {"kind": "guided" if kind == "sliding" else kind},
+        "outlet": {"kind": kind},
+    }
     rows = rows_of(scene(tube, supports=supports, remodeling=LAW))
     by_numbers = Scene(
         geometry={"shape": "tube", "inner_radius": RADII[0], "outer_radius": RADII[1], "length": LENGTH},
@@ -60,8 +67,13 @@ def test_a_pressure_on_an_end_is_what_its_support_bears(tube: Path) -> None:
     assert row[ENDS[0]] == pytest.approx(-0.2 * area, rel=0.05)
     held = last_row(scene(tube, ENDS[:1], supports=springs | {"inlet": {"kind": "held"}}, **short))
     assert held[ENDS[0]] == pytest.approx(row[ENDS[0]], rel=0.05)
-    elastic = {"outlet": {"kind": "elastic", "stiffness": 2.0}, "inlet": {"kind": "elastic", "stiffness": 2.0}}
-    row = last_row(scene(tube, ENDS, supports=elastic, loads={"push": {**loads["push"], "face": "inlet"}}))
+    elastic = {
+        "outlet": {"kind": "elastic", "stiffness": 2.0},
+        "inlet": {"kind": "elastic", "stiffness": 2.0},
+    }
+    row = last_row(
+        scene(tube, ENDS, supports=elastic, loads={"push": {**loads["push"], "face": "inlet"}})
+    )
     assert row[ENDS[0]] - row[ENDS[1]] == pytest.approx(0.2 * area, rel=0.05)
 
 
@@ -69,7 +81,9 @@ def test_a_pressure_on_an_end_is_what_its_support_bears(tube: Path) -> None:
     ("kPa", "mm", "mN"), ("MPa", "mm", "N"), ("Pa", "mm", "µN"), ("kPa", "um", "nN"), ("Pa", "m", "N"),
     ("MPa", "cm", "MPa cm²"), ("kPa", None, ""),
 ])  # fmt: skip
-def test_forces_have_a_unit_of_force_where_there_is_one(stress: str, length: str | None, unit: str) -> None:
+def test_forces_have_a_unit_of_force_where_there_is_one(
+    stress: str, length: str | None, unit: str
+) -> None:
     tube = preset_scene("consistent", "tube")
     values = {"material.stress_unit": stress} | ({"geometry.length_unit": length} if length else {})
     assert unit_of(tube.with_values(values), "force") == unit
@@ -77,7 +91,9 @@ def test_forces_have_a_unit_of_force_where_there_is_one(stress: str, length: str
 
 def test_what_is_refused(tube: Path) -> None:
     around = {"outer": {"kind": "elastic", "stiffness": 0.1}}
-    with pytest.raises(SceneError, match="output.columns = 'support_force_outer': the face goes around the body"):
+    with pytest.raises(
+        SceneError, match="output.columns = 'support_force_outer': the face goes around the body"
+    ):
         last_row(scene(tube, ["support_force_outer"], supports=around))
     unknown = "output.columns = '{}': no such column on request"
     for name in ("support_force_outer", "support_force_nothing"):

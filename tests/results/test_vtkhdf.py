@@ -41,7 +41,9 @@ for turn, order in enumerate((range(steps), reversed(range(steps)))):
 np.savez(sys.argv[2], steps=steps, **found)
 """
 
-CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)  # dolfinx's order of nodes
+CUBE = np.array(
+    [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float
+)  # dolfinx's order of nodes
 VTK_CUBE = [[0, 1, 3, 2, 4, 5, 7, 6]]
 
 
@@ -67,9 +69,13 @@ def test_reader_finds_every_step(tmp_path):
     random = np.random.default_rng(1)
     points = random.random((9, 3))
     cells = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [1, 2, 3, 4, 5, 6, 7, 8]])
-    of_points, of_cells = {"displacement": (9, 3), "pressure": (9,)}, {"stress": (2, 9), "l": (2, 3)}
+    of_points, of_cells = {"displacement": (9, 3), "pressure": (9,)}, {
+        "stress": (2, 9),
+        "l": (2, 3),
+    }
     steps = [
-        [{name: random.random(shape) for name, shape in of.items()} for of in (of_points, of_cells)] for _ in "abc"
+        [{name: random.random(shape) for name, shape in of.items()} for of in (of_points, of_cells)]
+        for _ in "abc"
     ]
     path = tmp_path / "fields.vtkhdf"
     with TransientGrid(path, points, cells, 12) as grid:
@@ -81,7 +87,10 @@ def test_reader_finds_every_step(tmp_path):
     assert found["steps"] == 3
     for k, (point_data, cell_data) in enumerate(steps):
         assert found[f"{k} time"] == 0.5 * k
-        assert np.array_equal(found[f"{k} points"], points) and found[f"{k} points"].dtype == np.float64
+        assert (
+            np.array_equal(found[f"{k} points"], points)
+            and found[f"{k} points"].dtype == np.float64
+        )
         assert np.array_equal(found[f"{k} cells"], cells.ravel())
         for kind, data in (("point", point_data), ("cell", cell_data)):
             for name, values in data.items():
@@ -102,7 +111,9 @@ def test_node_order_is_that_of_vtk(tmp_path, cell, degree):
     found = read(grid.path)
     assert np.allclose(found["0 parametric"].reshape(-1, 3), element.points[cells[0]], atol=1e-12)
     assert found["0 types"].tolist() == [cell_type]
-    assert found["0 volumes"] == pytest.approx([{"hexahedron": 1.0, "tetrahedron": 1 / 6}[cell]], rel=1e-6)
+    assert found["0 volumes"] == pytest.approx(
+        [{"hexahedron": 1.0, "tetrahedron": 1 / 6}[cell]], rel=1e-6
+    )
 
 
 def random_cells(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -129,7 +140,9 @@ def test_chain_displacement_is_that_of_the_body():
     points, _ = chain_lines(centres, lengths, axes, 0.2)
     F = np.eye(3) + 0.3 * np.random.default_rng(4).standard_normal((3, 3))
     shift = np.array([1.0, 2.0, 3.0])
-    moved = chain_displacement(points, centres, centres @ (F - np.eye(3)).T + shift, np.tile(F, (3, 1, 1)))
+    moved = chain_displacement(
+        points, centres, centres @ (F - np.eye(3)).T + shift, np.tile(F, (3, 1, 1))
+    )
     assert np.allclose(points + moved, points @ F.T + shift, atol=1e-14)
 
 

@@ -33,15 +33,29 @@ sys.exit(cli.main(sys.argv[3:]))
 @pytest.fixture(scope="module")
 def quarter(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a quarter of a tube."""
-    changes = {"model.kinematics": "sector", "mesh.refinement": 1, "time.end": 1.0, "cells.initial": "isotropic"}
+    changes = {
+        "model.kinematics": "sector",
+        "mesh.refinement": 1,
+        "time.end": 1.0,
+        "cells.initial": "isotropic",
+    }
     return run_scene(
-        preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes), tmp_path_factory.mktemp("q") / "run"
+        preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes),
+        tmp_path_factory.mktemp("q") / "run",
     )
 
 
 def test_revolve_that_was_killed_does_not_block_itself(quarter: Path) -> None:
     names = ["fields_body.vtkhdf", "fields_body_chains.vtkhdf"]
-    command = [sys.executable, "-c", KILLED, "1", "fields_body.vtkhdf.part", "revolve", str(quarter)]
+    command = [
+        sys.executable,
+        "-c",
+        KILLED,
+        "1",
+        "fields_body.vtkhdf.part",
+        "revolve",
+        str(quarter),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert not any((quarter / name).exists() for name in names)
@@ -50,8 +64,12 @@ def test_revolve_that_was_killed_does_not_block_itself(quarter: Path) -> None:
     assert not list(quarter.glob("*.part"))
 
 
-def test_revolve_of_damaged_fields_leaves_nothing(quarter: Path, tmp_path: Path, refused: Refused) -> None:
-    folder = shutil.copytree(quarter, tmp_path / "run", ignore=shutil.ignore_patterns("fields_body*"))
+def test_revolve_of_damaged_fields_leaves_nothing(
+    quarter: Path, tmp_path: Path, refused: Refused
+) -> None:
+    folder = shutil.copytree(
+        quarter, tmp_path / "run", ignore=shutil.ignore_patterns("fields_body*")
+    )
     with h5py.File(folder / "fields.vtkhdf") as file:
         chunk = file["VTKHDF/CellData/fibre_angle"].id.get_chunk_info(1)
     data = bytearray((folder / "fields.vtkhdf").read_bytes())
@@ -72,4 +90,6 @@ def test_a_new_file_is_whole_or_not_there(tmp_path: Path) -> None:
     write_new(path, b"whole")
     with pytest.raises(FileExistsError):
         write_new(path, b"another")
-    assert path.read_bytes() == b"whole" and [found.name for found in tmp_path.iterdir()] == ["page.html"]
+    assert path.read_bytes() == b"whole" and [found.name for found in tmp_path.iterdir()] == [
+        "page.html"
+    ]

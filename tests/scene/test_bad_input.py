@@ -101,8 +101,38 @@ def answer(*words: str, codes: tuple[int, ...] = (0, 2)) -> int:
 
 
 # ---------------------------------------------------------------- scenes
-ODD_NUMBERS = [math.nan, math.inf, -math.inf, 0, -0.0, -1, 1e308, -1e308, 5e-324, 2**63, -(2**63), 1e-300, 10**17, 0.1]
-ODD_TEXTS = ["", " ", "nan", "0", "None", "a\nb", "\u2028", "..", "/", "1 mm", "1e400 Pa", "10 furlong", "-", "x" * 300]
+ODD_NUMBERS = [
+    math.nan,
+    math.inf,
+    -math.inf,
+    0,
+    -0.0,
+    -1,
+    1e308,
+    -1e308,
+    5e-324,
+    2**63,
+    -(2**63),
+    1e-300,
+    10**17,
+    0.1,
+]
+ODD_TEXTS = [
+    "",
+    " ",
+    "nan",
+    "0",
+    "None",
+    "a\nb",
+    "\u2028",
+    "..",
+    "/",
+    "1 mm",
+    "1e400 Pa",
+    "10 furlong",
+    "-",
+    "x" * 300,
+]
 VALUES = st.one_of(
     st.sampled_from(ODD_NUMBERS),
     st.sampled_from(ODD_TEXTS),
@@ -111,10 +141,15 @@ VALUES = st.one_of(
     st.booleans(),
     st.text(max_size=8),
     st.just(date(2026, 1, 1)),
-    st.lists(st.one_of(st.floats(), st.text(max_size=3), st.lists(st.floats(), max_size=3)), max_size=4),
+    st.lists(
+        st.one_of(st.floats(), st.text(max_size=3), st.lists(st.floats(), max_size=3)), max_size=4
+    ),
     st.dictionaries(st.text(max_size=5), st.one_of(st.floats(), st.text(max_size=3)), max_size=3),
 )
-SHAPES = {shape: preset_scene("kuhl-holzapfel-2007", shape).model_dump(mode="json") for shape in ("cube", "tube")}
+SHAPES = {
+    shape: preset_scene("kuhl-holzapfel-2007", shape).model_dump(mode="json")
+    for shape in ("cube", "tube")
+}
 
 
 def places(table: dict[str, Any], above: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
@@ -155,7 +190,11 @@ def changed(shape: str, changes: list[tuple[int, str, Any]]) -> dict[str, Any]:
 
 
 CHANGES = st.lists(
-    st.tuples(st.integers(0, 200), st.sampled_from(["replace", "replace", "replace", "remove", "add"]), VALUES),
+    st.tuples(
+        st.integers(0, 200),
+        st.sampled_from(["replace", "replace", "replace", "remove", "add"]),
+        VALUES,
+    ),
     min_size=1,
     max_size=3,
 )
@@ -176,7 +215,9 @@ def written(values: dict[str, Any]) -> str | None:
     shape=st.sampled_from(sorted(SHAPES)),
     changes=CHANGES,
 )
-def test_a_scene_with_odd_values(shape: str, changes: list[tuple[int, str, Any]], tmp_path: Path) -> None:
+def test_a_scene_with_odd_values(
+    shape: str, changes: list[tuple[int, str, Any]], tmp_path: Path
+) -> None:
     text = written(changed(shape, changes))
     path = tmp_path / "scene.toml"
     if text is None:
@@ -191,7 +232,12 @@ def test_a_scene_with_odd_values(shape: str, changes: list[tuple[int, str, Any]]
 WHOLE = preset_scene("kuhl-holzapfel-2007", "tube").to_toml().encode()
 
 
-@bad("scenes of damaged text", 200, "cut off, other bytes, holes of zeros, foreign, empty", data=st.data())
+@bad(
+    "scenes of damaged text",
+    200,
+    "cut off, other bytes, holes of zeros, foreign, empty",
+    data=st.data(),
+)
 def test_a_scene_that_is_damaged_text(data: st.DataObject, tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_bytes(damaged(data, WHOLE))
     answer("validate", str(tmp_path / "scene.toml"))
@@ -238,12 +284,29 @@ SETTINGS = """time.end=3 time.end=nan cells.seed=-1 = a.b time=1 time.end.x=1 ce
 WORDS = st.one_of(
     st.sampled_from(["run", "status", "validate", "new", "info", "figures"]),
     st.sampled_from(FILES),
-    st.sampled_from(["--set", "--resume", "-o", "-q", "--max-wall-time", "--shape", "--bad", "--", "-", "--set="]),
+    st.sampled_from(
+        [
+            "--set",
+            "--resume",
+            "-o",
+            "-q",
+            "--max-wall-time",
+            "--shape",
+            "--bad",
+            "--",
+            "-",
+            "--set=",
+        ]
+    ),
     st.sampled_from(SETTINGS),
-    st.sampled_from(["2h", "0s", "-1h", "1e9h", "nan", "kuhl-holzapfel-2007", "tube", "1.5d", "99999999999d"]),
+    st.sampled_from(
+        ["2h", "0s", "-1h", "1e9h", "nan", "kuhl-holzapfel-2007", "tube", "1.5d", "99999999999d"]
+    ),
     st.text(st.characters(exclude_characters="\0"), max_size=6),
 )
-COMMANDS = st.tuples(st.sampled_from(["run", "run", "status", "validate", "new"]), st.lists(WORDS, max_size=5))
+COMMANDS = st.tuples(
+    st.sampled_from(["run", "run", "status", "validate", "new"]), st.lists(WORDS, max_size=5)
+)
 
 
 @bad(
@@ -273,7 +336,9 @@ def test_words_that_are_no_utf_8_are_refused_by_name(
 def test_thousands_of_tables_are_refused_at_once(table: str) -> None:
     """Each is checked against the others."""
     with pytest.raises(SceneError, match=f"{table}: has 5000 tables; must have at most 200"):
-        preset_scene("kuhl-holzapfel-2007", "tube").with_values({table: {f"a{n}": {} for n in range(5000)}})
+        preset_scene("kuhl-holzapfel-2007", "tube").with_values(
+            {table: {f"a{n}": {} for n in range(5000)}}
+        )
 
 
 def _kept(folder: Path, changes: list[str]) -> Path:
@@ -287,7 +352,9 @@ def _kept(folder: Path, changes: list[str]) -> Path:
 
 # ---------------------------------------------------------------- checkpoints
 @bad("damaged checkpoints", 150, "cut off, other bytes, holes, foreign, empty", data=st.data())
-def test_a_checkpoint_that_is_damaged(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_that_is_damaged(
+    data: st.DataObject, first_half: Path, tmp_path: Path
+) -> None:
     """Whatever one file holds, a state that is read is one that was written."""
     name = data.draw(st.sampled_from(["checkpoint-a.npz", "checkpoint-b.npz"]))
     folder = shutil.copytree(first_half, tmp_path / "copy", dirs_exist_ok=True)
@@ -297,7 +364,12 @@ def test_a_checkpoint_that_is_damaged(data: st.DataObject, first_half: Path, tmp
 
 
 # ---------------------------------------------------------------- recordings
-@bad("damaged recordings", 80, "history, fields, scene; read as a whole, and by `status`", data=st.data())
+@bad(
+    "damaged recordings",
+    80,
+    "history, fields, scene; read as a whole, and by `status`",
+    data=st.data(),
+)
 def test_a_recording_that_is_damaged(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
     name = data.draw(st.sampled_from(["history.csv", "fields.vtkhdf", "scene.toml"]))
     folder = shutil.copytree(first_half, tmp_path / "copy", dirs_exist_ok=True)
@@ -319,7 +391,9 @@ def test_a_recording_that_is_damaged(data: st.DataObject, first_half: Path, tmp_
     "any file of the folder damaged, missing, a folder, a link in a circle",
     data=st.data(),
 )
-def test_a_damaged_run_goes_on_or_is_refused(data: st.DataObject, first_half: Path, tmp_path: Path) -> None:
+def test_a_damaged_run_goes_on_or_is_refused(
+    data: st.DataObject, first_half: Path, tmp_path: Path
+) -> None:
     """Cut off, overwritten, missing, a folder: the run is the right one or there is one line."""
     expected = rows(first_half)
     name = data.draw(st.sampled_from(sorted(path.name for path in first_half.iterdir())))
@@ -346,7 +420,10 @@ def test_a_damaged_run_goes_on_or_is_refused(data: st.DataObject, first_half: Pa
         ({"shape": "cube"}, "the mesh is a 'cube'"),
         ({"dimensions": {"length": math.nan}}, "the mesh has nan"),
         ({"faces": {"inner": 1}}, "the mesh has no face bottom, top, outer"),
-        ({"faces": dict.fromkeys(Tube.face_names, 99)}, "no facets with the tag of bottom, top, inner, outer"),
+        (
+            {"faces": dict.fromkeys(Tube.face_names, 99)},
+            "no facets with the tag of bottom, top, inner, outer",
+        ),
         ({}, "the mesh has elements of type 'hexahedron'"),
         (None, "nodes that are not finite"),
     ],

@@ -32,7 +32,11 @@ def cube(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("factor", [1, 4])
 def test_the_initial_stiffness_is_what_a_run_shows(factor: int) -> None:
     """Young's modulus of the matrix and that of the network add up along the chains: across, these bear nothing."""
-    keys = {"material.initial_stiffness": "0.05 kPa", "material.energy_factor": factor, "cells.end_to_end_length": 0.8}
+    keys = {
+        "material.initial_stiffness": "0.05 kPa",
+        "material.energy_factor": factor,
+        "cells.end_to_end_length": 0.8,
+    }
     scene = scene_from_dict(cube(**keys))
     with made(scene) as simulation:
         stretch = list(simulation.steps())[-1].row["mean_stretch"]
@@ -44,7 +48,11 @@ def test_the_initial_stiffness_is_what_a_run_shows(factor: int) -> None:
 
 def test_they_become_the_models_own_numbers(tmp_path: Path) -> None:
     """The scene as run has these, and is read back as it was."""
-    keys = {"material.locking_stretch": 1.5, "remodeling.half_life": 10.0, "cells.end_to_end_length": 2.0}
+    keys = {
+        "material.locking_stretch": 1.5,
+        "remodeling.half_life": 10.0,
+        "cells.end_to_end_length": 2.0,
+    }
     scene = scene_from_dict(cube(**keys))
     assert scene.material.contour_length == pytest.approx(3.0, rel=1e-14)
     assert scene.remodeling.kappa == pytest.approx(math.log(2) / 10, rel=1e-14)
@@ -56,8 +64,12 @@ def test_they_become_the_models_own_numbers(tmp_path: Path) -> None:
 
 def test_the_stiffness_asks_for_the_locking_stretch_of_the_same_scene() -> None:
     """Both together are what the contour length and the density of chains are together."""
-    both = scene_from_dict(cube(**{"material.initial_stiffness": 5.0, "material.locking_stretch": 1.2}))
-    one = scene_from_dict(cube(**{"material.initial_stiffness": 5.0, "material.contour_length": 1.2}))
+    both = scene_from_dict(
+        cube(**{"material.initial_stiffness": 5.0, "material.locking_stretch": 1.2})
+    )
+    one = scene_from_dict(
+        cube(**{"material.initial_stiffness": 5.0, "material.contour_length": 1.2})
+    )
     assert both.material.chain_density == one.material.chain_density
     softer = scene_from_dict(cube(**{"material.initial_stiffness": 5.0})).material
     assert both.material.chain_density < softer.chain_density
@@ -69,7 +81,11 @@ def test_a_region_has_its_own() -> None:
         "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
         "material": {"locking_stretch": 1.4},
         "regions": {
-            "media": {"outer_radius": 2.0, "material": {"initial_stiffness": 8.0}, "remodeling": {"half_life": 20.0}},
+            "media": {
+                "outer_radius": 2.0,
+                "material": {"initial_stiffness": 8.0},
+                "remodeling": {"half_life": 20.0},
+            },
             "adventitia": {"material": {"locking_stretch": 1.2, "initial_stiffness": 8.0}},
         },
         "time": {"step": 1.0, "end": 1.0},
@@ -83,7 +99,11 @@ def test_a_region_has_its_own() -> None:
 
 def test_a_changed_one_replaces_what_was_there() -> None:
     """Sweeps and fits set them on scenes that have every value."""
-    scene = scene_from_dict(cube()).with_values({"remodeling.half_life": 7.0, "material.initial_stiffness": 3.0})
-    again = scene_from_dict(cube(**{"remodeling.half_life": 7.0, "material.initial_stiffness": 3.0}))
+    scene = scene_from_dict(cube()).with_values(
+        {"remodeling.half_life": 7.0, "material.initial_stiffness": 3.0}
+    )
+    again = scene_from_dict(
+        cube(**{"remodeling.half_life": 7.0, "material.initial_stiffness": 3.0})
+    )
     assert scene.remodeling.kappa == again.remodeling.kappa
     assert scene.material.chain_density == again.material.chain_density

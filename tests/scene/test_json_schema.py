@@ -27,7 +27,12 @@ jsonschema = pytest.importorskip("jsonschema", reason="python3-jsonschema is not
 ROOT = Path(__file__).parents[2]
 SCHEMA = json_schema()
 CHECK = jsonschema.Draft202012Validator(SCHEMA)
-WHOLE = [preset_scene(preset, shape) for preset, shapes in PRESETS.items() for shape in shapes if preset != "sun-2002"]
+WHOLE = [
+    preset_scene(preset, shape)
+    for preset, shapes in PRESETS.items()
+    for shape in shapes
+    if preset != "sun-2002"
+]
 
 
 def is_read(values: dict[str, Any]) -> bool:
@@ -51,10 +56,14 @@ def test_it_is_a_schema():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "demos").glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "demos").glob("*.toml")), ids=lambda path: path.stem
+)
 def test_demos_are_valid(path: Path):
     assert not list(CHECK.iter_errors(tomllib.loads(path.read_text())))
-    assert not list(CHECK.iter_errors(tomllib.loads(read_scene(path).to_toml()))), "as run, with all its keys"
+    assert not list(
+        CHECK.iter_errors(tomllib.loads(read_scene(path).to_toml()))
+    ), "as run, with all its keys"
 
 
 @pytest.mark.parametrize("scene", WHOLE, ids=lambda scene: f"{scene.preset}-{scene.geometry.name}")
@@ -69,7 +78,11 @@ def test_every_key_of_a_preset_is_valid(scene: Any):
 
 
 # of numbers a schema in JSON knows less: what is no number, or has no end
-WRONG_FOR_BOTH = [(key, value) for key, value in WRONG if value not in (float("inf"), int(HUGE)) and value == value]
+WRONG_FOR_BOTH = [
+    (key, value)
+    for key, value in WRONG
+    if value not in (float("inf"), int(HUGE)) and value == value
+]
 
 
 @pytest.mark.parametrize(("key", "value"), WRONG_FOR_BOTH, ids=str)
@@ -85,19 +98,27 @@ def test_what_always_must_be_there_is_asked_for():
 
 
 def test_a_value_may_have_a_unit_where_the_reader_takes_one():
-    units = artery(geometry__length_unit="mm", geometry__length="8 mm", loads__pressure__value="100 mmHg")
+    units = artery(
+        geometry__length_unit="mm", geometry__length="8 mm", loads__pressure__value="100 mmHg"
+    )
     assert is_read(units) and CHECK.is_valid(units)
     for key in ("remodeling__kappa", "cells__end_to_end_length"):
-        assert not is_read(artery(**{key: "1 mm"})) and not CHECK.is_valid(artery(**{key: "1 mm"})), key
+        assert not is_read(artery(**{key: "1 mm"})) and not CHECK.is_valid(
+            artery(**{key: "1 mm"})
+        ), key
 
 
-@settings(max_examples=300, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(
+    max_examples=300, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 @given(
     shape=st.sampled_from(["cube", "tube"]),
     place=st.integers(0, 200),
     kind=st.sampled_from(["replace", "remove", "add"]),
     value=st.one_of(
-        st.sampled_from([number for number in ODD_NUMBERS if abs(number) < 1e308 and number == number]),
+        st.sampled_from(
+            [number for number in ODD_NUMBERS if abs(number) < 1e308 and number == number]
+        ),
         st.sampled_from([*ODD_TEXTS, "free", "auto", "direct", "equilibrium", "8 mm"]),
         st.booleans(),
         st.lists(st.floats(0, 2), max_size=3),
@@ -114,7 +135,9 @@ def test_a_shape_of_a_script_is_in_it(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setitem(SHAPES, "rod", Rod)
     values = {"geometry": {"shape": "rod"}, "preset": "kuhl-holzapfel-2007"}
-    assert not CHECK.is_valid(values) and jsonschema.Draft202012Validator(json_schema()).is_valid(values)
+    assert not CHECK.is_valid(values) and jsonschema.Draft202012Validator(json_schema()).is_valid(
+        values
+    )
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Refused):

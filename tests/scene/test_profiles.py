@@ -19,9 +19,14 @@ ISOTROPIC = TUBE | {"cells": {"initial": "isotropic"}}
 @pytest.mark.parametrize("name", PROFILES)
 def test_a_profile_lies_over_the_preset_and_under_the_scene(name: str) -> None:
     scene = scene_from_dict(ISOTROPIC | {"profile": name})
-    assert scene.model.kinematics == "auto" and scene.time.tolerance == PROFILES[name].values["time.tolerance"]
+    assert (
+        scene.model.kinematics == "auto"
+        and scene.time.tolerance == PROFILES[name].values["time.tolerance"]
+    )
     assert scene.mesh.degree == PROFILES[name].values["mesh.degree"]
-    own = scene_from_dict(ISOTROPIC | {"profile": name, "mesh": {"refinement": 5}, "model": {"kinematics": "full"}})
+    own = scene_from_dict(
+        ISOTROPIC | {"profile": name, "mesh": {"refinement": 5}, "model": {"kinematics": "full"}}
+    )
     assert own.mesh.refinement == 5 and own.model.kinematics == "full"
     assert own.mesh.degree == PROFILES[name].values["mesh.degree"]
 
@@ -29,7 +34,9 @@ def test_a_profile_lies_over_the_preset_and_under_the_scene(name: str) -> None:
 def test_each_is_finer_than_the_one_before() -> None:
     errors = [(profile.degrees, profile.values["time.tolerance"]) for profile in PROFILES.values()]
     assert errors == sorted(errors, reverse=True)
-    assert [profile.seconds for profile in PROFILES.values()] == sorted(p.seconds for p in PROFILES.values())
+    assert [profile.seconds for profile in PROFILES.values()] == sorted(
+        p.seconds for p in PROFILES.values()
+    )
 
 
 def test_on_the_command_line_it_lies_over_the_scene(
@@ -57,7 +64,9 @@ def test_on_the_command_line_it_lies_over_the_scene(
     ({"geometry": {"shape": "tendon"}}, "auto"),
     ({"model": {"kinematics": "full"}}, "full"),  # the scene's own
 ])  # fmt: skip
-def test_random_cells_keep_mesh_and_steps(name: str, changes: dict[str, Any], kinematics: str, tmp_path: Path) -> None:
+def test_random_cells_keep_mesh_and_steps(
+    name: str, changes: dict[str, Any], kinematics: str, tmp_path: Path
+) -> None:
     """Both decide which cells are drawn, and what all seeds have in common; on the command line too."""
     plain = scene_from_dict({**TUBE, **changes})
     scene = scene_from_dict({**TUBE, **changes, "profile": name})
@@ -68,5 +77,7 @@ def test_random_cells_keep_mesh_and_steps(name: str, changes: dict[str, Any], ki
     path = tmp_path / "scene.toml"
     path.write_text(plain.to_toml())
     over = read_scene(path, ["solver.relative_tolerance=1e-8"], name)
-    assert over.model.kinematics == ("sector" if kinematics == "full" else kinematics)  # over all that the file says
+    assert over.model.kinematics == (
+        "sector" if kinematics == "full" else kinematics
+    )  # over all that the file says
     assert over.solver.relative_tolerance == 1e-8 and over.time == plain.time

@@ -30,7 +30,10 @@ VALUES: list[Any] = [
     {"kind": "elastic", "stiffness": 1.0}, [{"from": 0.25, "to": 0.5, "prestretch": {"axial": 1.1}}],
     [{"weight": 0.5, "loads": {}}, {"weight": 0.5, "loads": {"pressure": 2.0}}],
 ]  # fmt: skip
-NOT_REACHED = {"geometry", "cells.fibres"}  # a whole table; it takes the place of cells.initial (regions have it)
+NOT_REACHED = {
+    "geometry",
+    "cells.fibres",
+}  # a whole table; it takes the place of cells.initial (regions have it)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +50,9 @@ def bases(tmp_path_factory: pytest.TempPathFactory) -> list[Scene]:
     tube = preset_scene("kuhl-holzapfel-2007", "tube")
     return [
         tube.with_values({"regions": {"media": {"outer_radius": 2.0}, "adventitia": {}}}),
-        tube.with_values({"geometry.length_unit": "mm", "geometry.is": "loaded", "time.end": "equilibrium"}),
+        tube.with_values(
+            {"geometry.length_unit": "mm", "geometry.is": "loaded", "time.end": "equilibrium"}
+        ),
         scene_from_dict(mesh),
         scene_from_dict({"geometry": {"shape": "solid", "file": str(file)}, "time": {"end": 3.0}}),
         *(preset_scene("consistent", shape) for shape in ("cube", "tendon", "sheet")),
@@ -66,7 +71,9 @@ def keys() -> Iterator[tuple[str, FieldInfo]]:
 
 def fitting(field: FieldInfo) -> Iterator[Any]:
     """Values that its type alone takes, texts with units as they are: to try a scene costs more."""
-    kind: Any = TypeAdapter(Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation)
+    kind: Any = TypeAdapter(
+        Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    )
     for value in (*choices(field), *VALUES):
         with suppress(ValidationError):
             with suppress(KeyError):  # which shape a table means is said by the base
@@ -87,7 +94,9 @@ def test_every_key_with_every_kind_of_value(bases: list[Scene], tmp_path: Path):
                 except SceneError:
                     continue
                 reached |= {key} if value is not None else set()
-                if (whole := scene.model_dump_json()) not in seen:  # many values, and no value, make the same scene
+                if (
+                    whole := scene.model_dump_json()
+                ) not in seen:  # many values, and no value, make the same scene
                     path.write_text(scene.to_toml(), encoding="utf-8")
                     assert read_scene(path) == scene, f"{key} = {value!r} of a {base.geometry.name}"
                 seen.add(whole)

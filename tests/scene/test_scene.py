@@ -16,7 +16,14 @@ from remodel_fenicsx.body import SHAPES, Tube
 from remodel_fenicsx.model.chains import wormlike_stiffness
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.scene.presets import PRESET_NOTES, PRESETS
-from remodel_fenicsx.scene.scene import FORMAT, Scene, preset_scene, read_scene, scene_from_dict, too_soft
+from remodel_fenicsx.scene.scene import (
+    FORMAT,
+    Scene,
+    preset_scene,
+    read_scene,
+    scene_from_dict,
+    too_soft,
+)
 from remodel_fenicsx.schema.settings import Cells, Load, Material, Remodeling, Time
 from remodel_fenicsx.schema.tables import SceneError, allowed, locate, format_value
 from remodel_fenicsx.schema.text import set_nested
@@ -55,14 +62,20 @@ def refusal(tables: dict[str, Any]) -> str:
     return str(caught.value)
 
 
-WRONG = [(key, value) for key, row in rows(__file__, "wrong_values.txt") for value in values(f"all = [{row}]")["all"]]
+WRONG = [
+    (key, value)
+    for key, row in rows(__file__, "wrong_values.txt")
+    for value in values(f"all = [{row}]")["all"]
+]
 
 
 @pytest.mark.parametrize(("key", "value"), WRONG)
 def test_a_value_that_a_key_never_has(key: str, value: Any) -> None:
     _, _, field = locate(Scene, tuple(key.split(".")))
     assert field is not None
-    assert refusal(changed(TUBE, {key: value})) == f"{key} = {format_value(value)}: {allowed(field)}"
+    assert (
+        refusal(changed(TUBE, {key: value})) == f"{key} = {format_value(value)}: {allowed(field)}"
+    )
 
 
 @pytest.mark.parametrize(("base", "changes", "line"), rows(__file__, "bad_scenes.txt"))
@@ -89,13 +102,20 @@ def test_what_is_read_is_of_the_present_format():
     assert scene_from_dict(CUBE) == scene_from_dict({**CUBE, "format": 1})
     text = scene_from_dict({**CUBE, "format": 1}).to_toml("as run")
     assert tomllib.loads(text)["format"] == FORMAT
-    assert [line for line in text.splitlines() if line and not line.startswith("#")][0] == "format = 2"
+    assert [line for line in text.splitlines() if line and not line.startswith("#")][
+        0
+    ] == "format = 2"
 
 
-@pytest.mark.parametrize("kinematics, most", [("radial", 10**6), ("axisymmetric", 197), ("sector", 29), ("full", 18)])
+@pytest.mark.parametrize(
+    "kinematics, most", [("radial", 10**6), ("axisymmetric", 197), ("sector", 29), ("full", 18)]
+)
 def test_elements_are_counted_of_the_mesh_that_is_made(kinematics: str, most: int) -> None:
     """A ray or a quarter has fewer than the tube, and more of them in each direction are allowed."""
-    tube = changed(TUBE, {"cells": {"initial": "isotropic", "axes": "cylindrical"}, "model.kinematics": kinematics})
+    tube = changed(
+        TUBE,
+        {"cells": {"initial": "isotropic", "axes": "cylindrical"}, "model.kinematics": kinematics},
+    )
     assert scene_from_dict(changed(tube, {"mesh.refinement": most})).mesh.refinement == most
     with pytest.raises(SceneError, match=f"^mesh.refinement = {20 * most}: must be at most"):
         scene_from_dict(changed(tube, {"mesh.refinement": 20 * most}))
@@ -110,10 +130,19 @@ def test_something_else_than_a_table(values):
 # ---------------------------------------------------------------- files
 
 BAD_FILES = [
-    (b"name = 'a'\n[time\nend = 1", r"line 2: not TOML: Expected ']' at the end of a table declaration"),
+    (
+        b"name = 'a'\n[time\nend = 1",
+        r"line 2: not TOML: Expected ']' at the end of a table declaration",
+    ),
     (b"[time]\nend = 1.0\nend = 2.0\n", r"line 3: not TOML: Cannot overwrite a value"),
-    ("[geometry]\nshape = \u201ccube\u201d\n".encode(), "line 2: not TOML: .*; \u201c is not a quote of TOML: type .*"),
-    ('name = "a\u201d\n[time]\n'.encode(), "line 1: not TOML: .*; \u201d is not a quote of TOML: .*"),
+    (
+        "[geometry]\nshape = \u201ccube\u201d\n".encode(),
+        "line 2: not TOML: .*; \u201c is not a quote of TOML: type .*",
+    ),
+    (
+        'name = "a\u201d\n[time]\n'.encode(),
+        "line 1: not TOML: .*; \u201d is not a quote of TOML: .*",
+    ),
     ("[\u2018time\u2019]\n".encode(), "line 1: not TOML: .*; \u2018 is not a quote of TOML: .*"),
     (b"a = [1,\n2", r"line 2: not TOML: Unclosed array"),
     (b"[time]\nend = 150 s", r"line 2: not TOML: .*"),
@@ -135,7 +164,9 @@ def test_a_file_that_is_not_toml_gives_one_line_with_its_line(tmp_path, content,
 def test_a_missing_file_and_a_folder(tmp_path):
     with pytest.raises(SceneError, match=r"/none\.toml: no such file; a scene is a TOML file$"):
         read_scene(tmp_path / "none.toml")
-    with pytest.raises(SceneError, match=re.escape(f"{tmp_path}: cannot be read: is a folder, not a file")):
+    with pytest.raises(
+        SceneError, match=re.escape(f"{tmp_path}: cannot be read: is a folder, not a file")
+    ):
         read_scene(tmp_path)
     with pytest.raises(SceneError, match="cannot be read: .*embedded null"):
         read_scene("a\0b")
@@ -174,9 +205,17 @@ def test_overrides_lie_over_the_file_and_the_preset():
         'name="a b"',
     ]  # fmt: skip
     read = read_scene(ROOT / "demos" / "artery.toml", overrides)
-    assert (read.remodeling.driver, read.cells.seed, read.time.end, read.name) == ("pk2", 7, 40.0, "a b")
+    assert (read.remodeling.driver, read.cells.seed, read.time.end, read.name) == (
+        "pk2",
+        7,
+        40.0,
+        "a b",
+    )
     assert read.loads["pressure"] == Load(value=2.0, ramp=((0.0, 0.0), (25.0, 1.0)))
-    assert read.solver.petsc_options == {"pc_factor_mat_solver_type": "mumps", "mat_mumps_icntl_14": 50}
+    assert read.solver.petsc_options == {
+        "pc_factor_mat_solver_type": "mumps",
+        "mat_mumps_icntl_14": 50,
+    }
     assert read.output.fields is False
 
 
@@ -185,7 +224,11 @@ def test_a_preset_can_be_set_on_the_command_line(tmp_path):
     path.write_text("[geometry]\nshape = 'tendon'\n[time]\nend = 12\n")
     assert read_scene(path).remodeling.frame == "material"
     read = read_scene(path, [f"preset={PAPER}"])
-    assert (read.remodeling.frame, read.loads["force"].value, read.time.end) == ("spatial", 300.0, 12.0)
+    assert (read.remodeling.frame, read.loads["force"].value, read.time.end) == (
+        "spatial",
+        300.0,
+        12.0,
+    )
 
 
 # ---------------------------------------------------------------- presets and defaults
@@ -199,7 +242,10 @@ def test_the_preset_is_the_printed_method(shape):
     for key, value in (printed["all"] | printed[shape]).items():
         table, name = key.split(".")
         assert getattr(getattr(built, table), name) == value, key
-    loads = {name: Load(value=most, ramp=[[0, 0], [end, 1]]) for name, (most, end) in printed["loads"][shape].items()}
+    loads = {
+        name: Load(value=most, ramp=[[0, 0], [end, 1]])
+        for name, (most, end) in printed["loads"][shape].items()
+    }
     assert built.loads == loads
 
 
@@ -208,13 +254,19 @@ def test_every_preset_gives_good_scenes_and_is_explained():
     for name, shapes in PRESETS.items():
         assert set(shapes) == set(SHAPES) - {"mesh", "solid"}
         for shape in shapes:
-            values = changed(TUBE if shape == "tube" else CUBE, {"preset": name, "geometry.shape": shape})
+            values = changed(
+                TUBE if shape == "tube" else CUBE, {"preset": name, "geometry.shape": shape}
+            )
             assert scene_from_dict(values).preset == name
 
 
 def test_collagen_as_measured():
     built = preset_scene("sun-2002", "tendon")
-    lengths = (built.material.contour_length, built.material.persistence_length, built.cells.end_to_end_length)
+    lengths = (
+        built.material.contour_length,
+        built.material.persistence_length,
+        built.cells.end_to_end_length,
+    )
     assert lengths == (309.0, 14.5, 92.4)  # nm
     free_chain = math.sqrt(2 * 14.5 * 309.0 * (1 - 14.5 / 309.0 * (1 - math.exp(-309.0 / 14.5))))
     assert built.cells.end_to_end_length == pytest.approx(free_chain, abs=0.05)
@@ -239,7 +291,10 @@ def test_without_a_preset_law_repulsion_and_coupling_are_what_measures_best():
     assert scene.remodeling == Remodeling(
         driver="cauchy", law="tensor", frame="material", kappa=0.025, coupling="extrapolated"
     )
-    assert scene_from_dict(changed(CUBE, {"remodeling.coupling": "staggered"})).remodeling.coupling == "staggered"
+    assert (
+        scene_from_dict(changed(CUBE, {"remodeling.coupling": "staggered"})).remodeling.coupling
+        == "staggered"
+    )
 
 
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "tensor"])
@@ -253,7 +308,9 @@ def test_the_network_modulus():
     # c = k theta n / (4 A_p) by hand: 1.381e-23 * 310 * 2e21 / 5.46
     assert Material().network_modulus == pytest.approx(1.56817, rel=1e-5)
     assert Material(energy_factor=4).network_modulus == pytest.approx(4 * 1.56817, rel=1e-5)
-    assert Material(stress_unit="kPa", chain_density=2e24).network_modulus == pytest.approx(1.56817, rel=1e-5)
+    assert Material(stress_unit="kPa", chain_density=2e24).network_modulus == pytest.approx(
+        1.56817, rel=1e-5
+    )
 
 
 # ---------------------------------------------------------------- Python and TOML
@@ -270,7 +327,9 @@ def test_the_demos_are_the_preset():
     ]
     for path in (path for path in DEMOS if path.stem in of_the_paper):
         shape = of_the_paper[path.stem]
-        printed = scene_from_dict({"name": path.stem, "preset": PAPER, "geometry": {"shape": shape}})
+        printed = scene_from_dict(
+            {"name": path.stem, "preset": PAPER, "geometry": {"shape": shape}}
+        )
         assert read_scene(path) == printed
 
 
@@ -292,8 +351,13 @@ def test_python_says_what_toml_says():
 
 def test_a_changed_copy_is_validated():
     artery = read_scene(ROOT / "demos" / "artery.toml")
-    changed_scene = artery.with_values({"loads.pressure.value": 0.0, "remodeling.frame": "material"})
-    assert (changed_scene.loads["pressure"].value, changed_scene.remodeling.frame) == (0.0, "material")
+    changed_scene = artery.with_values(
+        {"loads.pressure.value": 0.0, "remodeling.frame": "material"}
+    )
+    assert (changed_scene.loads["pressure"].value, changed_scene.remodeling.frame) == (
+        0.0,
+        "material",
+    )
     assert changed_scene.loads["elongation"] == artery.loads["elongation"]
     assert artery.loads["pressure"].value == 4.8
     with pytest.raises(SceneError, match=r"^time\.step = 1\.0: must be at most time\.end = 0\.5$"):
@@ -325,13 +389,20 @@ def test_good_ramps_and_times():
 def test_the_summary_is_one_line_in_one_unit():
     beginning = "network modulus c = 1.568 Pa, shear modulus mu = 3.103 Pa"
     assert preset_scene(PAPER, "tube").summary() == f"{beginning}, largest pressure 4.8 Pa"
-    assert preset_scene(PAPER, "tendon").summary() == f"{beginning}, largest force over its area 30 Pa"
-    stiff = preset_scene(PAPER, "cube").with_values({"material.stress_unit": "kPa", "geometry.side": 2.0})
+    assert (
+        preset_scene(PAPER, "tendon").summary() == f"{beginning}, largest force over its area 30 Pa"
+    )
+    stiff = preset_scene(PAPER, "cube").with_values(
+        {"material.stress_unit": "kPa", "geometry.side": 2.0}
+    )
     line = "network modulus c = 0.004116 kPa, shear modulus mu = 3.103 kPa, largest force over its area 2.5 kPa"
     assert stiff.summary() == line
     assert scene_from_dict(CUBE).summary() == beginning
     grows = preset_scene(PAPER, "tube").with_values(
-        {"remodeling.law": "tensor", "remodeling.turnover": {"time": 40.0, "deposition_stretch": 1.1}}
+        {
+            "remodeling.law": "tensor",
+            "remodeling.turnover": {"time": 40.0, "deposition_stretch": 1.1},
+        }
     )
     assert grows.summary().endswith("'cauchy' and volume = 0.3")
 
@@ -343,7 +414,9 @@ def test_the_largest_load_is_the_largest_of_the_run():
     assert load.largest(15.0) == pytest.approx(-2.0)
     assert load.largest(18.0) == pytest.approx(-2.0 * 2.2)
     assert load.largest(100.0) == -6.0
-    assert Load(value=1.0, ramp=[[5.0, -2.0], [10.0, 1.0]]).largest(10.0) == -2.0  # held before the first pair
+    assert (
+        Load(value=1.0, ramp=[[5.0, -2.0], [10.0, 1.0]]).largest(10.0) == -2.0
+    )  # held before the first pair
 
 
 SOFT = (
@@ -358,10 +431,17 @@ def test_a_chain_density_of_another_stress_unit_is_warned_of():
     assert printed.warnings() == []
     soft = printed.with_values({"material.stress_unit": "kPa"})
     assert soft.warnings() == [SOFT]
-    assert scene_from_dict(changed(TUBE, {"material.stress_unit": "kPa"})).warnings() == [SOFT]  # the defaults
+    assert scene_from_dict(changed(TUBE, {"material.stress_unit": "kPa"})).warnings() == [
+        SOFT
+    ]  # the defaults
     # another density than the preset's is no excuse
     assert len(soft.with_values({"material.chain_density": 2.1e21}).warnings()) == 1
-    assert soft.with_values({"material.stress_unit": "MPa"}).warnings()[0].count("is 910000 times (6.0 decades)") == 1
+    assert (
+        soft.with_values({"material.stress_unit": "MPa"})
+        .warnings()[0]
+        .count("is 910000 times (6.0 decades)")
+        == 1
+    )
     softer = {"material.lame_mu": "3.103 Pa", "loads.pressure.value": "4.8 Pa"}
     for remedy in (
         {"material.chain_density": 2e24},
@@ -373,8 +453,16 @@ def test_a_chain_density_of_another_stress_unit_is_warned_of():
 
 def test_a_wall_too_soft_for_its_pressure_is_warned_of():
     """At the pressure at which the chains of a thin wall come to 90 % of their length; one without them at mu h/r."""
-    changes = {"geometry.outer_radius": 1.02, "model.kinematics": "radial", "loads.elongation.value": 0.0}
-    changes |= {"cells.initial": "isotropic", "remodeling.law": "none", "material.lame_lambda": 3000.0}
+    changes = {
+        "geometry.outer_radius": 1.02,
+        "model.kinematics": "radial",
+        "loads.elongation.value": 0.0,
+    }
+    changes |= {
+        "cells.initial": "isotropic",
+        "remodeling.law": "none",
+        "material.lame_lambda": 3000.0,
+    }
     thin = preset_scene(PAPER, "tube").with_values(
         {**changes, "time.end": 1.0, "loads.pressure.ramp": [[0, 0], [1, 1]]}
     )
@@ -383,18 +471,35 @@ def test_a_wall_too_soft_for_its_pressure_is_warned_of():
     borne = float(re.search("the tissue bears ([0-9.]+) Pa", words)[1])
     row = rows_of(thin.with_values({"loads.pressure.value": borne * wall}))[-1]
     assert row["max_chain_extension"] == pytest.approx(0.9, abs=6e-3)  # at the inner face
-    soft = thin.with_values({"material.chain_density": 0.0, "loads.pressure.value": 1.001 * 3.103 * wall})
-    assert len(soft.warnings()) == 1 and not soft.with_values({"loads.pressure.value": 3.1 * wall}).warnings()
+    soft = thin.with_values(
+        {"material.chain_density": 0.0, "loads.pressure.value": 1.001 * 3.103 * wall}
+    )
+    assert (
+        len(soft.warnings()) == 1
+        and not soft.with_values({"loads.pressure.value": 3.1 * wall}).warnings()
+    )
     stiff = thin.with_values({"loads.pressure.value": 0.99 * borne * wall})
     assert not [*too_soft(stiff), *too_soft(stiff.with_values({"geometry.is": "loaded"}))]
 
 
 def test_a_preset_with_units_in_another_stress_unit(monkeypatch):
-    material = {"stress_unit": "kPa", "lame_mu": "3.103 kPa", "lame_lambda": "27293 Pa", "chain_density": 2e24}
+    material = {
+        "stress_unit": "kPa",
+        "lame_mu": "3.103 kPa",
+        "lame_lambda": "27293 Pa",
+        "chain_density": 2e24,
+    }
     monkeypatch.setitem(PRESETS, "stiff", {"cube": {"material": material}})
     stiff = scene_from_dict({**CUBE, "preset": "stiff"})
-    assert (stiff.material.lame_mu, stiff.material.lame_lambda, stiff.warnings()) == (3.103, 27.293, [])
-    assert "(3.0 decades) stiffer than" in stiff.with_values({"material.stress_unit": "Pa"}).warnings()[0]
+    assert (stiff.material.lame_mu, stiff.material.lame_lambda, stiff.warnings()) == (
+        3.103,
+        27.293,
+        [],
+    )
+    assert (
+        "(3.0 decades) stiffer than"
+        in stiff.with_values({"material.stress_unit": "Pa"}).warnings()[0]
+    )
 
 
 @pytest.mark.parametrize(("shape", "changes", "line"), rows(__file__, "traps.txt"))
@@ -419,7 +524,10 @@ def test_bodies_of_plausible_tissue_are_not_warned_of():
         assert tube.with_values(quiet).warnings() == [], quiet
     metres = {"material.contour_length": 1.594e-9, "material.persistence_length": 1.365e-9,
               "cells.end_to_end_length": 1e-9}  # fmt: skip
-    assert [len(tube.with_values(metres | more).warnings()) for more in ({}, {"material.chain_density": 2e24})] == [
+    assert [
+        len(tube.with_values(metres | more).warnings())
+        for more in ({}, {"material.chain_density": 2e24})
+    ] == [
         0,
         1,
     ]
@@ -442,7 +550,10 @@ def test_the_coupling_of_the_default_law_goes_with_it(tmp_path: Path, preset: st
     path = tmp_path / "cube.toml"
     as_run = preset_scene("consistent", "cube").to_toml()
     path.write_text(as_run.replace('preset = "consistent"\n', preset))
-    for scene in (read_scene(path, ["remodeling.law=none"]), read_scene(path).with_values({"remodeling.law": "none"})):
+    for scene in (
+        read_scene(path, ["remodeling.law=none"]),
+        read_scene(path).with_values({"remodeling.law": "none"}),
+    ):
         assert scene.remodeling.coupling == "staggered"
     path.write_text('preset = "consistent"\ngeometry.shape = "cube"\nremodeling.law = "none"\n')
     assert read_scene(path).remodeling.coupling == "staggered"
@@ -450,22 +561,35 @@ def test_the_coupling_of_the_default_law_goes_with_it(tmp_path: Path, preset: st
         read_scene(path, ["remodeling.coupling=extrapolated"])
 
 
-def test_times_after_an_earlier_end_are_dropped_with_a_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_times_after_an_earlier_end_are_dropped_with_a_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "cube.toml"
-    path.write_text('preset = "consistent"\ngeometry.shape = "cube"\noutput.times = [2.0, 5.0, 6.0]\n')
+    path.write_text(
+        'preset = "consistent"\ngeometry.shape = "cube"\noutput.times = [2.0, 5.0, 6.0]\n'
+    )
     assert read_scene(path, ["time.end=3"]).output.times == (2.0,)
     assert caplog.messages == ["output.times: dropped 2 times after time.end = 3"]
     with pytest.raises(SceneError, match="must be at most time.end"):
         read_scene(path, ["time.end=3", "output.times=[5]"])
 
 
-def test_what_a_run_has_chosen_is_chosen_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_a_run_has_chosen_is_chosen_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """With a line, where it does not go with what is set; not what is set itself, nor without any change."""
     path = tmp_path / "scene.toml"
-    path.write_text(scene_from_dict(BASES["layers"]).with_values({"model.kinematics": "radial"}).to_toml())
-    assert read_scene(path, ["remodeling.kappa=0.1"]).model.kinematics == "radial" and not caplog.messages
+    path.write_text(
+        scene_from_dict(BASES["layers"]).with_values({"model.kinematics": "radial"}).to_toml()
+    )
+    assert (
+        read_scene(path, ["remodeling.kappa=0.1"]).model.kinematics == "radial"
+        and not caplog.messages
+    )
     assert read_scene(path, ["cells.initial=random"]).model.kinematics == "auto"
-    assert re.fullmatch("model.kinematics = 'radial': cells.initial .*; using 'auto' instead", *caplog.messages)
+    assert re.fullmatch(
+        "model.kinematics = 'radial': cells.initial .*; using 'auto' instead", *caplog.messages
+    )
     with pytest.raises(SceneError, match="model.kinematics = 'radial'"):
         read_scene(path, ["cells.initial=random", "model.kinematics=radial"])
     path.write_text(path.read_text().replace("format = ", "# "))

@@ -23,7 +23,9 @@ TENDON = ROOT / "demos" / "tendon.toml"
 
 def artery(**changes: Any) -> Any:
     """The artery in mm, with other values: "__" stands for the dot of a key."""
-    keys = {"geometry.length_unit": "mm"} | {name.replace("__", "."): value for name, value in changes.items()}
+    keys = {"geometry.length_unit": "mm"} | {
+        name.replace("__", "."): value for name, value in changes.items()
+    }
     return read_scene(ARTERY).with_values(keys)
 
 
@@ -42,15 +44,25 @@ LENGTHS = {"m": 0.0123, "cm": 1.23, "mm": 12.3, "um": 12300.0}
 
 
 @pytest.mark.parametrize("unit", LENGTHS)
-@pytest.mark.parametrize("text", ["12.3 mm", "1.23 cm", "12300 um", "12300 µm", "0.0123 m", "12300 micrometers"])
+@pytest.mark.parametrize(
+    "text", ["12.3 mm", "1.23 cm", "12300 um", "12300 µm", "0.0123 m", "12300 micrometers"]
+)
 def test_lengths_in_every_unit_exactly(unit, text):
-    scene = scene_from_dict({"geometry": {"shape": "cube", "side": text, "length_unit": unit}, "time": {"end": 1.0}})
-    assert scene.geometry.side == LENGTHS[unit]  # a product of floats gives 12.299999999999999 for some of these
+    scene = scene_from_dict(
+        {"geometry": {"shape": "cube", "side": text, "length_unit": unit}, "time": {"end": 1.0}}
+    )
+    assert (
+        scene.geometry.side == LENGTHS[unit]
+    )  # a product of floats gives 12.299999999999999 for some of these
 
 
 def test_the_units_are_those_of_the_scene():
     keys = {"material__stress_unit": "kPa", "geometry__length_unit": "cm"}
-    keys |= {"loads__pressure__value": "100 mmHg", "geometry__inner_radius": "1 mm", "geometry__length": "8 mm"}
+    keys |= {
+        "loads__pressure__value": "100 mmHg",
+        "geometry__inner_radius": "1 mm",
+        "geometry__length": "8 mm",
+    }
     scene = artery(**keys, material__lame_lambda="27.293 Pa", solver__absolute_tolerance="1 mN")
     assert scene.loads["pressure"].value == 13.3322387415
     assert (scene.geometry.inner_radius, scene.geometry.length) == (0.1, 0.8)
@@ -62,7 +74,11 @@ def test_the_units_are_those_of_the_scene():
 def test_forces_and_areas():
     values = ["geometry.length_unit=mm", "geometry.area=10 mm^2", "geometry.length=1 cm"]
     scene = read_scene(TENDON, [*values, "material.stress_unit=kPa", "loads.force.value=300 mN"])
-    assert (scene.geometry.area, scene.geometry.length, scene.loads["force"].value) == (10.0, 10.0, 300.0)
+    assert (scene.geometry.area, scene.geometry.length, scene.loads["force"].value) == (
+        10.0,
+        10.0,
+        300.0,
+    )
 
 
 def test_temperature_and_chain_density():
@@ -78,7 +94,10 @@ def test_a_scene_as_run_holds_numbers(tmp_path):
     again = tmp_path / "again.toml"
     again.write_text(text)
     values = tomllib.loads(text)
-    assert (values["loads"]["pressure"]["value"], values["geometry"]["length"]) == (13332.2387415, 8.0)
+    assert (values["loads"]["pressure"]["value"], values["geometry"]["length"]) == (
+        13332.2387415,
+        8.0,
+    )
     assert values["geometry"]["length_unit"] == "mm"
     assert read_scene(again) == read_scene(again, ["geometry.length=8 mm"])
 
@@ -86,14 +105,35 @@ def test_a_scene_as_run_holds_numbers(tmp_path):
 # ---------------------------------------------------------------- the command line
 
 
-@pytest.mark.parametrize("value", ['"100 mmHg"', "100 mmHg", "100mmHg", "'100 mmHg'", " 13332.2387415 "])
+@pytest.mark.parametrize(
+    "value", ['"100 mmHg"', "100 mmHg", "100mmHg", "'100 mmHg'", " 13332.2387415 "]
+)
 def test_set_with_and_without_quotes(value):
-    assert read_scene(ARTERY, [f"loads.pressure.value={value}"]).loads["pressure"].value == 13332.2387415
+    assert (
+        read_scene(ARTERY, [f"loads.pressure.value={value}"]).loads["pressure"].value
+        == 13332.2387415
+    )
 
 
 def test_a_quantity():
-    assert all(map(is_quantity, ("5 mm", "-5 mm", "2e21 / m^3", "37 degC", "1 N/mm^2", "1 kg m s^-2", "37 °C")))
-    for text in ("5", "2e21", "mm", "two words", "5 mm = 3", "5 mm, 6 mm", "2 / 3", "5 m(", "", "1_000"):
+    assert all(
+        map(
+            is_quantity,
+            ("5 mm", "-5 mm", "2e21 / m^3", "37 degC", "1 N/mm^2", "1 kg m s^-2", "37 °C"),
+        )
+    )
+    for text in (
+        "5",
+        "2e21",
+        "mm",
+        "two words",
+        "5 mm = 3",
+        "5 mm, 6 mm",
+        "2 / 3",
+        "5 m(",
+        "",
+        "1_000",
+    ):
         assert not is_quantity(text), text
 
 

@@ -22,7 +22,9 @@ from tests.locking_bodies import thick_tube
 from tests.runs import made
 from tests.values import ramped, isotropic
 
-LARGEST = 0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
+LARGEST = (
+    0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
+)
 
 
 def thin_tube(pressure: float = 0.5, end: float = 1.0, **values: Any) -> Scene:
@@ -39,7 +41,9 @@ def radii(scene: Scene) -> tuple[list[float], int]:
     """Inner radius of the steps, and their Newton iterations."""
     with made(scene) as simulation:
         steps = list(simulation.steps())
-    return [step.row["inner_radius"] for step in steps], sum(step.work.newton_iterations for step in steps)
+    return [step.row["inner_radius"] for step in steps], sum(
+        step.work.newton_iterations for step in steps
+    )
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -51,7 +55,11 @@ def test_a_limit_point_that_is_jumped_over_is_named(
     pressure: float, step: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     """From r = 1.6 to 3.4: where the way ends is the largest pressure, whatever the step."""
-    found, _ = radii(thin_tube(pressure, **{"mesh.degree": 2, "time.step": step, "solver.relative_tolerance": 1e-9}))
+    found, _ = radii(
+        thin_tube(
+            pressure, **{"mesh.degree": 2, "time.step": step, "solver.relative_tolerance": 1e-9}
+        )
+    )
     assert max(np.diff(found)) > 1.5
     (said,) = warnings(caplog)
     assert "limit point" in said and "a smaller time.step" in said
@@ -64,7 +72,9 @@ def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:
     with made(thin_tube(LARGEST - 1e-4, **{"time.step": 0.125})) as simulation:
         before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
         last = simulation.unknown.x.array - before
-        failure = SolveFailure("refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), 50.0)
+        failure = SolveFailure(
+            "refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), 50.0
+        )
         refusal = diagnose_failure(simulation.stepper.coupling.newton, failure, last)
     assert refusal.kind == "limit point"
 
@@ -73,17 +83,27 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Near its largest pressure a tube without chains goes more than twice as far as its first tangent points."""
-    changes: dict[str, Any] = {"material.chain_density": 0.0, "geometry.outer_radius": 3.0, "supports.ends": "free"}
+    changes: dict[str, Any] = {
+        "material.chain_density": 0.0,
+        "geometry.outer_radius": 3.0,
+        "supports.ends": "free",
+    }
     changes |= {"loads.elongation": {"value": 0.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}}
     looked, confirm = [], Continuation.repeat_in_substeps
-    monkeypatch.setattr(Continuation, "repeat_in_substeps", lambda *arguments: looked.append(1) or confirm(*arguments))
+    monkeypatch.setattr(
+        Continuation,
+        "repeat_in_substeps",
+        lambda *arguments: looked.append(1) or confirm(*arguments),
+    )
     (whole,), _ = radii(thin_tube(3.15, **changes))
     assert looked and not warnings(caplog)
     small, _ = radii(thin_tube(3.15, **changes, **{"time.step": 0.1}))
     assert whole == pytest.approx(small[-1], rel=1e-8)
 
 
-def test_where_a_step_is_expected_to_end_is_no_start_of_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_a_step_is_expected_to_end_is_no_start_of_its_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """An increment like the last one changes the volume of a stiff body: its first Newton step is short, no way far."""
     looked: list[int] = []
     monkeypatch.setattr(Continuation, "repeat_in_substeps", lambda *arguments: looked.append(1))
@@ -125,10 +145,15 @@ def test_of_several_solutions_the_one_that_parts_lead_to_is_taken(
     assert "several solutions exist; using the one reached by substeps" in caplog.text
 
 
-def test_a_body_that_jumps_again_and_again_is_looked_into_three_times(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_body_that_jumps_again_and_again_is_looked_into_three_times(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Loaded, unloaded, loaded: each way over a limit point is a warning, up to a number."""
     cycle = [[0.0, 0.0], *([float(t), float(t % 2)] for t in range(1, 9))]
-    scene = thin_tube(end=8.0, **{"loads.pressure.ramp": cycle, "time.step": 0.25, "solver.relative_tolerance": 1e-9})
+    scene = thin_tube(
+        end=8.0,
+        **{"loads.pressure.ramp": cycle, "time.step": 0.25, "solver.relative_tolerance": 1e-9},
+    )
     found, _ = radii(scene)
     assert sum(np.abs(np.diff(found)) > 1.0) >= 4
     assert len(warnings(caplog)) == 3
@@ -141,7 +166,9 @@ def test_parts_of_quasi_newton_steps_are_no_jump() -> None:
         scene = case.scene | {"solver": {"method": "lagged"}, "time": {"step": 1.0, "end": 6.0}}
         run = runner.run({"scene": scene, "counts": case.counts, "extended": case.extended})
         assert run.code == 0 and max(run.column("substeps")) > 4
-        assert run.column("mean_stretch")[-1] == pytest.approx(1.81231133, rel=1e-8)  # so every tangent says
+        assert run.column("mean_stretch")[-1] == pytest.approx(
+            1.81231133, rel=1e-8
+        )  # so every tangent says
         assert not any("jumps" in warning for warning in run.warnings)
 
 

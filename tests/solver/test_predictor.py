@@ -36,7 +36,9 @@ def test_a_trend_and_a_swing_are_both_continued_whatever_the_steps(simulation: S
     free = np.isnan(simulation.stepper.coupling.equilibrium.prescribed_values())
     for number, duration in enumerate(rng.uniform(0.5, 2.0, 8)):
         step, before = LoadStep(duration, RATES), unknown.copy()
-        found, increment = predictor.expected(step), duration * (0.9**number * trend + (-0.8) ** number * swing)
+        found, increment = predictor.expected(step), duration * (
+            0.9**number * trend + (-0.8) ** number * swing
+        )
         unknown[:] += increment
         predictor.solved(step, before)
     assert found is not None
@@ -56,7 +58,9 @@ def predicted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Path) -> None:
-    plain = run(pulled_cube(16.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
+    plain = run(
+        pulled_cube(16.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF
+    )
     found, expected = Recording(predicted).history, Recording(plain).history
     for name in ("mean_stretch", "stored_energy", "max_chain_extension", "remodeling_power"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-8, err_msg=name)
@@ -66,7 +70,10 @@ def test_the_solutions_are_the_same_with_less_work(predicted: Path, tmp_path: Pa
 def nearly_straight(predictor: Predictor, step: LoadStep) -> np.ndarray | None:
     """The last displacement, stretched until the longest chain has 0.999 of its contour length."""
     tissue = pulled_cube(4.0).material.tissue(pulled_cube(4.0).cells.end_to_end_length)
-    unknown, extension = predictor.state.unknown.x.array, Equilibrium(predictor.state, tissue).extension
+    unknown, extension = (
+        predictor.state.unknown.x.array,
+        Equilibrium(predictor.state, tissue).extension,
+    )
     last, factors = unknown.copy(), [1.0, 20.0]
     if not predictor.state.number:
         return None
@@ -78,11 +85,17 @@ def nearly_straight(predictor: Predictor, step: LoadStep) -> np.ndarray | None:
     return factors[0] * last
 
 
-def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_expected_wrongly_costs_no_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Not admissible, with chains nearly straight, or a start from which the solve fails: all is as without."""
     scene = pulled_cube(4.0, solver=PREDICTED, output={"fields": False})
-    plain = run(pulled_cube(4.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF)
-    monkeypatch.setattr(Predictor, "expected", lambda self, step: -50.0 * self.state.unknown.x.array)
+    plain = run(
+        pulled_cube(4.0, solver=NOT_PREDICTED, output={"fields": False}), tmp_path / "plain", SELF
+    )
+    monkeypatch.setattr(
+        Predictor, "expected", lambda self, step: -50.0 * self.state.unknown.x.array
+    )
     assert rows(run(scene, tmp_path / "far", SELF)) == rows(plain)
     monkeypatch.setattr(Predictor, "expected", nearly_straight)
     assert rows(run(scene, tmp_path / "straight", SELF)) == rows(plain)
@@ -91,7 +104,9 @@ def test_what_is_expected_wrongly_costs_no_step(tmp_path: Path, monkeypatch: pyt
     def failing(newton: GuardedNewton, origin: Any = None) -> Any:
         if not failed or failed[-1] != newton.equilibrium.state.number:
             failed.append(newton.equilibrium.state.number)
-            raise SolveFailure("made to fail", Solution(3, 3, extension=newton.equilibrium.extension()))
+            raise SolveFailure(
+                "made to fail", Solution(3, 3, extension=newton.equilibrium.extension())
+            )
         return solve(newton, origin)
 
     monkeypatch.setattr(Predictor, "expected", lambda self, step: self.state.unknown.x.array + 0.0)

@@ -26,7 +26,8 @@ RANDOM = Cells(initial="random", seed=3)
 def test_pressure_tangent_is_symmetric_on_the_artery_and_not_with_free_ends(element: str) -> None:
     """The ends slide in planes: the edge terms vanish and the pressure has a potential."""
     made = parts.body(
-        tube(length=2.0, element=element, divisions=(8, 2, 3)), Cells(initial="isotropic", axes="cylindrical")
+        tube(length=2.0, element=element, divisions=(8, 2, 3)),
+        Cells(initial="isotropic", axes="cylindrical"),
     )
     made.loading.hold_face("bottom", 2)
     made.loading.hold_face("top", 2)
@@ -35,11 +36,15 @@ def test_pressure_tangent_is_symmetric_on_the_artery_and_not_with_free_ends(elem
     u[:, 2] *= made.nodes[:, 2] * (2.0 - made.nodes[:, 2])
     made.set_displacement(u)
     made.loading.set({"pressure": 1.0})
-    test, trial = (make(made.displacement.function_space) for make in (ufl.TestFunction, ufl.TrialFunction))
+    test, trial = (
+        make(made.displacement.function_space) for make in (ufl.TestFunction, ufl.TrialFunction)
+    )
     virtual_work = made.loading.external_residual(test)
     form = jit.form(ufl.derivative(virtual_work, made.displacement, trial))
     tangent = dolfinx.fem.assemble_matrix(form).to_scipy().toarray()
-    held = np.concatenate([condition.dof_indices()[0] for condition in made.loading.boundary_conditions])
+    held = np.concatenate(
+        [condition.dof_indices()[0] for condition in made.loading.boundary_conditions]
+    )
     free = np.setdiff1d(np.arange(tangent.shape[0]), held)
     on_free = tangent[np.ix_(free, free)]
     assert np.linalg.norm(on_free - on_free.T) < 1e-14 * np.linalg.norm(on_free)
@@ -53,7 +58,10 @@ def test_loads_are_what_their_names_say() -> None:
     made.loading.add_follower_pressure("pressure", "x1")
     made.loading.add_prescribed_elongation("elongation", "z1", 2, 2.0)
     problem = made.problem()
-    for loads, total in (({"force": 3.0, "pressure": 0.0}, [0, 0, 3]), ({"force": 0.0, "pressure": 5.0}, [-20, 0, 0])):
+    for loads, total in (
+        ({"force": 3.0, "pressure": 0.0}, [0, 0, 3]),
+        ({"force": 0.0, "pressure": 5.0}, [-20, 0, 0]),
+    ):
         made.loading.set(loads)
         external = -dolfinx.fem.assemble_vector(problem.external_forms[0]).array.reshape(-1, 3)
         np.testing.assert_allclose(external.sum(axis=0), total, atol=1e-13)
@@ -74,7 +82,9 @@ def test_a_prescribed_elongation_is_reached_as_fast_as_newton_can() -> None:
         solution = problem.solve()
     u = made.displacement.x.array.reshape(-1, 3)
     np.testing.assert_allclose(u[:, 2], 0.2 * made.nodes[:, 2], atol=1e-10)
-    assert solution.newton_iterations <= 5  # the last one at the rounding of the forces; six without lifting
+    assert (
+        solution.newton_iterations <= 5
+    )  # the last one at the rounding of the forces; six without lifting
 
 
 # ---------------------------------------------------------------- guards
@@ -104,10 +114,14 @@ def small_steps() -> np.ndarray:
 
 
 @pytest.mark.parametrize("line_search", LINE_SEARCHES)
-def test_one_oversized_step_ends_on_the_branch_or_where_it_began(line_search: str, small_steps: np.ndarray) -> None:
+def test_one_oversized_step_ends_on_the_branch_or_where_it_began(
+    line_search: str, small_steps: np.ndarray
+) -> None:
     """Unguarded, the chains converge beyond their contour length: their force is finite and positive there too."""
     made = held_cube()
-    settings = parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": line_search}})
+    settings = parts.TIGHT.model_copy(
+        update={"petsc_options": {"snes_linesearch_type": line_search}}
+    )
     problem = made.problem(settings)
     made.loading.set({"force": OVERSIZED})
     try:
@@ -133,14 +147,21 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     """Beyond r = L the chain force is finite and positive again: Newton without guards converges there, quickly."""
     made = stretched_bar(4.0)
     start = made.displacement.x.array.copy()
-    problem = made.problem(parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}}))
-    real, harmless = problem.evaluate, PointState(StateLimits(0.5, 0.5, (0.0, 0.0, 0.0)), *np.zeros((3, 0)))
+    problem = made.problem(
+        parts.TIGHT.model_copy(update={"petsc_options": {"snes_linesearch_type": "bt"}})
+    )
+    real, harmless = problem.evaluate, PointState(
+        StateLimits(0.5, 0.5, (0.0, 0.0, 0.0)), *np.zeros((3, 0))
+    )
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
     guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
     monkeypatch.setattr(problem, "evaluate", guard)
     with pytest.raises(SolveFailure, match=r"reached r/L = 2\.72") as caught:
         problem.solve()
-    assert problem.newton._snes.getConvergedReason() > 0 and problem.newton._snes.getFunctionNorm() < 1e-9
+    assert (
+        problem.newton._snes.getConvergedReason() > 0
+        and problem.newton._snes.getFunctionNorm() < 1e-9
+    )
     assert caught.value.newton_iterations < 10
     assert caught.value.extension.max_chain_extension == pytest.approx(2.7212, abs=1e-3)
     np.testing.assert_array_equal(made.displacement.x.array, start)
@@ -152,7 +173,9 @@ def test_a_straight_way_through_a_collapsed_volume_is_seen() -> None:
     before, after = (np.eye(3) + 0.7 * rng.standard_normal((5_000, 3, 3)) for _ in range(2))
     good = (np.linalg.det(before) > 0) & (np.linalg.det(after) > 0)
     before, after = before[good], after[good]
-    lowest = np.min([np.linalg.det(before + s * (after - before)) for s in np.linspace(0, 1, 401)], axis=0)
+    lowest = np.min(
+        [np.linalg.det(before + s * (after - before)) for s in np.linspace(0, 1, 401)], axis=0
+    )
     found = determinant_changes_sign(before, after)
     assert np.all(found[lowest <= 0]) and np.all(lowest[found] < 1e-3)
     assert 0.02 < found.mean() < 0.2
@@ -160,7 +183,9 @@ def test_a_straight_way_through_a_collapsed_volume_is_seen() -> None:
     assert determinant_changes_sign(np.eye(3)[None], half_a_turn) and not determinant_changes_sign(
         half_a_turn, half_a_turn
     )
-    assert not determinant_changes_sign(np.eye(3)[None], np.full((1, 3, 3), np.nan))  # others refuse that
+    assert not determinant_changes_sign(
+        np.eye(3)[None], np.full((1, 3, 3), np.nan)
+    )  # others refuse that
 
 
 def test_no_point_that_turns_is_left_out() -> None:
@@ -174,7 +199,9 @@ def test_no_point_that_turns_is_left_out() -> None:
         expected = determinant_changes_sign(F, G)
         for at in range(len(F)):
             ends = [
-                PointState(problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1])
+                PointState(
+                    problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1]
+                )
                 for X in (F, G)
             ]
             assert problem.inverts_between(*ends) == expected[at]
@@ -208,8 +235,12 @@ def test_a_newton_step_is_shortened_where_elements_turn_inside_out_or_chains_loc
         np.testing.assert_allclose(step.array, asked / shorter)
 
 
-@pytest.mark.parametrize(("stretch", "said"), [(2.5, "reached r/L = "), (8.0, "reached r/L = "), (-0.5, "J = -0.125")])
-def test_a_start_beyond_the_contour_length_or_inside_out_fails_and_stays(stretch: float, said: str) -> None:
+@pytest.mark.parametrize(
+    ("stretch", "said"), [(2.5, "reached r/L = "), (8.0, "reached r/L = "), (-0.5, "J = -0.125")]
+)
+def test_a_start_beyond_the_contour_length_or_inside_out_fails_and_stays(
+    stretch: float, said: str
+) -> None:
     made = stretched_bar(max(stretch, 1.0))
     if stretch < 0:
         made.set_displacement((stretch - 1) * made.nodes)
@@ -225,7 +256,11 @@ def test_nan_anywhere_is_a_failure_not_a_result(where: str) -> None:
     made = held_cube()
     problem = made.problem()
     made.loading.set({"force": 1.0})
-    function = {"displacement": made.displacement, "dimensions": made.cells.dimensions, "axes": made.cells.axes}[where]
+    function = {
+        "displacement": made.displacement,
+        "dimensions": made.cells.dimensions,
+        "axes": made.cells.axes,
+    }[where]
     function.x.array[7] = np.nan
     before = made.displacement.x.array.copy()
     extension = problem.extension()
@@ -264,8 +299,13 @@ def test_a_failed_solve_leaves_a_solver_that_works() -> None:
 FINE = 6  # degree of the rule for the body force and the error norms
 TURNED = parts.rotation((1.0, 2.0, -0.5), 40.0)
 DIMENSIONS = np.array([0.8, 0.5, np.sqrt(1 - 0.8**2 - 0.5**2)])
-COMPRESSIBLE = Material(lame_lambda=3.0)  # nearly incompressible, linear tetrahedra are slow to show their rate
-MATERIALS = {"chains": COMPRESSIBLE, "matrix": COMPRESSIBLE.model_copy(update={"chain_density": 0.0})}
+COMPRESSIBLE = Material(
+    lame_lambda=3.0
+)  # nearly incompressible, linear tetrahedra are slow to show their rate
+MATERIALS = {
+    "chains": COMPRESSIBLE,
+    "matrix": COMPRESSIBLE.model_copy(update={"chain_density": 0.0}),
+}
 AMPLITUDES = np.array([0.08, -0.06, 0.1])
 SLOPES = np.array([[0.5, 0.2, -0.3], [-0.4, 0.1, 0.6], [0.2, -0.5, 0.3]])
 
@@ -274,9 +314,13 @@ def manufactured(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """u (n, 3) and grad u (n, 3, 3) at x (n, 3), real or complex; zero on the whole boundary of the unit cube."""
     sine, cosine = np.sin(np.pi * x), np.pi * np.cos(np.pi * x)
     bubble = np.prod(sine, axis=1)
-    slope = np.stack([cosine[:, j] * np.prod(np.delete(sine, j, axis=1), axis=1) for j in range(3)], axis=1)
+    slope = np.stack(
+        [cosine[:, j] * np.prod(np.delete(sine, j, axis=1), axis=1) for j in range(3)], axis=1
+    )
     factor = AMPLITUDES * (1 + x @ SLOPES.T)
-    gradient = factor[:, :, None] * slope[:, None, :] + bubble[:, None, None] * (AMPLITUDES[:, None] * SLOPES)
+    gradient = factor[:, :, None] * slope[:, None, :] + bubble[:, None, None] * (
+        AMPLITUDES[:, None] * SLOPES
+    )
     return factor * bubble[:, None], gradient
 
 
@@ -301,13 +345,22 @@ def body_force(x: np.ndarray, chain_density: float) -> np.ndarray:
     """b = -Div P(I + grad u) at x (n, 3), each derivative by a complex step."""
     force = np.zeros_like(x)
     for j, shift in enumerate(1e-30 * np.eye(3)):
-        force -= first_piola_kirchhoff(np.eye(3) + manufactured(x + 1j * shift)[1], chain_density)[:, :, j].imag / 1e-30
+        force -= (
+            first_piola_kirchhoff(np.eye(3) + manufactured(x + 1j * shift)[1], chain_density)[
+                :, :, j
+            ].imag
+            / 1e-30
+        )
     return force
 
 
 def errors(refinement: int, element: str, degree: int, material: Material) -> tuple[float, float]:
     """L2 and H1 (semi-norm) errors of the solution on a uniform mesh."""
-    made = parts.body(cube(refinement=refinement, element=element, degree=degree), Cells(initial="isotropic"), degree)
+    made = parts.body(
+        cube(refinement=refinement, element=element, degree=degree),
+        Cells(initial="isotropic"),
+        degree,
+    )
     made.cells.set(
         np.broadcast_to(DIMENSIONS, made.cells.dimension_values.shape),
         np.broadcast_to(TURNED, made.cells.axis_values.shape),
@@ -322,7 +375,9 @@ def errors(refinement: int, element: str, degree: int, material: Material) -> tu
     made.loading.add_term(lambda u, v: -ufl.inner(force, v) * rule.dx)
     made.problem(material=material).solve()
     u = made.displacement
-    state = jit.expression(ufl.as_vector([*u, *(ufl.grad(u)[i, j] for i in range(3) for j in range(3))]), rule.points)
+    state = jit.expression(
+        ufl.as_vector([*u, *(ufl.grad(u)[i, j] for i in range(3) for j in range(3))]), rule.points
+    )
     values = rule.evaluate(state, (12,))
     exact, gradient = manufactured(at)
     wrong = values - np.concatenate([exact, gradient.reshape(-1, 9)], axis=1).reshape(values.shape)
@@ -339,7 +394,11 @@ OTHERS = [("hexahedron", 2, (3, 6), "chains"), ("tetrahedron", 1, (8, 16), "chai
 
 @pytest.mark.parametrize(("element", "degree", "meshes", "material"), [*ELEMENTS, *slowly(*OTHERS)])
 def test_manufactured_solution_is_approached_at_the_elements_rates(
-    element: str, degree: int, meshes: tuple[int, int], material: str, monkeypatch: pytest.MonkeyPatch
+    element: str,
+    degree: int,
+    meshes: tuple[int, int],
+    material: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """An oblique orthotropic cell and a body force from eq. (7) typed by hand: shares no line with the forms."""
     monkeypatch.setitem(quadrature.DEGREES, (element, FINE), FINE)
@@ -350,5 +409,9 @@ def test_manufactured_solution_is_approached_at_the_elements_rates(
     np.testing.assert_allclose(
         rates, [degree + 1, degree], atol=0.2 if (element, degree) == ("tetrahedron", 1) else 0.1
     )
-    size = np.sqrt(np.mean(np.sum(manufactured(np.random.default_rng(1).uniform(size=(1000, 3)))[0] ** 2, axis=1)))
+    size = np.sqrt(
+        np.mean(
+            np.sum(manufactured(np.random.default_rng(1).uniform(size=(1000, 3)))[0] ** 2, axis=1)
+        )
+    )
     assert fine[0] < 0.04 * size

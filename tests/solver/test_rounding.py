@@ -25,7 +25,11 @@ def test_uniaxial_compression_remodels_nothing(density: float, frame: str) -> No
 
     0.1.0 took it for one: with the stiff network the angle went from 54.7 to 72.2 degrees.
     """
-    changes = {"loads.force.value": -10.0, "material.chain_density": density, "remodeling.frame": frame}
+    changes = {
+        "loads.force.value": -10.0,
+        "material.chain_density": density,
+        "remodeling.frame": frame,
+    }
     scene = preset_scene(PAPER, "cube").with_values({**changes, "time.end": 20.0})
     angles = [step.row["mean_fibre_angle"] for step in Simulation(scene).steps()]
     np.testing.assert_allclose(angles, np.degrees(np.arctan(np.sqrt(2.0))), rtol=0, atol=1e-10)
@@ -33,7 +37,10 @@ def test_uniaxial_compression_remodels_nothing(density: float, frame: str) -> No
 
 def test_what_a_loose_tolerance_leaves_is_no_tension() -> None:
     """Out-of-balance forces that were accepted are lateral stresses of 1e-3 here, far above rounding."""
-    loose = {"solver.relative_tolerance": 1e-4, "solver.predictor": "none"}  # a predictor leaves less
+    loose = {
+        "solver.relative_tolerance": 1e-4,
+        "solver.predictor": "none",
+    }  # a predictor leaves less
     changes = {"loads.force.value": -10.0, "material.chain_density": 1e24, **loose}
     scene = preset_scene(PAPER, "cube").with_values({**changes, "time.end": 12.0})
     steps = list(Simulation(scene).steps())
@@ -42,7 +49,12 @@ def test_what_a_loose_tolerance_leaves_is_no_tension() -> None:
     np.testing.assert_allclose(angles, np.degrees(np.arctan(np.sqrt(2.0))), rtol=0, atol=1e-10)
 
 
-LOOSE = {"model.kinematics": "radial", "cells.initial": "isotropic", "time.end": 40.0, "time.step": 2.5}
+LOOSE = {
+    "model.kinematics": "radial",
+    "cells.initial": "isotropic",
+    "time.end": 40.0,
+    "time.step": 2.5,
+}
 
 
 @pytest.mark.parametrize("coupling", ["extrapolated", "staggered"])
@@ -58,11 +70,17 @@ def test_a_loose_tolerance_remodels_as_a_tight_one(coupling: str) -> None:
     np.testing.assert_allclose(angles, angles[0], rtol=1e-3)
 
 
-def test_a_residual_that_may_be_much_of_the_stress_is_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_residual_that_may_be_much_of_the_stress_is_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     for tolerance in (1e-6, 1e-1):
         changes = {**LOOSE, "time.end": 5.0, "solver.relative_tolerance": tolerance}
         list(Simulation(preset_scene("consistent", "tube").with_values(changes)).steps())
-        said = [record.getMessage() for record in caplog.records if "treated as zero" in record.getMessage()]
+        said = [
+            record.getMessage()
+            for record in caplog.records
+            if "treated as zero" in record.getMessage()
+        ]
         assert len(said) == (tolerance == 1e-1), tolerance
     assert "Lower solver.relative_tolerance" in said[0]
 
@@ -78,7 +96,12 @@ def test_weak_tension_remodels_as_strong_tension_does() -> None:
 
 def test_a_small_force_on_a_slender_body_is_solved() -> None:
     """The scale of rounding is that of the nodes' own areas: with the length squared this step passed for solved."""
-    changes = {"cells.initial": "isotropic", "remodeling.law": "none", "time.end": 1.0, "loads.force.value": 3e-6}
+    changes = {
+        "cells.initial": "isotropic",
+        "remodeling.law": "none",
+        "time.end": 1.0,
+        "loads.force.value": 3e-6,
+    }
     changes |= {"loads.force.ramp": [[0.0, 0.0], [1.0, 1.0]], "geometry.area": 1.0}
     stretches = []
     for length in (10.0, 1e4):
@@ -94,7 +117,9 @@ def test_the_tolerance_is_a_force() -> None:
     found = []
     for side in (1.0, 1e3):
         made = parts.body(cube(side, comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
-        problem = made.problem(parts.TIGHT.model_copy(update={"absolute_tolerance": 0.0, "relative_tolerance": 1e-30}))
+        problem = made.problem(
+            parts.TIGHT.model_copy(update={"absolute_tolerance": 0.0, "relative_tolerance": 1e-30})
+        )
         made.loading.set({"force": side**2})
         problem.solve()
         found.append(problem.newton.convergence.tolerance())
@@ -115,13 +140,18 @@ THIN = {
     "remodeling.law": "none",
     "time.end": 8.0,
 }
-DIRECT = {"solver.method": "direct", "solver.predictor": "none"}  # each solve starts as far away as it can
+DIRECT = {
+    "solver.method": "direct",
+    "solver.predictor": "none",
+}  # each solve starts as far away as it can
 
 
 @pytest.mark.parametrize("lame_lambda", [3.103e4, 3.103e6])
 def test_thin_walls_are_solved(lame_lambda: float) -> None:
     """A displacement of a twelfth of the radius is rounded; over an element of 1/80 of it that is a strain."""
-    simulation = Simulation(preset_scene(PAPER, "tube").with_values({**THIN, "material.lame_lambda": lame_lambda}))
+    simulation = Simulation(
+        preset_scene(PAPER, "tube").with_values({**THIN, "material.lame_lambda": lame_lambda})
+    )
     *_, last = simulation.steps()
     elements = simulation.cells.quadrature.shape[0]
     wall = Tube(1.0, 1.05, elements, RadialMaterial(lame_lambda=lame_lambda))
@@ -138,9 +168,22 @@ def test_thin_walls_are_solved(lame_lambda: float) -> None:
 def test_a_stiff_wall_with_residual_stress_is_solved() -> None:
     """Elements of degree 2 leave four times the rounding of a displacement; it was refused at half of the load."""
     stiff = {"geometry.outer_radius": 1.15, "geometry.length": 2.0, "material.lame_lambda": 6382.0}
-    stiff |= {"material.lame_mu": 6.382, "material.chain_density": 1.635e21, "material.contour_length": 2.1}
-    stiff |= {"cells.initial": "isotropic", "natural.opening_angle": 60.0, "loads.pressure.value": 0.9939}
-    stiff |= {"loads.elongation.value": 0.2, "mesh.degree": 2, "model.kinematics": "radial", "time.end": 16.0}
+    stiff |= {
+        "material.lame_mu": 6.382,
+        "material.chain_density": 1.635e21,
+        "material.contour_length": 2.1,
+    }
+    stiff |= {
+        "cells.initial": "isotropic",
+        "natural.opening_angle": 60.0,
+        "loads.pressure.value": 0.9939,
+    }
+    stiff |= {
+        "loads.elongation.value": 0.2,
+        "mesh.degree": 2,
+        "model.kinematics": "radial",
+        "time.end": 16.0,
+    }
     for name in ("pressure", "elongation"):
         stiff[f"loads.{name}.ramp"] = [[0.0, 0.0], [8.0, 1.0]]
     stiff |= {"remodeling.law": "tensor", "remodeling.kappa": 0.025}
@@ -153,7 +196,10 @@ def test_a_refusal_names_a_tolerance_that_works(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(Convergence.tolerance, "__defaults__", (0.0,))
     with pytest.raises(StepFailure) as caught:
         list(Simulation(preset_scene(PAPER, "tube").with_values(THIN | DIRECT)).steps())
-    assert caught.value.refusal.kind == "solver tolerance" and "stagnates" in caught.value.refusal.advice
+    assert (
+        caught.value.refusal.kind == "solver tolerance"
+        and "stagnates" in caught.value.refusal.advice
+    )
     named = float(caught.value.refusal.advice.split("solver.relative_tolerance = ")[1].split()[0])
     assert 1e-10 < named <= 1e-6
     changes = THIN | DIRECT | {"solver.relative_tolerance": named}

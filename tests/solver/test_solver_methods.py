@@ -27,7 +27,11 @@ TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": [[0.0, 0
 
 def simulated(method: str, **changes: Any) -> tuple[Simulation, list[dict[str, float]]]:
     """A tube of two layers with random cells, loaded at full within five steps."""
-    values = TUBE | {"solver.method": method} | {name.replace("__", "."): value for name, value in changes.items()}
+    values = (
+        TUBE
+        | {"solver.method": method}
+        | {name.replace("__", "."): value for name, value in changes.items()}
+    )
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(values)
     simulation = Simulation(scene, SELF, tube(length=2.0, divisions=(8, 2, 1), comm=SELF))
     return simulation, [step.row for step in simulation.steps()]
@@ -42,17 +46,34 @@ def direct() -> list[dict[str, float]]:
 
 def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]]) -> None:
     """To what the tolerance leaves open."""
-    for name in ("inner_radius", "outer_radius", "stored_energy", "fibre_angle_inner", "max_chain_extension"):
-        np.testing.assert_allclose([row[name] for row in found], [row[name] for row in expected], rtol=1e-8)
+    for name in (
+        "inner_radius",
+        "outer_radius",
+        "stored_energy",
+        "fibre_angle_inner",
+        "max_chain_extension",
+    ):
+        np.testing.assert_allclose(
+            [row[name] for row in found], [row[name] for row in expected], rtol=1e-8
+        )
 
 
 # ---------------------------------------------------------------- what is chosen
-@pytest.mark.parametrize(("small", "reduced"), [(methods.MAX_DIRECT_3D, False), (methods.MAX_DIRECT_REDUCED, True)])
+@pytest.mark.parametrize(
+    ("small", "reduced"), [(methods.MAX_DIRECT_3D, False), (methods.MAX_DIRECT_REDUCED, True)]
+)
 def test_auto_goes_by_the_size(small: int, reduced: bool) -> None:
     large = methods.MIN_MULTIGRID
-    for unknowns, method in ((small, "direct"), (small + 1, "lagged"), (large, "lagged"), (large + 1, "iterative")):
+    for unknowns, method in (
+        (small, "direct"),
+        (small + 1, "lagged"),
+        (large, "lagged"),
+        (large + 1, "iterative"),
+    ):
         assert methods.resolve_auto("auto", unknowns, reduced) == method
-        assert all(methods.resolve_auto(name, unknowns, reduced) == name for name in methods.SOLVER_METHODS)
+        assert all(
+            methods.resolve_auto(name, unknowns, reduced) == name for name in methods.SOLVER_METHODS
+        )
     assert methods.resolve_auto("auto", large + 1, reduced, multigrid=False) == "lagged"
 
 
@@ -64,10 +85,14 @@ def test_all_methods_come_to_the_same_states(
 ) -> None:
     factors = []
     renew = LaggedFactorisation.renew
-    monkeypatch.setattr(LaggedFactorisation, "renew", lambda self, matrix: (factors.append(1), renew(self, matrix)))
+    monkeypatch.setattr(
+        LaggedFactorisation, "renew", lambda self, matrix: (factors.append(1), renew(self, matrix))
+    )
     simulation, rows = simulated(method, solver__predictor=predictor)
     assert_same(rows, direct)
-    solver, iterations = simulation.stepper.coupling.newton, sum(row["newton_iterations"] for row in rows)
+    solver, iterations = simulation.stepper.coupling.newton, sum(
+        row["newton_iterations"] for row in rows
+    )
     tangents, krylov = solver._linear.tangents, sum(row["linear_iterations"] for row in rows)
     if method == "lagged":
         assert len(factors) == tangents < iterations / 2 and krylov == iterations
@@ -81,7 +106,10 @@ def test_options_of_ones_own_lie_over_the_methods(direct: list[dict[str, float]]
     options = {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
     simulation, rows = simulated("lagged", solver__petsc_options=options)
     assert simulation.stepper.coupling.newton.factorisation().getFactorSolverType() == "mumps"
-    assert simulation.stepper.coupling.newton._linear.tangents < sum(row["newton_iterations"] for row in rows) / 2
+    assert (
+        simulation.stepper.coupling.newton._linear.tangents
+        < sum(row["newton_iterations"] for row in rows) / 2
+    )
     assert_same(rows, direct)
     simulation.close()
 
@@ -99,7 +127,11 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     rng = np.random.default_rng(3)
     some = rng.standard_normal((30, 30))
-    definite, indefinite, general = some @ some.T + np.eye(30), some + some.T, some + 30 * np.eye(30)
+    definite, indefinite, general = (
+        some @ some.T + np.eye(30),
+        some + some.T,
+        some + 30 * np.eye(30),
+    )
     factor, kinds = LaggedFactorisation(), []
     for values in (definite, indefinite, general, definite, 2 * definite):
         matrix = matrix_of(values)
@@ -109,9 +141,15 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
         factor.apply(None, x, y)
         np.testing.assert_allclose(values @ y.array, x.array, rtol=0, atol=1e-11)
         kinds.append((factor.preconditioner.getFactorSolverType(), factor.preconditioner.getType()))
-    cholmod, symmetric, unsymmetric = ("cholmod", "cholesky"), ("mumps", "cholesky"), ("mumps", "lu")
+    cholmod, symmetric, unsymmetric = (
+        ("cholmod", "cholesky"),
+        ("mumps", "cholesky"),
+        ("mumps", "lu"),
+    )
     assert kinds == [cholmod, symmetric, unsymmetric, cholmod, cholmod]
-    assert [record.message for record in caplog.records] == ["Cholesky factorisation of the tangent failed"]
+    assert [record.message for record in caplog.records] == [
+        "Cholesky factorisation of the tangent failed"
+    ]
     factor.renew(matrix_of(np.zeros((30, 30))))
     factor.apply(None, x, y)
     assert np.isnan(y.array).all() and "LU factorisation of the tangent failed" in caplog.text
@@ -143,13 +181,17 @@ def test_a_kept_factor_stays_when_its_matrix_changes() -> None:
 
 
 def test_a_solve_of_many_factors_goes_on_by_newtons_method(
-    direct: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    direct: list[dict[str, float]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Then there is one for each iteration, without L-BFGS; twice as many are too many. Parts may have any number."""
     caplog.set_level(logging.INFO)
     monkeypatch.setattr(linear, "MOST_RENEWALS", 2)
     made, renew = [], Lagged.renew
-    monkeypatch.setattr(Lagged, "renew", lambda self: (renew(self), made.append(self.tangents - self._before)))
+    monkeypatch.setattr(
+        Lagged, "renew", lambda self: (renew(self), made.append(self.tangents - self._before))
+    )
     simulation, rows = simulated("lagged")
     simulation.close()
     assert_same(rows, direct)
@@ -164,7 +206,12 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
         LimitedMemoryUpdate(SELF),
     )
     monkeypatch.setattr(Lagged, "renew", lambda self: made.append(self.tangents))
-    for lagged.tangents, every, given_up in ((2, False, False), (3, True, False), (4, True, False), (5, True, True)):
+    for lagged.tangents, every, given_up in (
+        (2, False, False),
+        (3, True, False),
+        (4, True, False),
+        (5, True, True),
+    ):
         made.clear()
         lagged.tangent(1.0, 1e-9)
         assert (made == [lagged.tangents], lagged.given_up) == (every, given_up)
@@ -176,14 +223,23 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
 
 # ---------------------------------------------------------------- fall-backs
 def test_where_old_factors_do_not_do_every_tangent_is_taken(
-    direct: list[dict[str, float]], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    direct: list[dict[str, float]],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Never renewed, and all of the load in two steps: the first factor is of no use for what follows."""
     caplog.set_level(logging.INFO)
     monkeypatch.setattr(Lagged, "_costs_more", lambda self, tolerance: False)
-    changes = {"loads.pressure.ramp": [[0.0, 0.0], [2.0, 1.0]], "time.end": 3.0, "solver.maximum_iterations": 8}
+    changes = {
+        "loads.pressure.ramp": [[0.0, 0.0], [2.0, 1.0]],
+        "time.end": 3.0,
+        "solver.maximum_iterations": 8,
+    }
     rows = [simulated(method, **changes)[1] for method in ("direct", "lagged")]
-    assert "retrying with a new factorisation in every iteration: no equilibrium within 24 Newton" in caplog.text
+    assert (
+        "retrying with a new factorisation in every iteration: no equilibrium within 24 Newton"
+        in caplog.text
+    )
     assert_same(rows[1], rows[0])
 
 
@@ -193,7 +249,9 @@ def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptu
     scene, rows, said = preset_scene("kuhl-holzapfel-2007", "tube"), {}, {}
     for method in methods.SOLVER_METHODS:
         domain = tube(divisions=(12, 4, 8), comm=SELF)
-        with made(scene.with_values({"time.end": 1.0, "solver.method": method}), domain) as simulation:
+        with made(
+            scene.with_values({"time.end": 1.0, "solver.method": method}), domain
+        ) as simulation:
             rows[method] = [step.row for step in simulation.steps()]
             said[method] = caplog.text
             caplog.clear()
@@ -212,22 +270,36 @@ def test_levels_that_have_become_useless_are_made_anew(caplog: pytest.LogCapture
     options = {"snes_lag_preconditioner": 1000, "ksp_max_it": 13}
     simulation, rows = simulated("iterative", solver__petsc_options=options, **changes)
     simulation.close()
-    assert "retrying with new multigrid levels in every iteration: the linear solver failed" in caplog.text
+    assert (
+        "retrying with new multigrid levels in every iteration: the linear solver failed"
+        in caplog.text
+    )
     assert "in parts" not in caplog.text
     assert_same(rows, expected)
 
 
-@pytest.mark.parametrize(("bulk", "options"), [(27.3, {}), (5000.0, {}), (27.3, {"pc_gamg_threshold": 0.02})])
+@pytest.mark.parametrize(
+    ("bulk", "options"), [(27.3, {}), (5000.0, {}), (27.3, {"pc_gamg_threshold": 0.02})]
+)
 def test_degree_one_is_the_next_level_of_degree_two(
     bulk: float, options: dict[str, Any], caplog: pytest.LogCaptureFixture
 ) -> None:
     """Where options of one's own say nothing else, until a stiff bulk is too much for it."""
     caplog.set_level(logging.INFO)
     rows, scene = {}, preset_scene("kuhl-holzapfel-2007", "tube")
-    values = {"mesh.degree": 2, "material.lame_lambda": bulk, "time.end": 1.0, "geometry.length": 2.0}
+    values = {
+        "mesh.degree": 2,
+        "material.lame_lambda": bulk,
+        "time.end": 1.0,
+        "geometry.length": 2.0,
+    }
     for method, given in (("direct", {}), ("iterative", options)):
-        with_method = scene.with_values(values | {"solver.method": method, "solver.petsc_options": given})
-        with made(with_method, tube(length=2.0, divisions=(8, 2, 1), degree=2, comm=SELF)) as simulation:
+        with_method = scene.with_values(
+            values | {"solver.method": method, "solver.petsc_options": given}
+        )
+        with made(
+            with_method, tube(length=2.0, divisions=(8, 2, 1), degree=2, comm=SELF)
+        ) as simulation:
             rows[method] = [step.row for step in simulation.steps()]
             kind = simulation.stepper.coupling.newton._snes.getKSP().getPC().getType()
     assert_same(rows["iterative"], rows["direct"])
@@ -267,7 +339,11 @@ def test_no_displacement_changes_f_by_more_than_the_bound() -> None:
     largest = 0.0
     for _ in range(20):
         u = rng.standard_normal(made.nodes.shape)
-        u /= np.linalg.norm(u, axis=1).max() if rng.random() < 0.5 else np.linalg.norm(u, axis=1)[:, None]
+        u /= (
+            np.linalg.norm(u, axis=1).max()
+            if rng.random() < 0.5
+            else np.linalg.norm(u, axis=1)[:, None]
+        )
         made.set_displacement(u)
         change = np.linalg.norm(state.deformation_gradient() - np.eye(3), axis=(1, 2))
         largest = max(largest, float(change.max()))

@@ -76,7 +76,9 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
     assert coupling.equilibrium.extension().max_chain_extension > 1.0
     with pytest.raises(SolveFailure):
         coupling.newton.solve()
-    assert "equilibrium" not in vars(coupling.blend)  # what parts are solved with is compiled when a step has some
+    assert "equilibrium" not in vars(
+        coupling.blend
+    )  # what parts are solved with is compiled when a step has some
     said: list[str] = []
     coupling.state.tell = said.append
     assert solve(stepper, FORCE + 1.0).substeps > 1
@@ -97,7 +99,9 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
     assert energy == pytest.approx(problem.stored_energy(), rel=1e-11)
 
 
-def test_the_first_part_of_an_exchange_is_no_longer_than_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_part_of_an_exchange_is_no_longer_than_its_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     _, stepper = loaded_and_remodeled("cauchy", "material", 60.0)
     coupling: Any = stepper.coupling
     done, real = [0.0], GuardedNewton.solve
@@ -126,13 +130,17 @@ def test_the_bound_of_a_part_is_where_the_first_point_has_lost_its_share() -> No
     first = blend.largest_part(0.0)
     for done in (0.0, first / 2):
         before = left(done)
-        assert np.min(left(done + blend.largest_part(done)) / before) == pytest.approx(0.2, abs=1e-9)
+        assert np.min(left(done + blend.largest_part(done)) / before) == pytest.approx(
+            0.2, abs=1e-9
+        )
 
 
 # ---------------------------------------------------------------- failures
 def small_tube(load_values: Any, **solver: Any) -> tuple[parts.Body, Stepper]:
     """A short artery with random cells."""
-    made = parts.body(tube(length=1.0, divisions=(8, 3, 1)), Cells(initial="random", axes="cylindrical"))
+    made = parts.body(
+        tube(length=1.0, divisions=(8, 3, 1)), Cells(initial="random", axes="cylindrical")
+    )
     made.supported()
     settings = parts.TIGHT.model_copy(update=solver)
     return made, made.stepper(load_values, settings, law="explicit")
@@ -142,7 +150,9 @@ def test_an_impossible_load_is_a_failure_that_changes_nothing() -> None:
     """No tube of this wall holds a pressure of 50; a smaller one afterwards goes on from where it was."""
     pressures = {0.0: 0.0, 1.0: 0.5, 2.0: 50.0, 3.0: 1.0}
     made, stepper = small_tube(
-        lambda t: {"pressure": pressures[t], "elongation": 0.01 * min(t, 1.0)}, maximum_halvings=3, maximum_iterations=8
+        lambda t: {"pressure": pressures[t], "elongation": 0.01 * min(t, 1.0)},
+        maximum_halvings=3,
+        maximum_iterations=8,
     )
     stepper.advance(1.0)
     before = state(made)
@@ -155,7 +165,10 @@ def test_an_impossible_load_is_a_failure_that_changes_nothing() -> None:
     point = np.array([float(c) for c in text.split(" at (")[1].split(")")[0].split(", ")])
     assert 1.0 <= np.hypot(*point[:2]) <= 3.0 and 0.0 <= point[2] <= 1.0
     assert_same(before, state(made))
-    assert stepper.state.time == 1.0 and made.loading.values == {"pressure": 0.5, "elongation": 0.01}
+    assert stepper.state.time == 1.0 and made.loading.values == {
+        "pressure": 0.5,
+        "elongation": 0.01,
+    }
     pressures[2.0] = 1.0
     assert stepper.advance(2.0).work.substeps == 1
     assert made.loading.values["pressure"] == 1.0
@@ -174,12 +187,16 @@ class Refusing:
         force = self.made.loading.values["force"]
         self.tried.append(force)
         if force - self.accepted[-1] > self.limit:
-            raise SolveFailure("too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0))))
+            raise SolveFailure(
+                "too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0)))
+            )
         self.accepted.append(force)
         return Solution(3, 3)
 
 
-def test_parts_are_halved_after_a_failure_and_doubled_after_a_success(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_are_halved_after_a_failure_and_doubled_after_a_success(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     made = clamped_cube()
     stepper = made.stepper(lambda t: {"force": 8.0 * t})
     refusing = Refusing(made, 2.5)
@@ -193,7 +210,9 @@ def test_parts_are_halved_after_a_failure_and_doubled_after_a_success(monkeypatc
     assert made.loading.values == {"force": 8.0}
 
 
-def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """After three quarters half of the whole would be next: the quarter that is left is refused, an eighth tried."""
     made = clamped_cube()
     stepper = made.stepper(lambda t: {"force": 8.0 * t})
@@ -210,9 +229,13 @@ def test_a_part_that_would_go_beyond_the_end_is_halved_from_what_is_left(monkeyp
 
 
 @pytest.mark.parametrize("halvings", [0, 3])
-def test_the_number_of_halvings_is_the_scenes(halvings: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_halvings_is_the_scenes(
+    halvings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = clamped_cube()
-    stepper = made.stepper(lambda t: {"force": 8.0 * t}, parts.TIGHT.model_copy(update={"maximum_halvings": halvings}))
+    stepper = made.stepper(
+        lambda t: {"force": 8.0 * t}, parts.TIGHT.model_copy(update={"maximum_halvings": halvings})
+    )
     refusing = Refusing(made, 0.0)
     monkeypatch.setattr(stepper.coupling.newton, "solve", refusing)  # type: ignore[attr-defined]
     with pytest.raises(StepFailure, match="loads"):
@@ -223,9 +246,15 @@ def test_the_number_of_halvings_is_the_scenes(halvings: int, monkeypatch: pytest
 
 def test_times_are_computed_from_their_numbers() -> None:
     assert list(times(150.0, 1.0)) == [float(k) for k in range(1, 151)]
-    assert list(times(100.0, 0.1)) == [k / 10 for k in range(1, 1001)]  # 0.3, not 3 * 0.1 = 0.30000000000000004
+    assert list(times(100.0, 0.1)) == [
+        k / 10 for k in range(1, 1001)
+    ]  # 0.3, not 3 * 0.1 = 0.30000000000000004
     assert list(times(0.3, 0.1)) == [0.1, 0.2, 0.3] and 0.3 / 0.1 < 3.0
-    assert list(times(1.0, 0.3333333333)) == [0.3333333333, 0.6666666666, 1.0]  # a third, as a scene may write it
+    assert list(times(1.0, 0.3333333333)) == [
+        0.3333333333,
+        0.6666666666,
+        1.0,
+    ]  # a third, as a scene may write it
 
 
 def test_loads_are_hit_exactly_at_the_times_of_the_ramp() -> None:
@@ -237,7 +266,9 @@ def test_loads_are_hit_exactly_at_the_times_of_the_ramp() -> None:
     assert factors[0.5] == pytest.approx(0.5, rel=1e-14)
 
 
-def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The failure of the whole step says nothing of the loads alone: they start from another state now."""
     made = clamped_cube()
     stepper = made.stepper(lambda t: {"force": t}, kappa=0.4)
@@ -245,10 +276,16 @@ def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeyp
     coupling: Any = stepper.coupling
     tried: list[tuple[str, float]] = []
 
-    def refuse_the_first(newton: GuardedNewton, origin: Any = None, loose_tolerance: bool = False) -> Solution:
-        tried.append(("loads" if newton is coupling.newton else "cells", made.loading.values["force"]))
+    def refuse_the_first(
+        newton: GuardedNewton, origin: Any = None, loose_tolerance: bool = False
+    ) -> Solution:
+        tried.append(
+            ("loads" if newton is coupling.newton else "cells", made.loading.values["force"])
+        )
         if len(tried) == 1:
-            raise SolveFailure("too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0))))
+            raise SolveFailure(
+                "too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0)))
+            )
         return Solution(3, 3)
 
     monkeypatch.setattr(GuardedNewton, "solve", refuse_the_first)
@@ -257,7 +294,9 @@ def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(monkeyp
     assert work.substeps == 2 and work.newton_iterations == 7 + 3 + 3
 
 
-def test_without_a_change_of_the_cells_only_the_loads_are_divided(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_change_of_the_cells_only_the_loads_are_divided(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """From the load of the step before to exactly the new one, which their difference misses by rounding."""
     made = clamped_cube()
     old, new = 0.4, 1.8
@@ -274,7 +313,9 @@ def test_without_a_change_of_the_cells_only_the_loads_are_divided(monkeypatch: p
 
 def test_power_of_remodeling_is_the_derivative_of_the_stored_energy() -> None:
     """-dE/dtheta / dt of the blend of old and new cells at frozen displacement, by central differences."""
-    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"cells.initial": "random", "mesh.refinement": 2})
+    scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values(
+        {"cells.initial": "random", "mesh.refinement": 2}
+    )
     simulation = Simulation(scene)
     stepper = simulation.stepper
     tissue, solver = stepper.tissue, scene.solver

@@ -42,7 +42,11 @@ def test_one_process_does_many_commands(worker: Worker, tmp_path: Path) -> None:
     assert end_of(worker, ["validate", str(tmp_path / "nothing.toml")], said[0]) == 2
     assert worker.last_output().endswith("nothing.toml: no such file; a scene is a TOML file")
     assert end_of(worker, ["no-such-command"], said[1]) == 2  # argparse ends in a way of its own
-    assert "no such file" not in said[1].read_text() and worker.is_alive and worker.process.pid == number
+    assert (
+        "no such file" not in said[1].read_text()
+        and worker.is_alive
+        and worker.process.pid == number
+    )
     worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], said[2])
     assert worker.poll() is None and worker.is_at_work
     os.kill(number, signal.SIGKILL)
@@ -73,20 +77,44 @@ def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
     assert not said or said.splitlines()[-1].endswith(kept)
     assert number == signal.SIGKILL or said
     assert not (tmp_path / "runs" / "ensemble.csv").exists()
-    assert all(history.read_text().count("\n") < 152 for history in (tmp_path / "runs").rglob("history.csv"))
+    assert all(
+        history.read_text().count("\n") < 152
+        for history in (tmp_path / "runs").rglob("history.csv")
+    )
 
 
 # ---------------------------------------------------------------- the processes of a fit
 FIT = ARTERY.parent / "fit"
 
 
-@pytest.mark.parametrize(("whose", "number", "code"), [("child", signal.SIGKILL, 5), ("parent", signal.SIGINT, 130)])
-def test_a_fit_whose_process_is_killed_ends(whose: str, number: signal.Signals, code: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("whose", "number", "code"), [("child", signal.SIGKILL, 5), ("parent", signal.SIGINT, 130)]
+)
+def test_a_fit_whose_process_is_killed_ends(
+    whose: str, number: signal.Signals, code: int, tmp_path: Path
+) -> None:
     """Who is short of memory kills a process: one line, and what was evaluated stays."""
-    words = ["fit", str(FIT / "scene.toml"), str(FIT / "inflation.toml"), "--starts", "999", "--jobs", "2", "-o", "out"]
-    journal, command = tmp_path / "out" / "evaluations.jsonl", [sys.executable, "-c", COMMAND, *words]
+    words = [
+        "fit",
+        str(FIT / "scene.toml"),
+        str(FIT / "inflation.toml"),
+        "--starts",
+        "999",
+        "--jobs",
+        "2",
+        "-o",
+        "out",
+    ]
+    journal, command = tmp_path / "out" / "evaluations.jsonl", [
+        sys.executable,
+        "-c",
+        COMMAND,
+        *words,
+    ]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
-        while len(pool := members(process.pid, CHILDREN)) < 2 or journal.read_text().count("\n") < 10:
+        while (
+            len(pool := members(process.pid, CHILDREN)) < 2 or journal.read_text().count("\n") < 10
+        ):
             assert process.poll() is None
             time.sleep(0.05)
         os.kill(min(pool) if whose == "child" else process.pid, number)

@@ -46,12 +46,21 @@ def test_one_that_fails_loses_only_itself(
 ) -> None:
     """The others are evaluated, and not run again; the command names it, and its exit code is 3."""
     folder, found = made
-    assert list(found.failed) == ["seed-2"] and "seed-2" in found.failed["seed-2"] and len(found.histories) == 2
+    assert (
+        list(found.failed) == ["seed-2"]
+        and "seed-2" in found.failed["seed-2"]
+        and len(found.histories) == 2
+    )
     assert status(folder) == [f"{folder}: 2 runs: 2 finished"]  # the third has not begun
     (tmp_path / "scene.toml").write_text(scene().to_toml())
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")}
     with forked_children():
-        assert cli.main(["ensemble", str(tmp_path / "scene.toml"), "-o", str(folder), "--seeds", "3", "-q"]) == 3
+        assert (
+            cli.main(
+                ["ensemble", str(tmp_path / "scene.toml"), "-o", str(folder), "--seeds", "3", "-q"]
+            )
+            == 3
+        )
     written = capsys.readouterr()
     assert "At time 5, mean of 2 seeds: " in written.out and "seed-2 has failed: " in written.err
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/history.csv")} == before
@@ -65,7 +74,10 @@ def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> Non
     runs = [Recording(folder / name) for name in ("seed-1", "seed-3")]
     assert [run.scene.cells.seed for run in runs] == [1, 3]
     rows = list(csv.DictReader((folder / "ensemble.csv").read_text().splitlines()))
-    found = [[float(row[f"mean_stretch_{kind}"]) for row in rows] for kind in ("mean", "deviation", "most")]
+    found = [
+        [float(row[f"mean_stretch_{kind}"]) for row in rows]
+        for kind in ("mean", "deviation", "most")
+    ]
     one, two = (run.history["mean_stretch"] for run in runs)
     expected = [(one + two) / 2, np.abs(one - two) / 2**0.5, np.maximum(one, two)]
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
@@ -77,7 +89,10 @@ def test_two_seeds_are_needed(tmp_path: Path) -> None:
     """Runs that have failed are no bad input."""
     for seed in (2, 3):
         (tmp_path / f"seed-{seed}").write_text("a file of the user's\n")
-    with forked_children(), pytest.raises(TooFewRuns, match="1 of 3 runs reached the end, .* is kept") as too_few:
+    with (
+        forked_children(),
+        pytest.raises(TooFewRuns, match="1 of 3 runs reached the end, .* is kept") as too_few,
+    ):
         study.ensemble(pulled_cube(1.0), tmp_path, seeds=3)
     assert list(too_few.value.failed) == ["seed-2", "seed-3"] and too_few.value.exit_code == 3
 
@@ -111,7 +126,10 @@ def of_seeds(scene: Scene, columns: dict[str, np.ndarray]) -> study.Ensemble:
     """An ensemble of columns (seeds, rows) at times 0, 1, ..."""
     seeds, rows = next(iter(columns.values())).shape
     time = {"time": np.arange(float(rows))}
-    histories = {f"seed-{n}": time | {name: values[n] for name, values in columns.items()} for n in range(seeds)}
+    histories = {
+        f"seed-{n}": time | {name: values[n] for name, values in columns.items()}
+        for n in range(seeds)
+    }
     points = {name: {"cells.seed": number} for number, name in enumerate(histories)}
     return study.Ensemble(scene, points, histories)
 
@@ -130,9 +148,13 @@ def test_words_say_how_far_seeds_are_apart() -> None:
 
 def test_bad_input_is_one_line(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "scene.toml"
-    path.write_text(scene(output={"fields": False}).with_values({"cells.initial": "isotropic"}).to_toml())
+    path.write_text(
+        scene(output={"fields": False}).with_values({"cells.initial": "isotropic"}).to_toml()
+    )
     assert "an ensemble needs 'random' cells" in refused("ensemble", path, "-o", tmp_path / "out")
-    assert "--seeds 1: allowed is a whole number at least 2" in refused("ensemble", path, "--seeds", "1")
+    assert "--seeds 1: allowed is a whole number at least 2" in refused(
+        "ensemble", path, "--seeds", "1"
+    )
     assert not (tmp_path / "out").exists()
 
 

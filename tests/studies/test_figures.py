@@ -60,7 +60,11 @@ def draw(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     (["fig1", "-o", "taken"], "-o taken: is a file"), (["fig1", "--runs", "taken"], "--runs taken: is a file"),
 ])  # fmt: skip
 def test_bad_input_is_one_line_and_writes_nothing(
-    arguments: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    arguments: list[str],
+    named: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("taken").write_text("")
@@ -118,10 +122,14 @@ def test_fig1_is_eq_2(drawn: Path) -> None:
     x = table["extension"]
     assert len(x) > 100 and x[0] == 0 and 0.9 < x[-1] < 1
     for A in (0.1, 0.4, 0.8):
-        np.testing.assert_allclose(table[f"force_A_{A}"], (4 * x + (1 - x) ** -2 - 1) / (4 * A), rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(
+            table[f"force_A_{A}"], (4 * x + (1 - x) ** -2 - 1) / (4 * A), rtol=1e-6, atol=1e-12
+        )
 
 
-def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_valid_runs_are_used_again_and_own_figures_drawn_anew(
+    drawn: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     histories = sorted((drawn / "runs").glob("cube-*/history.csv"))
     assert len(histories) == 4
     before = [path.stat().st_mtime_ns for path in histories]
@@ -139,14 +147,18 @@ def test_valid_runs_are_used_again_and_own_figures_drawn_anew(drawn: Path, monke
 def test_all_numbers_are_those_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """To what another machine rounds: of angles in elements that hardly decide."""
     assert draw(monkeypatch, "-o", tmp_path, "--runs", tmp_path / "runs") == 0
-    tables = [path for name in figures.FIGURES for path in (DOCS / "figures").glob(f"{name}[.-]*csv")]
+    tables = [
+        path for name in figures.FIGURES for path in (DOCS / "figures").glob(f"{name}[.-]*csv")
+    ]
     assert len(tables) == 14
     for path in tables:
         found, kept = (read_table(folder / path.name) for folder in (tmp_path, DOCS / "figures"))
         assert list(found) == list(kept)
         for column, values in kept.items():
             if values.dtype.kind == "f":
-                np.testing.assert_allclose(found[column], values, rtol=1e-4, atol=0.01, err_msg=f"{path} {column}")
+                np.testing.assert_allclose(
+                    found[column], values, rtol=1e-4, atol=0.01, err_msg=f"{path} {column}"
+                )
 
 
 # ---------------------------------------------------------------- docs/verification.md

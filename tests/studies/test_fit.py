@@ -26,7 +26,9 @@ ROOT, FITS = Path(__file__).parents[2], Path(__file__).with_name("fits")
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}
 PRESSURES = [0.2, 0.4, 0.6, 0.8, 1.0, 1.2]
 
-PER_MMHG = STRESS_UNITS[preset_scene("kuhl-holzapfel-2007", "tube").material.stress_unit] / 133.322387415
+PER_MMHG = (
+    STRESS_UNITS[preset_scene("kuhl-holzapfel-2007", "tube").material.stress_unit] / 133.322387415
+)
 
 
 def tube(**changes: Any) -> Scene:
@@ -42,7 +44,12 @@ def tube(**changes: Any) -> Scene:
 def inflated() -> list[dict[str, float]]:
     """Virgin tissue under rising pressure at once with the whole elongation."""
     ramp = [[0.0, 0.0], *([number + 1.0, p / 1.2] for number, p in enumerate(PRESSURES))]
-    changes = {"remodeling.law": "none", "time.end": 6.0, "time.step": 1.0, "loads.pressure.ramp": ramp}
+    changes = {
+        "remodeling.law": "none",
+        "time.end": 6.0,
+        "time.step": 1.0,
+        "loads.pressure.ramp": ramp,
+    }
     return rows_of(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
 
 
@@ -51,13 +58,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Scene, tables of the model's own rows, and what is to be fitted, from starts that are off by a third."""
     folder = tmp_path_factory.mktemp("made")
     (folder / "scene.toml").write_text(tube().to_toml())
-    virgin = [[p * PER_MMHG, row["outer_radius"]] for p, row in zip(PRESSURES, inflated(), strict=True)]
+    virgin = [
+        [p * PER_MMHG, row["outer_radius"]] for p, row in zip(PRESSURES, inflated(), strict=True)
+    ]
     kept = [row for row in rows_of(tube()) if row["time"] in (10.0, 20.0, 30.0, 40.0)]
     names = ["time", "fibre_angle_outer", "inner_radius"]
     tables = {"virgin": [["pressure", "outer_radius"], *virgin]}
     tables["history"] = [names, *([row[name] for name in names] for row in kept)]
     for name, table in tables.items():
-        (folder / f"{name}.csv").write_text("".join(",".join(map(str, row)) + "\n" for row in table))
+        (folder / f"{name}.csv").write_text(
+            "".join(",".join(map(str, row)) + "\n" for row in table)
+        )
     (folder / "data.toml").write_text(DATA)
     return folder
 
@@ -69,7 +80,11 @@ def folder(made: Path, tmp_path: Path) -> Path:
 
 
 def written(
-    folder: Path, starts: Mapping[str, float | str], file: str, sd: str, state: str = "state = 'virgin'"
+    folder: Path,
+    starts: Mapping[str, float | str],
+    file: str,
+    sd: str,
+    state: str = "state = 'virgin'",
 ) -> Path:
     """A DATA.toml of one table."""
     unknowns = "\n".join(f'"{key}" = {{ start = {start} }}' for key, start in starts.items())
@@ -130,12 +145,18 @@ def test_a_fit_goes_on_where_it_was_killed(folder: Path) -> None:
 
 def test_profiles_of_what_goes_together(folder: Path) -> None:
     """Stiffness and locking of the chains, of an inflation: at the band's ends the sum of squares is 3.84 higher."""
-    (folder / "data.toml").write_text(PAIR.replace("0.01", "0.04"))  # wide bands, far from a straight line
-    _, found = fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out", starts=1)
+    (folder / "data.toml").write_text(
+        PAIR.replace("0.01", "0.04")
+    )  # wide bands, far from a straight line
+    _, found = fit(
+        read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out", starts=1
+    )
     assert set(found.profiles) == {"material.chain_density", "material.contour_length"}
     lower, upper = found.profiles["material.contour_length"]
     assert lower < found.values[1] < upper
-    problem = Problem(read_scene(folder / "scene.toml"), *read_measurements(folder / "data.toml", found.scene))
+    problem = Problem(
+        read_scene(folder / "scene.toml"), *read_measurements(folder / "data.toml", found.scene)
+    )
     held = np.log([found.values[0], upper])
     again = minimised(problem, held, held=1)
     least = float(np.sum(problem.residuals(np.log(found.values)) ** 2))
@@ -143,7 +164,9 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
     (panel,) = found.figure().axes[:1]
     assert panel.get_xlabel() == "pressure, mmHg" and panel.get_ylabel() == "outer radius, mm"
     np.testing.assert_allclose(panel.lines[0].get_xdata(), np.multiply(PRESSURES, PER_MMHG))
-    wide = replace(found, covariance=1e6 * found.covariance)  # as of what the data hardly change: no overflow
+    wide = replace(
+        found, covariance=1e6 * found.covariance
+    )  # as of what the data hardly change: no overflow
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert wide.open == ["both", "both"]
@@ -163,20 +186,30 @@ def test_the_picture_has_panels_for_each_protocol(tmp_path: Path) -> None:
                  [(0.02, 0.04), (0.05, 0.1), (0.03, 0.06), (0.01, 0.02)]]  # fmt: skip
     strains = np.concatenate(protocols)
     lines = [f"{1 + x},{1 + y},{60 * x},{50 * y}\n" for x, y in strains]
-    (tmp_path / "d.csv").write_text("stretch_x,stretch_y,nominal_stress_x,nominal_stress_y\n" + "".join(lines))
+    (tmp_path / "d.csv").write_text(
+        "stretch_x,stretch_y,nominal_stress_x,nominal_stress_y\n" + "".join(lines)
+    )
     sd = "nominal_stress_x = 1.0, nominal_stress_y = 1.0"
-    found = fit(scene, written(tmp_path, {"material.lame_mu": 10.0}, "d.csv", sd), tmp_path / "o", starts=1)[1]
+    found = fit(
+        scene, written(tmp_path, {"material.lame_mu": 10.0}, "d.csv", sd), tmp_path / "o", starts=1
+    )[1]
     panels = [panel for panel in found.figure().axes if panel.axison]
-    assert [panel.get_title() for panel in panels[::2]] == [f"d.csv (virgin), protocol {n} of 3" for n in (1, 2, 3)]
+    assert [panel.get_title() for panel in panels[::2]] == [
+        f"d.csv (virgin), protocol {n} of 3" for n in (1, 2, 3)
+    ]
     for axis, name in enumerate(("nominal_stress_x", "nominal_stress_y")):
         points, model = ([panel.lines[n] for panel in panels[axis::2]] for n in (0, 1))
-        assert [len(line.get_xdata()) for line in points] == [len(protocol) for protocol in protocols]
+        assert [len(line.get_xdata()) for line in points] == [
+            len(protocol) for protocol in protocols
+        ]
         for shown in (points, model):
             np.testing.assert_allclose(
                 np.concatenate([line.get_xdata() for line in shown]), strains[:, axis], atol=1e-12
             )
         y = [np.concatenate([line.get_ydata() for line in shown]) for shown in (points, model)]
-        np.testing.assert_allclose(y, [(60, 50)[axis] * strains[:, axis], found.modelled[0][name]], atol=1e-9)
+        np.testing.assert_allclose(
+            y, [(60, 50)[axis] * strains[:, axis], found.modelled[0][name]], atol=1e-9
+        )
 
 
 def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path) -> None:
@@ -184,22 +217,40 @@ def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path) -> None:
     scene = read_scene(ROOT / "demos" / "sheet.toml").with_values({"material.chain_density": 0.0})
     (tmp_path / "d.csv").write_text("elongation_x,nominal_stress_x\n0.05,1.0\n0.1,4.0\n0.2,30.0\n")
     found = {}
-    for name, sd, upper in (("a", 0.5, 1e3), ("b", 0.05, 1e3), ("noise", 50.0, 1e3), ("bound", 0.5, 12.0)):
-        data = written(tmp_path, {"material.lame_mu": f"10.0, upper = {upper}"}, "d.csv", f"nominal_stress_x = {sd}")
+    for name, sd, upper in (
+        ("a", 0.5, 1e3),
+        ("b", 0.05, 1e3),
+        ("noise", 50.0, 1e3),
+        ("bound", 0.5, 12.0),
+    ):
+        data = written(
+            tmp_path,
+            {"material.lame_mu": f"10.0, upper = {upper}"},
+            "d.csv",
+            f"nominal_stress_x = {sd}",
+        )
         found[name] = fit(scene, data, tmp_path / name, starts=1)[1]
     for name, one in found.items():
         assert one.limited_by == ("noise" if name == "noise" else "model")
-        assert ("times those of the noise, for the model limits them" in one.in_words()) is (name != "noise")
+        assert ("times those of the noise, for the model limits them" in one.in_words()) is (
+            name != "noise"
+        )
     np.testing.assert_allclose(found["a"].band, found["b"].band, rtol=1e-3)
-    assert found["a"].open == [""] and found["a"].band[0] < found["a"].logarithms < found["a"].band[1]
+    assert (
+        found["a"].open == [""] and found["a"].band[0] < found["a"].logarithms < found["a"].band[1]
+    )
     assert found["bound"].open == ["upper"] and found["bound"].values == pytest.approx([12.0])
 
 
 def test_what_changes_nothing_is_named(folder: Path) -> None:
     """A rate of remodeling in a test of virgin tissue."""
-    text = PAIR.replace('"material.contour_length" = { start = 2.125 }', '"remodeling.kappa" = { start = 0.05 }')
+    text = PAIR.replace(
+        '"material.contour_length" = { start = 2.125 }', '"remodeling.kappa" = { start = 0.05 }'
+    )
     (folder / "data.toml").write_text(text)
-    with pytest.raises(SceneError, match="remodeling.kappa changes nothing that is measured; fix it"):
+    with pytest.raises(
+        SceneError, match="remodeling.kappa changes nothing that is measured; fix it"
+    ):
         fit(read_scene(folder / "scene.toml"), folder / "data.toml", folder / "out")
 
 
@@ -211,7 +262,9 @@ def of_every_state(folder: Path, scene: Scene, more: str = "") -> Problem:
     for name, count in (("virgin", 3), ("history", 2)):
         table = folder / f"{name}.csv"
         table.write_text("".join(table.read_text().splitlines(keepends=True)[: 1 + count]))
-    (folder / "after.csv").write_text("pressure,inner_radius,reduced_axial_force\n0.6,1.2,0.5\n1.2,1.3,0.1\n")
+    (folder / "after.csv").write_text(
+        "pressure,inner_radius,reduced_axial_force\n0.6,1.2,0.5\n1.2,1.3,0.1\n"
+    )
     (folder / "every.toml").write_text(EVERY.replace("[unknowns]\n", f"[unknowns]\n{more}\n"))
     return Problem(scene, *read_measurements(folder / "every.toml", scene))
 
@@ -223,7 +276,9 @@ def test_derivatives_are_those_of_the_model(folder: Path) -> None:
     found, way = problem.jacobian(x, central=True), np.random.default_rng(2).normal(size=len(x)) / 3
     present = problem.residuals(x)
     sizes = (0.02, 0.01, 0.005)
-    remainders = [np.linalg.norm(problem.residuals(x + h * way) - present - h * found @ way) for h in sizes]
+    remainders = [
+        np.linalg.norm(problem.residuals(x + h * way) - present - h * found @ way) for h in sizes
+    ]
     ratios = np.divide(remainders[:-1], remainders[1:])
     assert np.abs(ratios - 4.0).max() < 0.1, ratios
 
@@ -236,7 +291,12 @@ def test_derivatives_are_those_of_the_model(folder: Path) -> None:
             '"natural.opening_angle" = { start = 60.0 }',
         ),
         (
-            {"regions": {"inside": {"outer_radius": 1.1, "material": {"lame_mu": 2.0}}, "outside": {}}},
+            {
+                "regions": {
+                    "inside": {"outer_radius": 1.1, "material": {"lame_mu": 2.0}},
+                    "outside": {},
+                }
+            },
             '"regions.inside.material.lame_mu" = { start = 2.0 }',
         ),
         ({"time.tolerance": 4.0, "solver.maximum_halvings": 2}, ""),
@@ -244,13 +304,17 @@ def test_derivatives_are_those_of_the_model(folder: Path) -> None:
     ],
     ids=["closing", "regions", "chosen steps", "geometry"],
 )
-def test_a_simulation_that_stays_says_what_a_new_one_does(folder: Path, changes: dict[str, Any], more: str) -> None:
+def test_a_simulation_that_stays_says_what_a_new_one_does(
+    folder: Path, changes: dict[str, Any], more: str
+) -> None:
     """With other numbers in between, and after a run that has failed."""
     problem = of_every_state(folder, tube(**changes), more)
     x = np.log([unknown.start for unknown in problem.unknowns.values()])
     for far in (0.1, 4.0):
         problem.residuals(x + far)
-    for found, fresh in zip(problem.predictions(x + 0.02, problem.kept), problem.predictions(x + 0.02), strict=True):
+    for found, fresh in zip(
+        problem.predictions(x + 0.02, problem.kept), problem.predictions(x + 0.02), strict=True
+    ):
         for name in fresh:
             np.testing.assert_allclose(found[name], fresh[name], rtol=1e-9)
 
@@ -259,7 +323,9 @@ def test_a_passive_test_of_remodeled_tissue(folder: Path) -> None:
     """Cells of t = 40 that stay: at the loads of the run's own end it has the radii of the run's own next row."""
     end = tube(**{"time.end": 45.0})
     expected = rows_of(end)[-1]
-    (folder / "after.csv").write_text("pressure,outer_radius,inner_radius\n0.6,1.4,1.2\n1.2,1.4,1.2\n")
+    (folder / "after.csv").write_text(
+        "pressure,outer_radius,inner_radius\n0.6,1.4,1.2\n1.2,1.4,1.2\n"
+    )
     sd, state = "outer_radius = 0.01, inner_radius = 0.01", "state = 'after'\ntime = 40.0"
     data = written(folder, {"material.lame_mu": 3.0}, "after.csv", sd, state)
     problem = Problem(end, *read_measurements(data, end))
@@ -267,7 +333,9 @@ def test_a_passive_test_of_remodeled_tissue(folder: Path) -> None:
     assert found["outer_radius"][-1] == pytest.approx(expected["outer_radius"], rel=1e-8)
     assert found["inner_radius"][-1] == pytest.approx(expected["inner_radius"], rel=1e-8)
     virgin = inflated()[-1]
-    assert abs(found["inner_radius"][-1] - virgin["inner_radius"]) > 1e-3  # and not those of virgin tissue
+    assert (
+        abs(found["inner_radius"][-1] - virgin["inner_radius"]) > 1e-3
+    )  # and not those of virgin tissue
 
 
 def test_what_the_data_cannot_tell_apart_is_named(folder: Path) -> None:
@@ -279,9 +347,14 @@ def test_what_the_data_cannot_tell_apart_is_named(folder: Path) -> None:
         '[unknowns]\n"material.chain_density" = { start = 1e21 }\n"material.persistence_length" = { start = 1.82 }\n'
         + virgin
     )
-    with pytest.raises(SceneError, match=r"tell apart material.chain_density \(.0.71\), material.persistence_length"):
+    with pytest.raises(
+        SceneError,
+        match=r"tell apart material.chain_density \(.0.71\), material.persistence_length",
+    ):
         fit(scene, path, folder / "blind")
-    moduli = "".join(f'"material.{name}" = {{ start = {getattr(scene.material, name)} }}\n' for name in MODULI)
+    moduli = "".join(
+        f'"material.{name}" = {{ start = {getattr(scene.material, name)} }}\n' for name in MODULI
+    )
     path.write_text(f'[unknowns]\n{moduli}{virgin}scale = {{ pressure = "unknown" }}\n')
     with pytest.raises(SceneError, match=r"tell apart .*lame_mu.*chain_density.*scale.pressure"):
         fit(scene, path, folder / "blind")
@@ -292,7 +365,9 @@ MODULI = ("lame_lambda", "lame_mu", "chain_density")
 
 
 @pytest.mark.parametrize(("old", "new", "named"), rows(str(FITS / "x"), "refused.txt"))
-def test_bad_data_is_one_line(folder: Path, old: str, new: str, named: str, refused: Refused) -> None:
+def test_bad_data_is_one_line(
+    folder: Path, old: str, new: str, named: str, refused: Refused
+) -> None:
     """Exit code 2, before any solve, and nothing is written."""
     (folder / "bad.csv").write_text("pressure,outer_radius\n1,1.3\n2,nan\n")
     (folder / "short.csv").write_text("pressure,outer_radius\n1\n")
@@ -300,20 +375,36 @@ def test_bad_data_is_one_line(folder: Path, old: str, new: str, named: str, refu
     (folder / "other.csv").write_text("pressure,diameter\n1,1.3\n2,1.4\n")
     assert old in DATA, old
     (folder / "data.toml").write_text(DATA.replace(old, new, 1))
-    assert named in refused("fit", folder / "scene.toml", folder / "data.toml", "-o", folder / "out", "-q")
+    assert named in refused(
+        "fit", folder / "scene.toml", folder / "data.toml", "-o", folder / "out", "-q"
+    )
     assert not (folder / "out").exists()
 
 
-def test_the_page_leads_from_a_curve_to_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_leads_from_a_curve_to_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """docs/fit.md: its files and commands and its fit as they stand; the numbers are the page's."""
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "fit.md").read_text(encoding="utf-8")
     page = page[page.index("## A pressure-radius curve") : page.index("## The two files")]
-    for name, text in re.findall(r"^```(?:text|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
+    for name, text in re.findall(
+        r"^```(?:text|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL
+    ):
         Path(name).write_text(text)
     (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (line,) = (line for line in block.splitlines() if " fit " in line)
-    assert cli.main([*shlex.split(line.removeprefix("./with-fenicsx remodel-fenicsx ")), "-q", "--starts", "1"]) == 0
+    assert (
+        cli.main(
+            [
+                *shlex.split(line.removeprefix("./with-fenicsx remodel-fenicsx ")),
+                "-q",
+                "--starts",
+                "1",
+            ]
+        )
+        == 0
+    )
     with Path("found/fit.csv").open() as file:
         table = {row["key"]: row for row in csv.DictReader(file)}
     said = re.findall(r"^\| `(\w+)` \| ([\d.]+).* \| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
@@ -331,7 +422,13 @@ def stretched(network: dict[str, float]) -> Scene:
         name="strip",
         geometry={"shape": "cube"},
         model={"kinematics": "point"},
-        material={"stress_unit": "Pa", "lame_lambda": 2e4, "lame_mu": 200.0, "initial_stiffness": 200.0, **network},
+        material={
+            "stress_unit": "Pa",
+            "lame_lambda": 2e4,
+            "lame_mu": 200.0,
+            "initial_stiffness": 200.0,
+            **network,
+        },
         cells={"initial": "aligned"},
         loads={"force": {"value": 4184.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
         remodeling={"law": "none"},
@@ -343,7 +440,11 @@ def stretched(network: dict[str, float]) -> Scene:
 def test_a_fit_stays_in_the_range_of_a_key(key: str, start: float, tmp_path: Path) -> None:
     """From some starts a trial has chains that are shorter than their ends are apart; the end is not at an edge."""
     shutil.copy(FITS / "curve.csv", tmp_path)
-    keys = {"material.lame_mu": 200.0, "material.initial_stiffness": 200.0, f"material.{key}": start}
+    keys = {
+        "material.lame_mu": 200.0,
+        "material.initial_stiffness": 200.0,
+        f"material.{key}": start,
+    }
     data = written(tmp_path, keys, "curve.csv", "mean_stretch = 0.005")
     found = fit(stretched({key: start}), data, tmp_path / "out", profiles=False)[1]
     assert found.misfit < 1.3 and found.values[2] == pytest.approx(1.224, rel=2e-3)
@@ -364,12 +465,17 @@ def test_bounds_are_those_of_the_key(folder: Path, refused: Refused) -> None:
         path.write_text(DATA.replace(kappa, "\n".join(lines)))
         return [*read_measurements(path, scene)[0].values()]
 
-    inner, outer = '"geometry.inner_radius" = { start = 1.0 }', '"geometry.outer_radius" = { start = 1.3 }'
+    inner, outer = (
+        '"geometry.inner_radius" = { start = 1.0 }',
+        '"geometry.outer_radius" = { start = 1.3 }',
+    )
     one = unknowns(inner)[-1]
     assert one.lower == 1e-3 and 1.298 < one.upper < 1.3
     problem = Problem(scene, *read_measurements(path, scene))
     x = np.log([*(unknown.start for unknown in problem.unknowns.values())][:-1] + [one.upper])
-    assert np.abs(problem.jacobian(x, central=True)[:, -1]).max() < 1e5, "no row is that of a state without equilibrium"
+    assert (
+        np.abs(problem.jacobian(x, central=True)[:, -1]).max() < 1e5
+    ), "no row is that of a state without equilibrium"
     low, high = unknowns(inner, outer)[-2:]
     assert low.upper > 1.3 and high.lower < 1.0
     assert unknowns(kappa.replace(" }", ", lower = 0.01, upper = 0.04 }"))[-1].upper == 0.04
@@ -390,7 +496,9 @@ def test_bounds_are_those_of_the_key(folder: Path, refused: Refused) -> None:
         ("outer_radius", 1.1, ""),
     ],
 )
-def test_numbers_of_another_kind_are_doubted(name: str, factor: float, said: str, folder: Path) -> None:
+def test_numbers_of_another_kind_are_doubted(
+    name: str, factor: float, said: str, folder: Path
+) -> None:
     """Judged against the model at the start."""
     path = folder / ("virgin.csv" if name == "outer_radius" else "history.csv")
     table = list(csv.reader(path.read_text().splitlines()))
@@ -402,7 +510,9 @@ def test_numbers_of_another_kind_are_doubted(name: str, factor: float, said: str
     problem = Problem(scene, *read_measurements(folder / "data.toml", scene))
     at_start = problem.predictions(np.log([unknown.start for unknown in problem.unknowns.values()]))
     found = [*data_warnings(problem.tables, at_start, scene)]
-    assert len(found) == bool(said) and all(f"{path.name}, {name}: " in line and said in line for line in found)
+    assert len(found) == bool(said) and all(
+        f"{path.name}, {name}: " in line and said in line for line in found
+    )
 
 
 @pytest.mark.parametrize(
@@ -416,19 +526,29 @@ def test_numbers_of_another_kind_are_doubted(name: str, factor: float, said: str
     ],
 )
 def test_loads_of_another_kind_are_doubted(
-    column: str, numbers: tuple[float, float], said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    column: str,
+    numbers: tuple[float, float],
+    said: str,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Before any solve, which may fail because of them."""
-    (tmp_path / "d.csv").write_text(f"{column},nominal_stress_x\n{numbers[0]},1.0\n{numbers[1]},2.0\n")
+    (tmp_path / "d.csv").write_text(
+        f"{column},nominal_stress_x\n{numbers[0]},1.0\n{numbers[1]},2.0\n"
+    )
     data = written(tmp_path, {"material.lame_mu": 3.0}, "d.csv", "nominal_stress_x = 0.1")
     read_measurements(data, read_scene(ROOT / "demos" / "sheet.toml"))
     found = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(found) == bool(said) and all(line.startswith(f"d.csv, {column}: {said}") for line in found)
+    assert len(found) == bool(said) and all(
+        line.startswith(f"d.csv, {column}: {said}") for line in found
+    )
 
 
 def test_virgin_tissue_whose_collagen_will_be_turned_over(tmp_path: Path) -> None:
     """It is as without turnover; what a scene records beside does not matter. A test after turnover is refused."""
-    scene = read_scene(ROOT / "demos" / "turnover.toml").with_values({"output.fields": ["content", "fibre_angle"]})
+    scene = read_scene(ROOT / "demos" / "turnover.toml").with_values(
+        {"output.fields": ["content", "fibre_angle"]}
+    )
     (tmp_path / "d.csv").write_text("pressure,outer_radius\n0.6,1.35\n1.2,1.5\n")
     data = written(tmp_path, {"material.lame_mu": 3.0}, "d.csv", "outer_radius = 0.1")
     found, other = (
@@ -437,13 +557,27 @@ def test_virgin_tissue_whose_collagen_will_be_turned_over(tmp_path: Path) -> Non
     )
     np.testing.assert_allclose(found, other, rtol=1e-9)
     assert np.abs(found).max() < 100, "it has an equilibrium"
-    written(tmp_path, {"material.lame_mu": 3.0}, "d.csv", "outer_radius = 0.1", "state = 'after'\ntime = 4.0")
-    with pytest.raises(SceneError, match="state = 'after': takes cells alone, not what remodeling.turnover"):
+    written(
+        tmp_path,
+        {"material.lame_mu": 3.0},
+        "d.csv",
+        "outer_radius = 0.1",
+        "state = 'after'\ntime = 4.0",
+    )
+    with pytest.raises(
+        SceneError, match="state = 'after': takes cells alone, not what remodeling.turnover"
+    ):
         read_measurements(data, scene)
 
 
 def tube_without_turnover(scene: Scene) -> Scene:
     """The same tissue, whose collagen stays."""
     return scene.with_values(
-        {"remodeling.turnover": {}, "output.columns": [], "output.fields": True, "time.end": 40.0, "time.step": 4.0}
+        {
+            "remodeling.turnover": {},
+            "output.columns": [],
+            "output.fields": True,
+            "time.end": 40.0,
+            "time.step": 4.0,
+        }
     )

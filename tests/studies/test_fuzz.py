@@ -33,7 +33,9 @@ def hold(seed: int, runner: Runner) -> None:
     record = evaluated(seed, runner)
     if seed in ENDLESS and record["outcome"] == "unchecked":
         return
-    assert record["outcome"] in HELD, f"./with-fenicsx benchmarks/fuzz.py --only {seed}: {said(record)}"
+    assert (
+        record["outcome"] in HELD
+    ), f"./with-fenicsx benchmarks/fuzz.py --only {seed}: {said(record)}"
 
 
 @pytest.mark.parametrize("seed", QUICK)
@@ -48,7 +50,11 @@ def test_all_scenes(seed: int, runner: Runner) -> None:
 
 
 # ---------------------------------------------------------------- the scenes
-OF_FILES = {"cells.fibres", "cells.fibres_sha256", "natural.fibres"}  # a seed makes a scene and no files beside it
+OF_FILES = {
+    "cells.fibres",
+    "cells.fibres_sha256",
+    "natural.fibres",
+}  # a seed makes a scene and no files beside it
 OTHER_WORDS = {
     "material.initial_stiffness",
     "material.locking_stretch",
@@ -63,7 +69,11 @@ def test_scenes_are_valid_and_draw_every_key() -> None:
         scene, _ = made(seed)
         assert scene == made(seed)[0]
         valid = scene_from_dict(scene)
-        tables = {name: table for name, table in scene.items() if isinstance(table, dict) and name != "loads"}
+        tables = {
+            name: table
+            for name, table in scene.items()
+            if isinstance(table, dict) and name != "loads"
+        }
         drawn |= {f"{name}.{key}" for name, table in tables.items() for key in table} | set(scene)
     keys = {name for name in type(valid).model_fields}
     for name in keys - {"geometry", "loads"}:

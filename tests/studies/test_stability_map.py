@@ -18,7 +18,9 @@ from tests.reference.solid import smallest_eigenvalue
 
 CASES = all_cases()
 REDUCED = [key for key, case in CASES.items() if case.reduced]
-EXPECTED = tomllib.loads(Path(__file__).with_name("stability_expected.toml").read_text(encoding="utf-8"))["outcomes"]
+EXPECTED = tomllib.loads(
+    Path(__file__).with_name("stability_expected.toml").read_text(encoding="utf-8")
+)["outcomes"]
 # of each kind one, a second or less: the others of the reduced map are marked slow
 QUICK = (
     "load: frame spatial, force 10.0", "load: frame material, force 0.0001",
@@ -72,7 +74,9 @@ def test_the_table_of_known_faults_has_no_other_cases() -> None:
 def test_the_point_knows_the_closed_form() -> None:
     """The cube's angle (demos/cube.toml), whatever the stretch."""
     path = march(CUBE, Bar(CUBE))
-    s = -np.expm1(-0.025 * (np.array(path.times) - 1))  # the row's cells are those of the step before
+    s = -np.expm1(
+        -0.025 * (np.array(path.times) - 1)
+    )  # the row's cells are those of the step before
     angle = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
     np.testing.assert_allclose(path.angle(), angle, rtol=1e-12)
     held = smallest_eigenvalue(np.ones(3), np.full(3, 1 / 3), material(CUBE))
@@ -90,6 +94,10 @@ def test_both_points_agree_where_axes_stay() -> None:
             }
             path = march(scene, Bar(scene))
             F = np.array([np.diag(stretches) for stretches in path.unknowns])
-            A = prescribed_path(material(scene), F, np.array(path.times), np.full(3, 3**-0.5), driver, law)
+            A = prescribed_path(
+                material(scene), F, np.array(path.times), np.full(3, 3**-0.5), driver, law
+            )
             along = A[:, 2, 2]
-            np.testing.assert_allclose(along, np.array(path.squares)[:, 0, 2], atol=1e-9, err_msg=f"{driver} {law}")
+            np.testing.assert_allclose(
+                along, np.array(path.squares)[:, 0, 2], atol=1e-9, err_msg=f"{driver} {law}"
+            )

@@ -20,7 +20,13 @@ from tests.studies.test_trade import artery, compared
 def the_ensemble(seeds: int) -> StudyResult:
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values({"geometry.length_unit": "mm"})
     time, rng = np.arange(151.0), np.random.default_rng(1)
-    names = ("inner_radius", "outer_radius", "fibre_angle_inner", "fibre_angle_outer", "max_chain_extension")
+    names = (
+        "inner_radius",
+        "outer_radius",
+        "fibre_angle_inner",
+        "fibre_angle_outer",
+        "max_chain_extension",
+    )
     columns = {name: 1 + rng.normal(0, 0.1, (seeds, 1)) * time for name in names}
     return of_seeds(scene, columns)
 
@@ -67,7 +73,9 @@ def test_a_picture_says_its_answer_and_every_word_can_be_read(
     assert labels <= said and not any("_" in text for text in said)
     boxes = [text.get_window_extent() for text in figure.texts]
     boxes += [legend.get_window_extent() for legend in figure.legends]
-    boxes += [box for axes in figure.axes if axes.axison and (box := axes.get_tightbbox()) is not None]
+    boxes += [
+        box for axes in figure.axes if axes.axison and (box := axes.get_tightbbox()) is not None
+    ]
     assert len(figure.legends) >= 1 and all(not axes.get_legend() for axes in figure.axes)
     for number, box in enumerate(boxes):
         assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, number
@@ -87,4 +95,6 @@ def test_the_verdict_on_settings_is_that_of_trusted_ones() -> None:
     coarse = Trade(artery(), [row for row in rows if row.angle_error > 1.0])
     assert coarse.verdict().startswith("No setting is known to be within 1 degree; the closest is ")
     doubted = Trade(artery(), [row._replace(doubt="noise") for row in rows])
-    assert doubted.verdict() == f"Not known: all {len(rows)} errors are doubted; trade.csv says why."
+    assert (
+        doubted.verdict() == f"Not known: all {len(rows)} errors are doubted; trade.csv says why."
+    )

@@ -34,7 +34,9 @@ def rows(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_ends_follow_the_closed_form(
+    cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The angle of the printed scheme after 19 steps, for three kappas; a finer sweep runs what is new."""
     out = tmp_path / "out"
     with forked_children():
@@ -50,7 +52,9 @@ def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pyt
             assert float(row["mean_fibre_angle"]) == pytest.approx(expected, abs=1e-5)
         before = {path: path.stat().st_mtime_ns for path in out.glob("*/history.csv")}
         (out / "sweep.json").unlink()  # as a folder of 0.3.0
-        (out / "sweep.csv").write_text(f"# remodel_fenicsx figures 0.3.0: sweep\n{(out / 'sweep.csv').read_text()}")
+        (out / "sweep.csv").write_text(
+            f"# remodel_fenicsx figures 0.3.0: sweep\n{(out / 'sweep.csv').read_text()}"
+        )
         assert cli.main([*words[:2], "remodeling.kappa=0.05:0.15:5", *words[3:]]) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(rows(out)) == 5 and len(list(out.glob("*/history.csv"))) == 5
@@ -58,7 +62,9 @@ def test_the_ends_follow_the_closed_form(cube: Path, tmp_path: Path, capsys: pyt
     assert status(out)[0] == f"{out}: 5 runs: 5 finished"
 
 
-def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_fails_is_nan_and_named(
+    cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its folder's name is taken by a file."""
     out = tmp_path / "out"
     out.mkdir()
@@ -67,14 +73,24 @@ def test_a_run_that_fails_is_nan_and_named(cube: Path, tmp_path: Path, capsys: p
         words = ["remodeling.kappa=0.05,0.1", "loads.force.value=4:8:2", "-o", str(out), "-q"]
         assert cli.main(["sweep", str(cube), *words]) == 3
     assert "remodeling.kappa-0.1_loads.force.value-4 has failed: " in capsys.readouterr().err
-    angles = {(row["remodeling.kappa"], row["loads.force.value"]): row["mean_fibre_angle"] for row in rows(out)}
+    angles = {
+        (row["remodeling.kappa"], row["loads.force.value"]): row["mean_fibre_angle"]
+        for row in rows(out)
+    }
     assert sorted(angles) == [("0.05", "4"), ("0.05", "8"), ("0.1", "4"), ("0.1", "8")]
-    assert [key for key, angle in angles.items() if not np.isfinite(float(angle or "nan"))] == [("0.1", "4")]
+    assert [key for key, angle in angles.items() if not np.isfinite(float(angle or "nan"))] == [
+        ("0.1", "4")
+    ]
     run = out / "remodeling.kappa-0.05_loads.force.value-4"
-    (run / "history.csv").write_text("".join((run / "history.csv").read_text().splitlines(keepends=True)[:-1]))
+    (run / "history.csv").write_text(
+        "".join((run / "history.csv").read_text().splitlines(keepends=True)[:-1])
+    )
     with (run / "run.log").open("a") as log:
         log.write("2026-01-01 00:00:00,000 INFO failed: no equilibrium\n")
-    assert status(out) == [f"{out}: 3 runs: 1 failed, 2 finished", f"{run.name} has failed: no equilibrium"]
+    assert status(out) == [
+        f"{out}: 3 runs: 1 failed, 2 finished",
+        f"{run.name} has failed: no equilibrium",
+    ]
 
 
 def test_drawn_numbers_outside_of_a_range_are_failed_points(
@@ -83,10 +99,19 @@ def test_drawn_numbers_outside_of_a_range_are_failed_points(
     """The ends that are typed are allowed together; of the points some are no scenes, and the others are run."""
     out = tmp_path / "out"
     with forked_children():
-        words = ["cells.end_to_end_length=1.5:2.5", "material.contour_length=1.6:2.6", "--latin", "6", "-o", str(out)]
+        words = [
+            "cells.end_to_end_length=1.5:2.5",
+            "material.contour_length=1.6:2.6",
+            "--latin",
+            "6",
+            "-o",
+            str(out),
+        ]
         assert cli.main(["sweep", str(cube), *words, "-q"]) == 3
     table, errors = rows(out), capsys.readouterr().err
-    beyond = [float(r["cells.end_to_end_length"]) >= float(r["material.contour_length"]) for r in table]
+    beyond = [
+        float(r["cells.end_to_end_length"]) >= float(r["material.contour_length"]) for r in table
+    ]
     assert len(table) == 6 and 0 < sum(beyond) < 5
     assert [not np.isfinite(float(row["mean_fibre_angle"] or "nan")) for row in table] == beyond
     assert errors.count("has failed: ") == sum(beyond) and "Traceback" not in errors
@@ -107,14 +132,24 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def sweep_of(folder: Path) -> list[str]:
     """The words of its command."""
-    return ["sweep", str(folder / "cube.toml"), "remodeling.kappa=0.05,0.1,0.15", "-o", str(folder / "out"), "-q"]
+    return [
+        "sweep",
+        str(folder / "cube.toml"),
+        "remodeling.kappa=0.05,0.1,0.15",
+        "-o",
+        str(folder / "out"),
+        "-q",
+    ]
 
 
 @pytest.mark.parametrize(
     ("file", "damage"),
     [
         *(("history.csv", damage) for damage in ("folder", "pipe", "other columns", "cut")),
-        *(("scene.toml", damage) for damage in ("folder", "pipe", "a = 1", "\0", "", "cells.seed = -1")),
+        *(
+            ("scene.toml", damage)
+            for damage in ("folder", "pipe", "a = 1", "\0", "", "cells.seed = -1")
+        ),
     ],
 )
 def test_a_damaged_finished_run_is_left_out_and_named(
@@ -129,12 +164,16 @@ def test_a_damaged_finished_run_is_left_out_and_named(
         path.mkdir() if damage == "folder" else os.mkfifo(path)
     else:
         path.write_text(
-            {"cut": text[:-20], "other columns": text.replace("time,", "time,other,", 1)}.get(damage, damage)
+            {"cut": text[:-20], "other columns": text.replace("time,", "time,other,", 1)}.get(
+                damage, damage
+            )
         )
     with forked_children():
         assert cli.main(sweep_of(tmp_path)) == 3
     said = capsys.readouterr().err.strip()
-    assert said.startswith("remodel-fenicsx: remodeling.kappa-0.1 has failed: ") and "\n" not in said
+    assert (
+        said.startswith("remodel-fenicsx: remodeling.kappa-0.1 has failed: ") and "\n" not in said
+    )
     assert str(path.parent) in said and len(said) < 600
     angles = [float(row["mean_fibre_angle"]) for row in rows(tmp_path / "out")]
     assert np.isfinite(angles).tolist() == [True, False, True]
@@ -164,7 +203,9 @@ def test_bad_input_is_one_line(cube: Path, words: str, said: str, refused: Refus
     assert not (cube.parent / "out").exists()
 
 
-def test_two_equal_studies_do_not_share_a_folder(done: Path, tmp_path: Path, refused: Refused) -> None:
+def test_two_equal_studies_do_not_share_a_folder(
+    done: Path, tmp_path: Path, refused: Refused
+) -> None:
     """The second names the first; when that has ended it may."""
     shutil.copytree(done, tmp_path, dirs_exist_ok=True)
     with forked_children():

@@ -32,7 +32,9 @@ def made_up(setting: trade.Setting, noise: float = 0.0) -> trade.Result:
     """A result with an error of first order in the step and of second in the size of elements, and noise of seeds."""
     step = min(setting.step, setting.scene.time.tolerance or np.inf)
     error = 0.4 * step * SMOOTH + 1.6 * setting.element**2 * SMOOTH[:, ::-1]
-    scatter = noise * np.random.default_rng(len(setting.name)).normal(size=(len(setting.seeds), *SMOOTH.shape))
+    scatter = noise * np.random.default_rng(len(setting.name)).normal(
+        size=(len(setting.seeds), *SMOOTH.shape)
+    )
     angles = 45.0 + error + scatter
     cost = {"full": 100.0}.get(setting.scene.model.kinematics, 1.0) / setting.element / step
     return trade.Result(setting, angles, 2.0 * (1 + 0.01 * (angles[..., :2] - 45.0)), cost)
@@ -49,7 +51,11 @@ def test_errors_are_differences_from_the_finest_and_trusted_where_that_is_finer_
     finest = made_up(rows["radial-4-degree-2-step-0.25"].setting)
     for name, row in rows.items():
         if name == finest.setting.name:
-            assert np.isnan(row.angle_error) and row.doubt == "the others are compared with it" and not row.on_front
+            assert (
+                np.isnan(row.angle_error)
+                and row.doubt == "the others are compared with it"
+                and not row.on_front
+            )
             continue
         apart = made_up(row.setting).angles - finest.angles
         assert row.angle_error == pytest.approx(trade.nanrms(apart))
@@ -68,11 +74,22 @@ def test_seeds_are_compared_one_by_one() -> None:
     shift = np.array([-5.0, 0.0, 5.0])[:, None, None]
     moved = trade.compared([replace(result, angles=result.angles + shift) for result in results])
     for row, same in zip(trade.compared(results), moved, strict=True):
-        assert same.angle_error == pytest.approx(row.angle_error, nan_ok=True) and same.doubt == row.doubt
+        assert (
+            same.angle_error == pytest.approx(row.angle_error, nan_ok=True)
+            and same.doubt == row.doubt
+        )
     rows = compared(noise=1.0, **random)
-    noises = {row.doubt.removeprefix("noise of random cells "): row for row in rows if "noise" in row.doubt}
-    assert len(noises) > 3 and all(row.angle_error < 2.1 * float(noise) for noise, row in noises.items())
-    assert 0.5 < np.median([float(noise) for noise in noises]) < 1.2  # sqrt(2/3), of two means over three
+    noises = {
+        row.doubt.removeprefix("noise of random cells "): row
+        for row in rows
+        if "noise" in row.doubt
+    }
+    assert len(noises) > 3 and all(
+        row.angle_error < 2.1 * float(noise) for noise, row in noises.items()
+    )
+    assert (
+        0.5 < np.median([float(noise) for noise in noises]) < 1.2
+    )  # sqrt(2/3), of two means over three
 
 
 def test_the_front() -> None:
@@ -94,7 +111,9 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
     assert {f"profile-{name}" for name in PROFILES} <= set(named)
     fast = {"model.kinematics": "radial", "time.tolerance": 1.0, "mesh.formulation": "auto"}
     assert named["profile-fast"].scene == scene.with_values(fast)
-    assert named["profile-reference"].cost < 0.1 * named["full-1-degree-1-step-1"].cost  # measured: a fiftieth
+    assert (
+        named["profile-reference"].cost < 0.1 * named["full-1-degree-1-step-1"].cost
+    )  # measured: a fiftieth
     for setting in settings:
         run = trade.as_run(setting, 3)
         assert run.cells.seed == 3 and not run.output.times and not run.output.fields
@@ -105,7 +124,9 @@ def test_a_point_has_no_mesh() -> None:
     """No row for one, and no doubt for want of one."""
     scene = preset_scene(PAPER, "cube").with_values({"cells.initial": "isotropic"})
     settings = trade.ladder(scene)
-    assert {(setting.scene.mesh.refinement, setting.scene.mesh.degree) for setting in settings} == {(1, 1)}
+    assert {(setting.scene.mesh.refinement, setting.scene.mesh.degree) for setting in settings} == {
+        (1, 1)
+    }
     points = [setting for setting in settings if setting.scene.model.kinematics == "point"]
     rows = trade.compared([made_up(setting) for setting in points])
     assert len(rows) > 10 and not any("elements" in row.doubt for row in rows)
@@ -113,13 +134,22 @@ def test_a_point_has_no_mesh() -> None:
 
 def test_hats_add_up_to_one_and_are_one_at_their_places() -> None:
     np.testing.assert_allclose(profile_weights(np.linspace(0, 1, 37)).sum(axis=-1), 1.0)
-    np.testing.assert_allclose(profile_weights(np.linspace(0, 1, PROFILE_PLACES)), np.eye(PROFILE_PLACES), atol=1e-15)
+    np.testing.assert_allclose(
+        profile_weights(np.linspace(0, 1, PROFILE_PLACES)), np.eye(PROFILE_PLACES), atol=1e-15
+    )
 
 
 # ---------------------------------------------------------------- the command
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """On a cube whose stress is the same everywhere: three steps, of which one fails at first; a row is a scene."""
-    for name, value in {"STEPS": (2.0, 0.5), "MESHES": (), "TOLERANCES": (), "PROFILES": {}}.items():
+    for name, value in {
+        "STEPS": (2.0, 0.5),
+        "MESHES": (),
+        "TOLERANCES": (),
+        "PROFILES": {},
+    }.items():
         monkeypatch.setattr(trade, name, value)
     monkeypatch.setattr(trade, "objections", lambda scene, name: ["left out by the test"])
     path, out = tmp_path / "cube.toml", tmp_path / "out"
@@ -128,36 +158,60 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
     def traded(folder: Path, budget: str = "10min") -> tuple[int, str]:
         with forked_children():
-            code = cli.main(["trade", str(path), "-o", str(folder), "--jobs", "12", "--budget", budget, "-q"])
+            code = cli.main(
+                ["trade", str(path), "-o", str(folder), "--jobs", "12", "--budget", budget, "-q"]
+            )
         return code, "".join(capsys.readouterr())
 
     out.mkdir()
     names = [f"point-1-degree-1-step-{step}" for step in ("2", "1", "0.5")]
     (out / f"{names[2]}-1").write_text("a file of the user's: this run fails")
     code, said = traded(out)
-    assert code == 3 and f"{names[2]}-1 has failed: " in said and status(out) == [f"{out}: 2 runs: 2 finished"]
+    assert (
+        code == 3
+        and f"{names[2]}-1 has failed: " in said
+        and status(out) == [f"{out}: 2 runs: 2 finished"]
+    )
     before = {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")}
     (out / f"{names[2]}-1").unlink()
     assert traded(out)[0] == 0 and {file: file.stat().st_mtime_ns for file in before} == before
     with (out / "trade.csv").open() as file:
         table = sorted(csv.DictReader(file), key=lambda entry: names.index(entry["setting"]))
-    assert list(table[0])[:5] == ["setting", "scene", "error_degrees", "error_stretch", "cpu_seconds"]
+    assert list(table[0])[:5] == [
+        "setting",
+        "scene",
+        "error_degrees",
+        "error_stretch",
+        "cpu_seconds",
+    ]
     scenes = [read_scene(out / entry["scene"]) for entry in table]
     assert [one.time.step for one in scenes] == [2.0, 1.0, 0.5] and scenes[0].output.fields is True
-    assert [entry["trusted"] for entry in table] == ["1", "1", "0"] and table[2]["error_degrees"] == "nan"
+    assert [entry["trusted"] for entry in table] == ["1", "1", "0"] and table[2][
+        "error_degrees"
+    ] == "nan"
     # the closed form of the printed scheme: a row of fixed steps has the angle of one step before
     times, columns = np.linspace(0.0, 20.0, 10)[1:], []
     for step in (2.0, 1.0, 0.5):
         rows = np.arange(0.0, 20.5, step)
         s = 1 - np.exp(-0.1 * np.maximum(rows - step, 0.0))
-        columns.append(np.interp(times, rows, np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))))
+        columns.append(
+            np.interp(
+                times, rows, np.degrees(np.arctan(np.sqrt(2) * (1 - s) / (1 - s + np.sqrt(3) * s)))
+            )
+        )
     apart = [trade.nanrms(column - columns[2]) for column in columns[:2]]
-    np.testing.assert_allclose([float(entry["error_degrees"]) for entry in table[:2]], apart, rtol=1e-5)
+    np.testing.assert_allclose(
+        [float(entry["error_degrees"]) for entry in table[:2]], apart, rtol=1e-5
+    )
     monkeypatch.setattr(trade, "TOLERANCES", (0.5,))
     code, said = traded(out, "0.001s")
     assert code == 0 and "left out, over the budget: point-1-degree-1-tolerance-0.5" in said
     code, said = traded(tmp_path / "none", "0.001s")
-    assert code == 4 and "0 of 4 settings reached the end within the budget of 0.001 s, at least 2 are needed" in said
+    assert (
+        code == 4
+        and "0 of 4 settings reached the end within the budget of 0.001 s, at least 2 are needed"
+        in said
+    )
     assert "a larger budget goes on" in said
 
 
@@ -172,9 +226,13 @@ def test_trusted_errors_of_the_artery_are_the_true_ones(tmp_path: Path) -> None:
     for row in found.rows:
         if not row.doubt:
             history = Recording(folder / f"{row.setting.name}-1").history
-            angles = np.transpose([np.interp(times, history["time"], history[name]) for name in PROFILE])
+            angles = np.transpose(
+                [np.interp(times, history["time"], history[name]) for name in PROFILE]
+            )
             ratios.append(row.angle_error / trade.nanrms(angles - (2 * fine - coarse)))
-    assert len(ratios) > 8 and np.mean([0.5 <= ratio <= 2.0 for ratio in ratios]) >= 0.8, sorted(ratios)
+    assert len(ratios) > 8 and np.mean([0.5 <= ratio <= 2.0 for ratio in ratios]) >= 0.8, sorted(
+        ratios
+    )
 
 
 def _reference(step: float, times: list[float]) -> np.ndarray:

@@ -15,8 +15,34 @@ from tests.runs import rows_of
 from tests.tables import rows as table
 
 SCRIPT = runpy.run_path(str(Path(__file__).parents[2] / "demos" / "which_numbers.py"))
-ABSURD = ["--k1", "996.6", "--k2", "524.6", "--kappa", "0.226", "--c", "7.64", "--angle", "49.98", "--up-to", "1.3"]
-PAPER = ["--k1", "2.4", "--k2", "0.84", "--kappa", "0.2", "--c", "3.0", "--angle", "40", "--up-to", "1.3"]
+ABSURD = [
+    "--k1",
+    "996.6",
+    "--k2",
+    "524.6",
+    "--kappa",
+    "0.226",
+    "--c",
+    "7.64",
+    "--angle",
+    "49.98",
+    "--up-to",
+    "1.3",
+]
+PAPER = [
+    "--k1",
+    "2.4",
+    "--k2",
+    "0.84",
+    "--kappa",
+    "0.2",
+    "--c",
+    "3.0",
+    "--angle",
+    "40",
+    "--up-to",
+    "1.3",
+]
 
 
 def printed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
@@ -33,28 +59,43 @@ def test_the_stress_of_papers_is_the_slope_of_their_energy() -> None:
 
     def energy(stretches: np.ndarray) -> float:
         squared = stretches**2
-        strains = [kappa * (squared.sum() - 3) + (1 - 3 * kappa) * (squared @ a**2 - 1) for a in families]
-        return c / 2 * (squared.sum() - 3) + sum(k1 / (2 * k2) * (np.exp(k2 * E**2) - 1) for E in strains)
+        strains = [
+            kappa * (squared.sum() - 3) + (1 - 3 * kappa) * (squared @ a**2 - 1) for a in families
+        ]
+        return c / 2 * (squared.sum() - 3) + sum(
+            k1 / (2 * k2) * (np.exp(k2 * E**2) - 1) for E in strains
+        )
 
     cells = kappa + (1 - 3 * kappa) * families[0] ** 2
     at = np.array([1.2, 1.1, 1 / 1.32])
     slopes = [(energy(at + h) - energy(at - h)) / 2e-6 for h in 1e-6 * np.eye(3)]
-    np.testing.assert_allclose(SCRIPT["of_papers"](k1, k2, cells, kappa, c)(at), at * slopes, rtol=1e-7)
+    np.testing.assert_allclose(
+        SCRIPT["of_papers"](k1, k2, cells, kappa, c)(at), at * slopes, rtol=1e-7
+    )
 
 
-def test_the_sheet_of_its_numbers_has_the_stresses_of_the_paper(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_sheet_of_its_numbers_has_the_stresses_of_the_paper(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Equibiaxial and uniaxial, as `remodel-fenicsx run` has them: within the misfit that it prints."""
     tables, misfit = printed(PAPER, capsys)
     share = float(misfit.split("largest stress: ")[1].split(" %")[0]) / 100
     assert 0.001 < share < 0.03
-    cells = np.array([0.2 + 0.4 * np.cos(np.radians(40)) ** 2, 0.2 + 0.4 * np.sin(np.radians(40)) ** 2, 0.2])
+    cells = np.array(
+        [0.2 + 0.4 * np.cos(np.radians(40)) ** 2, 0.2 + 0.4 * np.sin(np.radians(40)) ** 2, 0.2]
+    )
     np.testing.assert_allclose(tables["cells"]["initial"], np.sqrt(cells), rtol=1e-6)
     tables["material"]["lame_lambda"] *= 100  # incompressible, as the paper's
     stress = SCRIPT["of_papers"](2.4, 0.84, cells, 0.2, 3.0)
     for across in (True, False):
         pulled = {"value": 0.3, "ramp": [[0.0, 0.0], [6.0, 1.0]]}
         loads = {"elongation_x": pulled} | ({"elongation_y": pulled} if across else {})
-        sheet = {"geometry": {"shape": "sheet"}, "loads": loads, "time": {"end": 6.0}, "remodeling": {"law": "none"}}
+        sheet = {
+            "geometry": {"shape": "sheet"},
+            "loads": loads,
+            "time": {"end": 6.0},
+            "remodeling": {"law": "none"},
+        }
         rows = rows_of(Scene(**sheet, **tables))
         wanted = [SCRIPT["nominal"](stress, 1 + row["elongation_x"], 1 + row["elongation_x"] if across else None)
                   for row in rows]  # fmt: skip
@@ -62,7 +103,9 @@ def test_the_sheet_of_its_numbers_has_the_stresses_of_the_paper(capsys: pytest.C
         np.testing.assert_allclose(found, wanted, atol=4 * share * np.max(wanted))
 
 
-def test_a_table_of_this_model_gives_its_numbers_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_of_this_model_gives_its_numbers_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Equibiaxial rows and, in another file, uniaxial ones; the matrix too."""
     cells = np.full(3, 1 / 3)
     stress = SCRIPT["of_chains"](4.0, 1.5, cells, 12.0)
@@ -75,14 +118,20 @@ def test_a_table_of_this_model_gives_its_numbers_back(tmp_path: Path, capsys: py
         tables, misfit = printed(["--table", str(tmp_path / "test.csv"), "--unit", "Pa"], capsys)
         assert tables["material"]["lame_mu"] == pytest.approx(12.0, rel=1e-3)
         assert tables["material"]["contour_length"] == pytest.approx(1.5, rel=1e-3)
-        own = Scene(geometry={"shape": "cube"}, time={"end": 1.0}, material=tables["material"]).material
+        own = Scene(
+            geometry={"shape": "cube"}, time={"end": 1.0}, material=tables["material"]
+        ).material
         assert own.network_modulus == pytest.approx(4.0, rel=2e-3) and own.stress_unit == "Pa"
         assert "along x" in misfit and ("along y" in misfit) is across
 
 
 @pytest.mark.parametrize(("words", "line"), table(__file__, "refused_numbers.txt"))
 def test_what_is_refused(
-    words: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str,
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("bad.csv").write_text("stretch_x,force\n1.1,2.0\n")
@@ -97,7 +146,9 @@ def test_what_is_refused(
         Path(f"{name}.csv").write_text(f"stretch_x,nominal_stress_x\n{rows}")
     Path("half.csv").write_text("stretch_x\n1.1\n1.2\n")
     with pytest.raises(SystemExit) as left:
-        SCRIPT["main"](words.replace("PAPER", " ".join(PAPER)).replace("ABSURD", " ".join(ABSURD)).split())
+        SCRIPT["main"](
+            words.replace("PAPER", " ".join(PAPER)).replace("ABSURD", " ".join(ABSURD)).split()
+        )
     said = capsys.readouterr().err
     assert left.value.code == 2 and f"error: {line}" in said and said.count("\n") == 1
 
@@ -111,4 +162,6 @@ def test_the_largest_stretch_that_it_names_is_taken(capsys: pytest.CaptureFixtur
     assert 1e5 < high / small < 1e6 and found["lame_lambda"] > 100 * found["lame_mu"]
     SCRIPT["main"](PAPER)
     said = capsys.readouterr().out
-    assert said.startswith("# Assumed: cells of dispersion kappa = 0.2, families at +-40 degrees to x; a volume that")
+    assert said.startswith(
+        "# Assumed: cells of dispersion kappa = 0.2, families at +-40 degrees to x; a volume that"
+    )

@@ -29,7 +29,9 @@ def test_the_factor_is_that_by_which_a_tilt_grows_in_a_run() -> None:
     straight, tilted = weak_cube(26.0), weak_cube(26.0)
     analysis = FactorWatcher(straight.stepper, lambda step: step.number == 26)
     straight_cells = [straight.cells.structure_tensor() for _ in straight.steps([analysis])]
-    tilted_cells = [tilted.cells.structure_tensor() for _ in tilted.steps([Tilt(tilted, 16.0, 1e-8)])]
+    tilted_cells = [
+        tilted.cells.structure_tensor() for _ in tilted.steps([Tilt(tilted, 16.0, 1e-8)])
+    ]
     last, one_more = (tilted_cells[k] - straight_cells[k] for k in (-2, -1))
     grown = np.sign(np.sum(last * one_more)) * np.linalg.norm(one_more) / np.linalg.norm(last)
     # lateral stresses are zero, where the positive part has a kink: a run sees one side, central differences their mean
@@ -45,20 +47,36 @@ def test_the_command_writes_table_and_picture(
     for coupling in ("staggered", "relaxed"):
         folder = tmp_path / coupling
         settings = ["time.end=14", "loads.force.value=0.01", f"remodeling.coupling={coupling}"]
-        arguments = [str(scene), *(f"--set={text}" for text in settings), "-o", str(folder), "--times", "2", "-q"]
+        arguments = [
+            str(scene),
+            *(f"--set={text}" for text in settings),
+            "-o",
+            str(folder),
+            "--times",
+            "2",
+            "-q",
+        ]
         assert main(["stability", *arguments]) == 0
         with (folder / "stability.csv").open() as file:
             table = list(csv.DictReader(file))
-        assert [(list(row), row["time"]) for row in table] == [(["time", "factor"], "7"), (["time", "factor"], "14")]
+        assert [(list(row), row["time"]) for row in table] == [
+            (["time", "factor"], "7"),
+            (["time", "factor"], "14"),
+        ]
         factors[coupling] = float(table[1]["factor"])
-        assert (folder / "stability.png").read_bytes().startswith(b"\x89PNG") and (folder / "run.log").exists()
+        assert (folder / "stability.png").read_bytes().startswith(b"\x89PNG") and (
+            folder / "run.log"
+        ).exists()
         printed = capsys.readouterr().out.splitlines()
         assert printed[0].split() == ["time", "factor"] and len(printed) == 5
         assert printed[3].startswith("Unstable: at 2 of 2 times")
     assert factors["staggered"] < factors["relaxed"] < -1.0
     refused("stability", *arguments)  # the folder is taken
     nothing = ("--set", "remodeling.law=none", "-o", tmp_path / "none")
-    assert "nothing remodels" in refused("stability", scene, *nothing) and not (tmp_path / "none").exists()
+    assert (
+        "nothing remodels" in refused("stability", scene, *nothing)
+        and not (tmp_path / "none").exists()
+    )
 
 
 @pytest.mark.parametrize(("factors", "words"), [

@@ -36,7 +36,9 @@ def slender(kinematics: str, pressure: float, **changes: Any) -> Scene:
     """A tube without chains, 40 long, its wall from 1 to 1.5."""
     shape = {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.5, "length": 40.0}
     loads = {"pressure": ramped(pressure)}
-    return Scene(**isotropic(None, kinematics, geometry=shape, loads=loads, **BARE)).with_values(changes)
+    return Scene(**isotropic(None, kinematics, geometry=shape, loads=loads, **BARE)).with_values(
+        changes
+    )
 
 
 @contextmanager
@@ -74,7 +76,9 @@ def test_eulers_load_of_an_unloaded_tube(kinematics: str, ends: str, factor: flo
 def column(force: float, kinematics: str = "point") -> Scene:
     """A slender tendon under a dead force."""
     shape = {"shape": "tendon", "length": 10.0, "area": 0.1}
-    return Scene(**isotropic(None, kinematics, geometry=shape, loads={"force": ramped(force)}, **BARE))
+    return Scene(
+        **isotropic(None, kinematics, geometry=shape, loads={"force": ramped(force)}, **BARE)
+    )
 
 
 def test_a_tendon_is_a_column_with_a_free_end() -> None:
@@ -92,7 +96,9 @@ def test_the_whole_tube_loses_its_stability_where_the_ray_says_so(caplog: Any) -
             shares.append(watcher.thrust() / watcher.euler_load())
         changes = {"mesh.degree": 2, "output.columns": ["negative_eigenvalues"]}
         whole = slender("full", pressure, **changes)
-        with made(whole, tube(1.0, 1.5, 40.0, 1, "hexahedron", 2, MPI.COMM_SELF, (8, 1, 8))) as simulation:
+        with made(
+            whole, tube(1.0, 1.5, 40.0, 1, "hexahedron", 2, MPI.COMM_SELF, (8, 1, 8))
+        ) as simulation:
             counts.append([step.row["negative_eigenvalues"] for step in simulation.steps()][-1])
     assert counts == [0, 2]
     assert shares[0] < 0.9 < shares[1]
@@ -113,7 +119,11 @@ def test_who_is_told(scene: Scene, told: str, caplog: Any) -> None:
     longer = scene.with_values({"time.end": 2.0})
     with caplog.at_level(logging.WARNING), watched(longer):
         pass
-    lines = [record.getMessage() for record in caplog.records if "expected buckling" in record.getMessage()]
+    lines = [
+        record.getMessage()
+        for record in caplog.records
+        if "expected buckling" in record.getMessage()
+    ]
     assert len(lines) == bool(told), lines
     for line in lines:
         assert f"axial {told} is about " in line and "set model.kinematics = 'full'" in line

@@ -31,7 +31,9 @@ def pushed_cube(force: float, **values: Any) -> Scene:
     """The demo's cube under a force that is there after three steps."""
     scene = read_scene(DEMOS / "cube.toml")
     ramp = [[0.0, 0.0], [3.0, 1.0]]
-    return scene.with_values({"loads.force.value": force, "loads.force.ramp": ramp, "time.end": 4.0, **values})
+    return scene.with_values(
+        {"loads.force.value": force, "loads.force.ramp": ramp, "time.end": 4.0, **values}
+    )
 
 
 def run(scene: Scene, domain: Any = None) -> list[Step]:
@@ -47,9 +49,13 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
 # ---------------------------------------------------------------- the count
 def test_count_and_lowest_eigenvalue_are_those_of_the_dense_matrix() -> None:
     """A follower pressure and random cells: the tangent has every kind of entry; prescribed unknowns do not count."""
-    made = parts.body(tube(length=1.0, divisions=(8, 2, 1)), Cells(initial="random", axes="cylindrical")).supported()
+    made = parts.body(
+        tube(length=1.0, divisions=(8, 2, 1)), Cells(initial="random", axes="cylindrical")
+    ).supported()
     problem = made.problem()
-    made.loading.set({"pressure": -20.0, "elongation": 0.0})  # no equilibrium: a tangent is one anywhere
+    made.loading.set(
+        {"pressure": -20.0, "elongation": 0.0}
+    )  # no equilibrium: a tangent is one anywhere
     rng = np.random.default_rng(5)
     made.set_displacement(0.03 * rng.standard_normal(made.nodes.shape))
     matrix = problem.create_matrix()
@@ -59,7 +65,9 @@ def test_count_and_lowest_eigenvalue_are_those_of_the_dense_matrix() -> None:
     dense_free = dense[np.ix_(free, free)]
     expected, modes = np.linalg.eig(dense_free)
     lowest = np.argmin(expected.real)
-    assert np.abs(dense - dense.T).max() > 1e-6 * np.abs(dense).max() and (expected.real < 0).sum() > 1
+    assert (
+        np.abs(dense - dense.T).max() > 1e-6 * np.abs(dense).max() and (expected.real < 0).sum() > 1
+    )
     inertia = Inertia(problem)
     assert inertia.negative_eigenvalues() == (expected.real < 0).sum()
     mode = inertia.lowest()
@@ -77,7 +85,9 @@ def test_count_and_lowest_eigenvalue_are_those_of_the_dense_matrix() -> None:
 
 
 @pytest.mark.parametrize("load", ["pulled", "pushed", "dead thrust"])
-def test_a_pressure_that_follows_a_free_end_has_no_buckling_load(load: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_pressure_that_follows_a_free_end_has_no_buckling_load(
+    load: str, caplog: pytest.LogCaptureFixture
+) -> None:
     """A clamped beam under follower tension or thrust bends in no direction (EI w'' = T w: only w = 0).
 
     The symmetric part of its tangent is indefinite nevertheless. A dead thrust of this size is beyond Euler's load.
@@ -97,12 +107,20 @@ def test_a_pressure_that_follows_a_free_end_has_no_buckling_load(load: str, capl
     dense = matrix.convert("dense").getDenseArray()
     watcher.close()
     assert np.linalg.eigvalsh(dense + dense.T)[0] < 0
-    assert last.negative_eigenvalues == (2 if load == "dead thrust" else 0) == (np.linalg.eigvals(dense).real < 0).sum()
+    assert (
+        last.negative_eigenvalues
+        == (2 if load == "dead thrust" else 0)
+        == (np.linalg.eigvals(dense).real < 0).sum()
+    )
     assert bool(warnings(caplog)) == (load == "dead thrust")
 
 
-@pytest.mark.parametrize(("force", "expected"), [(-30.0, [0, 0, 1, 3, 3]), (-10.0, [0] * 5), (10.0, [0] * 5)])
-def test_a_compressed_cube_in_every_row(force: float, expected: list[int], caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    ("force", "expected"), [(-30.0, [0, 0, 1, 3, 3]), (-10.0, [0] * 5), (10.0, [0] * 5)]
+)
+def test_a_compressed_cube_in_every_row(
+    force: float, expected: list[int], caplog: pytest.LogCaptureFixture
+) -> None:
     """At -30 its lowest eigenvalue is -2.3 of the unloaded one, at -10 still 0.16."""
     scene = pushed_cube(force, **COLUMN, **{"remodeling.law": "none"})
     rows = [step.row["negative_eigenvalues"] for step in run(scene)]
@@ -111,9 +129,13 @@ def test_a_compressed_cube_in_every_row(force: float, expected: list[int], caplo
     assert len(said) == len(set(expected)) - 1  # each change once
     if said:
         assert (
-            "time 2: unstable equilibrium: " in said[0] and "1 negative eigenvalue of the tangent (before: 0" in said[0]
+            "time 2: unstable equilibrium: " in said[0]
+            and "1 negative eigenvalue of the tangent (before: 0" in said[0]
         )
-        assert "the lowest is -2.3 times its unloaded value, and its mode is largest at (1, 1, 0)" in said[1]
+        assert (
+            "the lowest is -2.3 times its unloaded value, and its mode is largest at (1, 1, 0)"
+            in said[1]
+        )
 
 
 # ---------------------------------------------------------------- when somebody looks
@@ -136,7 +158,9 @@ def test_a_large_body_is_counted_on_request_only(
 
 
 def test_the_sign_of_the_determinant_tells_at_once(caplog: pytest.LogCaptureFixture) -> None:
-    steps = run(pushed_cube(-30.0, **{"time.end": 2.0, "loads.force.ramp": [[0.0, 0.0], [12.0, 4.0]]}))
+    steps = run(
+        pushed_cube(-30.0, **{"time.end": 2.0, "loads.force.ramp": [[0.0, 0.0], [12.0, 4.0]]})
+    )
     assert [step.negative_eigenvalues for step in steps][-1] == 1 and len(warnings(caplog)) == 1
 
 
@@ -163,7 +187,9 @@ def test_a_start_that_is_indefinite_is_told_apart(
     caplog.set_level(logging.INFO)
     run(pushed_cube(-20.0, **COLUMN, **{"remodeling.law": "none", "solver.unstable": "stop"}))
     assert not warnings(caplog)
-    assert sum("the equilibrium is not lost" in record.getMessage() for record in caplog.records) == 1
+    assert (
+        sum("the equilibrium is not lost" in record.getMessage() for record in caplog.records) == 1
+    )
 
 
 # ---------------------------------------------------------------- refusals
@@ -179,9 +205,18 @@ def refused(values: dict[str, Any]) -> tuple[StepFailure, float]:
 
 def test_an_asymptote_of_the_pressure_is_a_limit_point() -> None:
     """Without chains p(r_i) rises to mu ln(R_o/R_i) and no further; on this mesh, a prism of eight sides, to more."""
-    rising = {"loads.pressure.value": 8.0, "loads.pressure.ramp": [[0.0, 0.0], [10.0, 1.0]], "time.end": 10.0}
+    rising = {
+        "loads.pressure.value": 8.0,
+        "loads.pressure.ramp": [[0.0, 0.0], [10.0, 1.0]],
+        "time.end": 10.0,
+    }
     failure, last = refused(
-        {"material.chain_density": 0.0, "remodeling.law": "none", "loads.elongation.value": 0.0, **rising}
+        {
+            "material.chain_density": 0.0,
+            "remodeling.law": "none",
+            "loads.elongation.value": 0.0,
+            **rising,
+        }
     )
     assert failure.refusal.kind == "limit point" and 2.0 <= last < 10.0
     assert "approaches the largest that the body can carry" in failure.refusal.advice
@@ -190,14 +225,20 @@ def test_an_asymptote_of_the_pressure_is_a_limit_point() -> None:
 
 def test_more_elongation_than_chains_allow_is_chain_locking() -> None:
     """All chains axial: l lambda = L at a stretch of 1.594. Newton's method must not end with the elongation unmet."""
-    failure, last = refused({"loads.elongation.value": 0.6, "remodeling.kappa": 0.5, "time.end": 25.0})
+    failure, last = refused(
+        {"loads.elongation.value": 0.6, "remodeling.kappa": 0.5, "time.end": 25.0}
+    )
     assert failure.refusal.kind == "chain locking" and last == 24.0
     reached = 0.024 * (24 + float(str(failure).split(" failed at ")[1].split(" %")[0]) / 100)
     assert reached == pytest.approx(0.594, abs=1e-3)
 
 
 @pytest.mark.parametrize(("left", "kind"), [(50.0, "solver tolerance"), (1e6, "")])
-def test_a_residual_that_is_almost_small_enough_is_a_matter_of_the_tolerance(left: float, kind: str) -> None:
+def test_a_residual_that_is_almost_small_enough_is_a_matter_of_the_tolerance(
+    left: float, kind: str
+) -> None:
     made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
-    failure = SolveFailure("refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), left)
+    failure = SolveFailure(
+        "refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), left
+    )
     assert diagnose_failure(made.problem().newton, failure).kind == kind

@@ -25,7 +25,9 @@ KAPPA, END = 0.025, 100.0
 
 def cube(force: float, **changes: Any) -> Simulation:
     """The preset's cube under another load."""
-    values = {"loads.force.value": force} | {name.replace("__", "."): value for name, value in changes.items()}
+    values = {"loads.force.value": force} | {
+        name.replace("__", "."): value for name, value in changes.items()
+    }
     return Simulation(preset_scene(PAPER, "cube").with_values(values), MPI.COMM_SELF)
 
 
@@ -49,7 +51,9 @@ class Tilt(Watcher):
 
 def angles(simulation: Simulation) -> np.ndarray:
     """Angle between chains and load after the last pass, degrees, all points."""
-    return angle_to_axis(simulation.cells.dimension_values, simulation.cells.axis_values, np.array([0.0, 0.0, 1.0]))
+    return angle_to_axis(
+        simulation.cells.dimension_values, simulation.cells.axis_values, np.array([0.0, 0.0, 1.0])
+    )
 
 
 # ---------------------------------------------------------------- weak loads
@@ -62,10 +66,14 @@ def test_the_angle_under_a_weak_load_is_the_closed_form(
     simulation = cube(force, remodeling__frame=frame)
     with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
         *_, last = simulation.steps()
-    np.testing.assert_allclose(angles(simulation), closed_form_angle(KAPPA, np.array(END)), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        angles(simulation), closed_form_angle(KAPPA, np.array(END)), rtol=0, atol=1e-8
+    )
     share = 1 - np.exp(-KAPPA * (END - 1.0))
     across = (1 - share) / np.sqrt(3)
-    assert last.row["mean_stretch"] == pytest.approx(uniaxial_stretches(force, across + share, across)[0], abs=1e-8)
+    assert last.row["mean_stretch"] == pytest.approx(
+        uniaxial_stretches(force, across + share, across)[0], abs=1e-8
+    )
     assert "overshoots" not in caplog.text
 
 
@@ -79,17 +87,24 @@ def test_a_tilt_that_grows_is_warned_of_before_the_angle_is_off(
         for step in simulation.steps([Tilt(simulation, 20.0, 1e-8)]):
             if "overshoots" in caplog.text:
                 warned.append(step.time)
-            if abs(np.mean(angles(simulation)) - closed_form_angle(KAPPA, np.array(step.time))) > 0.5:
+            if (
+                abs(np.mean(angles(simulation)) - closed_form_angle(KAPPA, np.array(step.time)))
+                > 0.5
+            ):
                 off.append(step.time)
     assert bool(warned) == bool(off) == swings
     if swings:
         assert warned[0] <= off[0] + 1
         (record,) = caplog.records
-        assert record.levelname == "WARNING" and record.message.startswith(f"time {warned[0]:g}: the remodeling pass")
+        assert record.levelname == "WARNING" and record.message.startswith(
+            f"time {warned[0]:g}: the remodeling pass"
+        )
         assert 'coupling = "relaxed" with a relaxation_factor below 0.1' in record.message
 
 
-def test_loads_that_swing_themselves_are_no_over_correction(caplog: pytest.LogCaptureFixture) -> None:
+def test_loads_that_swing_themselves_are_no_over_correction(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     ramp = [[float(time), 1.0 if time % 2 else 0.3] for time in range(21)]
     simulation = cube(10.0, time__end=20.0, loads__force__ramp=ramp, remodeling__law="relaxation")
     with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
@@ -105,14 +120,22 @@ class Scripted:
     def __init__(self, factor: float, size: float, **changes: Any):
         self.simulation = cube(1.0, loads__force__ramp=[[0.0, 1.0]], **changes)
         self.stepper: Stepper = self.simulation.stepper
-        (self.watcher,) = (watcher for watcher in self.simulation.watchers if isinstance(watcher, OverCorrection))
+        (self.watcher,) = (
+            watcher for watcher in self.simulation.watchers if isinstance(watcher, OverCorrection)
+        )
         self.factor, self.size = factor, size
 
     def step(self, number: int) -> Step:
         """The state of a number."""
         swing = self.size * self.factor**number
         self.simulation.cells.dimension_values[..., 2] = np.sqrt(0.5 + 0.01 * number + swing)
-        return Step(float(number), number, {"force": 1.0}, self.stepper.coupling.equilibrium.extension(), Work())
+        return Step(
+            float(number),
+            number,
+            {"force": 1.0},
+            self.stepper.coupling.equilibrium.extension(),
+            Work(),
+        )
 
     def passes(self, last: int, rest: int = 0) -> None:
         """Until the last one; in one of them the cells may rest."""
@@ -138,9 +161,15 @@ def test_factor_and_size_of_a_swing_are_found_beside_a_smooth_course(factor: flo
 
 
 @pytest.mark.parametrize(("coupling", "said"), [("staggered", True), ("extrapolated", True)])
-def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(coupling: str, said: bool) -> None:
+def test_rows_whose_cells_belong_to_their_stress_over_correct_nothing(
+    coupling: str, said: bool
+) -> None:
     """Long steps may look like a swing; an explicit rule does swing."""
-    law = {"remodeling__law": "tensor", "material__repulsion": "log", "remodeling__coupling": coupling}
+    law = {
+        "remodeling__law": "tensor",
+        "material__repulsion": "log",
+        "remodeling__coupling": coupling,
+    }
     scripted = Scripted(-3.0, 4e-5, **law)
     scripted.passes(8)
     assert scripted.watcher.is_reported == said
@@ -198,7 +227,13 @@ def test_cells_that_make_up_for_a_rest_are_warned_of(
 def test_a_rest_without_loads_is_no_matter_of_steps(caplog: pytest.LogCaptureFixture) -> None:
     """Cells rest because the force is off: they would with any step."""
     ramp = [[0.0, 0.0], [2.0, 1.0], [8.0, 1.0], [9.0, 0.0], [14.0, 0.0], [15.0, 1.0]]
-    simulation = cube(10.0, loads__force__ramp=ramp, remodeling__law="explicit", remodeling__kappa=0.1, time__end=17.0)
+    simulation = cube(
+        10.0,
+        loads__force__ramp=ramp,
+        remodeling__law="explicit",
+        remodeling__kappa=0.1,
+        time__end=17.0,
+    )
     with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
         list(simulation.steps())
     assert "resume remodeling" not in caplog.text
