@@ -1,1 +1,1 @@
-"""What is kept of a run, and read back: columns, history, fields."""
+"""Recorded results of a run and their readers: columns, history, fields."""

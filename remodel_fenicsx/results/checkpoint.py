@@ -26,9 +26,8 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 MAX_LOSS_SECONDS = 600.0  # seconds
-SHORTEST_PAUSE = (
-    10.0  # seconds between two that are chosen by time: below it nothing worth a write is lost
-)
+# seconds between two checkpoints that are chosen by time: a shorter pause saves too little work
+SHORTEST_PAUSE = 10.0
 MAX_TIME_FRACTION = 0.04  # of the time of a run, that checkpoints chosen by time may cost
 
 
@@ -44,7 +43,8 @@ class Checkpoints(Watcher):
         before: Sequence[Callable[[], None]] = (),
     ):
         self.before = before
-        self.folder, self.state, self.scene_text, self.every = folder, state, scene_text, every
+        self.folder, self.state = folder, state
+        self.scene_text, self.every = scene_text, every
         self._mesh = mesh_arrays(state.loading.domain)
         self._versions = versions() if state.comm.rank == 0 else {}
         self._written_at, self._cost = clock.monotonic(), 0.0
@@ -61,7 +61,7 @@ class Checkpoints(Watcher):
             self.write()
 
     def _is_due(self, number: int) -> bool:
-        """The same on all ranks."""
+        """Return whether a checkpoint is due, the same on all ranks. Collective."""
         if self.every is not None:
             return self.every > 0 and number % self.every == 0
         pause = min(max(SHORTEST_PAUSE, self._cost / MAX_TIME_FRACTION), MAX_LOSS_SECONDS)
@@ -94,13 +94,16 @@ class Checkpoints(Watcher):
 
 
 def mesh_arrays(domain: Domain) -> dict[str, Array] | None:
-    """The mesh by the input's numbering, on rank 0. Collective."""
+    """Return the mesh in the input's numbering, on rank 0. Collective."""
     points, elements = domain.gather_mesh()
     return None if points is None or elements is None else {"points": points, "elements": elements}
 
 
 def gather_state(state: State) -> dict[str, Array] | None:
-    """Every function of a state by name, (elements, values of one) in input order, on rank 0. Collective."""
+    """Return every function of a state by name, on rank 0. Collective.
+
+    Each array is (elements, values of one element), in the order of the input.
+    """
     domain, functions = state.loading.domain, state.functions()
     gathered = {
         name: domain.gather_elements(one.x.array[_places(one)]) for name, one in functions.items()
@@ -144,21 +147,23 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
         for n, one in state.functions().items()
     }
     begins_anew = {name: shape for name, shape in wanted.items() if name in counts}
-    found = {name: arrays[f"function/{name}"].shape for name in checkpoint.functions}
+    stored = {name: arrays[f"function/{name}"].shape for name in checkpoint.functions}
     own = marked(state, lambda case: case.loading.values)
     loads = {
         name for name, value in checkpoint.loads.items() if value
     }  # earlier versions kept all, zero or not
-    if not wanted.items() <= (begins_anew | found).items() or not loads <= own.keys():
+    if not wanted.items() <= (begins_anew | stored).items() or not loads <= own.keys():
         there, here = (
-            f"functions {a} and loads {sorted(b)}" for a, b in ((found, loads), (wanted, own))
+            f"functions {a} and loads {sorted(b)}" for a, b in ((stored, loads), (wanted, own))
         )
         raise CheckpointError(f"the checkpoint has the {there}; this run has the {here}")
     points, elements = arrays["points"], arrays["elements"]
     same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
     if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):
-        words = "the checkpoint has another mesh: perhaps Gmsh is of another version, run.log says which it was"
-        raise CheckpointError(words)
+        raise CheckpointError(
+            "the checkpoint has another mesh: perhaps Gmsh is of another version, "
+            "run.log says which it was"
+        )
 
 
 def marked(state: State, values: Callable[[State], Mapping[str, T]]) -> dict[str, T]:
@@ -168,7 +173,7 @@ def marked(state: State, values: Callable[[State], Mapping[str, T]]) -> dict[str
 
 
 def values_of_case(values: Mapping[str, T], mark: str) -> dict[str, T]:
-    """Those of one load case, by their names without its mark."""
+    """Return the values of one load case, by their names without its mark."""
     parts = {name: name.partition("@") for name in values}
     return {
         parts[name][0]: value for name, value in values.items() if "".join(parts[name][1:]) == mark
@@ -186,7 +191,7 @@ def _counts(state: State) -> dict[str, str]:
 
 
 def _places(function: object) -> Array:
-    """Where the values of each local element stand in the function's array, (elements, values of one)."""
+    """Return indices into the function's array, (elements, values of one element)."""
     space = function.function_space  # type: ignore[attr-defined]
     dofs, size = np.asarray(space.dofmap.list, dtype=np.int64), space.dofmap.bs
     # not -1: a rank may have no element at all

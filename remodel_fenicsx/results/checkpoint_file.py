@@ -1,7 +1,8 @@
-"""Checkpoints as files: numpy's .npz with a JSON header, one and its predecessor; the larger number is the newest.
+"""Checkpoints as files: numpy's .npz with a JSON header.
 
-Each gets its name when it is whole, over the older one. Its values have the check sums of zip, which tell of accidents,
-not of intent: types and shapes are looked at too. This needs no dolfinx.
+A folder has the newest checkpoint, which is the one with the larger number, and its predecessor.
+A new checkpoint replaces the older file when it is complete. The check sums of zip detect
+accidents, not intent, so types and shapes are checked too. This module needs no dolfinx.
 """
 
 from __future__ import annotations
@@ -28,19 +29,27 @@ Array = NDArray[Any]
 CHECKPOINT_FORMAT = 1
 FILES = ("checkpoint-a.npz", "checkpoint-b.npz")
 _HEADER = "header"  # name of the array that holds the JSON
-# what numpy, zipfile and pydantic raise of a file that somebody has changed: encrypted, too deep, no literal, ...
+# errors of numpy, zipfile and pydantic if a file was changed: encrypted, too deep, no literal, ...
 _FAULTS = (
-    ValueError, KeyError, TypeError, EOFError, OSError, MemoryError, RuntimeError, SyntaxError, tokenize.TokenError,
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    OSError,
+    MemoryError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
     zipfile.BadZipFile,
-)  # fmt: skip
+)
 
 
 class CheckpointError(RemodelError, ValueError):
-    """A checkpoint is damaged or does not belong to the run; one line."""
+    """A checkpoint is corrupt or does not belong to the run; one line."""
 
 
 class Checkpoint(BaseModel):
-    """A state by the input mesh's numbering."""
+    """A state in the numbering of the input mesh."""
 
     model_config = ConfigDict(
         strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
@@ -71,32 +80,35 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def time_of_checkpoint(folder: Path) -> float | None:
-    """That of the newest; None if there is none."""
-    found = read_checkpoint(folder)
-    return None if found is None else found.time
+    """Return the time of the newest checkpoint, or None if there is none."""
+    checkpoint = read_checkpoint(folder)
+    return None if checkpoint is None else checkpoint.time
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint that is whole, with a warning where one is not; None if there is none."""
-    found, faults = list[Checkpoint](), list[str]()
+    """Return the newest complete checkpoint, or None if there is none.
+
+    The program logs a warning about an incomplete one.
+    """
+    checkpoints, faults = list[Checkpoint](), list[str]()
     for path in (folder / name for name in FILES):
         try:
             if os.path.lexists(path):
-                found.append(read_file(path))
+                checkpoints.append(read_file(path))
         except CheckpointError as error:
             faults.append(str(error))
-    if faults and not found:
+    if faults and not checkpoints:
         remedy = "without its files checkpoint* the run starts again at t = 0"
         raise CheckpointError(
             f"{folder}: has no checkpoint that is whole ({'; '.join(faults)}); {remedy}"
         )
     for fault in faults:
         log.warning("%s", fault)
-    return max(found, key=lambda one: one.number) if found else None
+    return max(checkpoints, key=lambda one: one.number) if checkpoints else None
 
 
 def read_file(path: Path) -> Checkpoint:
-    """Read a checkpoint."""
+    """Read a checkpoint and check its types and shapes."""
     check_regular(path)
     try:
         with np.load(path, allow_pickle=False) as file, zipfile.ZipFile(path) as archive:
@@ -118,12 +130,12 @@ def read_file(path: Path) -> Checkpoint:
         raise
     except _FAULTS as error:
         raise CheckpointError(
-            f"{path}: is damaged or of another kind than the checkpoints of this version"
+            f"{path}: is corrupt or of another kind than the checkpoints of this version"
         ) from error
     return checkpoint
 
 
 def _check_table(array: Array) -> None:
-    """Raise ValueError unless it is a table of finite numbers."""
+    """Raise ValueError unless the array is a table of finite numbers."""
     if array.ndim != 2 or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
         raise ValueError("no table of finite numbers")

@@ -28,7 +28,7 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
-NO_LUMEN = 1e-9  # of the body's size cubed: what a flat inner face encloses by rounding
+NO_LUMEN = 1e-9  # of the body's size cubed: a flat inner face encloses that by rounding
 
 
 class Observer(Watcher):
@@ -58,7 +58,8 @@ class Observer(Watcher):
     """
 
     def __init__(self, shape: Shape, stepper: Any, columns: Sequence[Column] | None = None):
-        self.shape, self.stepper, self.state = shape, stepper, stepper.state
+        self.shape, self.stepper = shape, stepper
+        self.state = stepper.state
         if columns is None:
             columns = columns_of(shape, loads=self.state.loading.values)
         self.columns = tuple(columns)
@@ -83,7 +84,7 @@ class Observer(Watcher):
         self._fill(step, after_pass=False)
 
     def completed(self, step: Step) -> None:
-        """Fill in what is known only now."""
+        """Fill in the columns that are known only after the remodeling pass."""
         self._fill(step, after_pass=True)
 
     def _fill(self, step: Step, after_pass: bool) -> None:
@@ -93,8 +94,8 @@ class Observer(Watcher):
                 value = column.value(measurement)
                 if not isinstance(value, Real) or np.isinf(value):
                     error = RemodelError(
-                        f"the column {column.name!r} is {format_value(value)} at time {step.time:g}: "
-                        "must be a finite number, or nan where there is none"
+                        f"the column {column.name!r} is {format_value(value)} "
+                        f"at time {step.time:g}: must be a finite number, or nan if there is none"
                     )
                     error.on_all_ranks = False
                     raise error
@@ -103,7 +104,7 @@ class Observer(Watcher):
 
 @with_old_names
 class Measurement:
-    """What columns may ask of a step; everything is computed once, when the first one asks.
+    """Quantities of a step for columns; each is computed once, when a column first needs it.
 
     Parameters
     ----------
@@ -132,23 +133,23 @@ class Measurement:
     ...     measured = Measurement(simulation.observer, step)
     >>> measured.displacement.shape, measured.fibre_angle.shape  # (nodes, 3), (elements, points)
     ((8, 3), (1, 8))
-    >>> round(measured.face_mean("z1", measured.position[:, 2]), 4), round(measured.face_area("z1"), 4)
-    (1.0808, 1.0)
+    >>> round(measured.face_mean("z1", measured.position[:, 2]), 4)
+    1.0808
+    >>> round(measured.face_area("z1"), 4)
+    1.0
     """
 
     def __init__(self, observer: Observer, step: Step):
         self.step, self.observer = step, observer
         self._of_step: dict[object, Any] = {}
-        self.domain, self.quadrature, self.state = (
-            observer.domain,
-            observer.quadrature,
-            observer.state,
-        )
+        self.domain, self.quadrature = observer.domain, observer.quadrature
+        self.state = observer.state
 
     @property
     def equilibrium(self) -> Equilibrium:
         """The forms of the solved state."""
-        return self.observer.stepper.coupling.equilibrium
+        coupling = self.observer.stepper.coupling
+        return coupling.equilibrium
 
     @cached_property
     def displacement(self) -> Array:
@@ -157,7 +158,7 @@ class Measurement:
 
     @cached_property
     def position(self) -> Array:
-        """Deformed place of the local nodes, (nodes, 3)."""
+        """Deformed position of the local nodes, (nodes, 3)."""
         nodes: Array = self.state.kinematics.nodal_space(
             self.state.unknown
         ).tabulate_dof_coordinates()
@@ -170,11 +171,10 @@ class Measurement:
 
     @cached_property
     def stress(self) -> Array:
-        """Cauchy stress at all points, (elements, points, 3, 3), with what formulation and repulsion add."""
+        """Cauchy stress with formulation and repulsion terms, (elements, points, 3, 3)."""
         stepper = self.observer.stepper
-        if (
-            stepper.remodeling.law.remodels and stepper.remodeling.driver is DRIVERS["cauchy"]
-        ):  # the pass asks for it too
+        if stepper.remodeling.law.remodels and stepper.remodeling.driver is DRIVERS["cauchy"]:
+            # the pass needs the same tensor
             return stepper.remodeling.driving_tensor()[1].reshape(*self.quadrature.shape, 3, 3)
 
         def compiled() -> tuple[PointStresses, jit.PointValues]:
@@ -188,32 +188,33 @@ class Measurement:
     @cached_property
     def wall_stress(self) -> Array:
         """Cauchy stress around, along and across the wall at all points, (elements, points, 3)."""
-        axes = self.state.cells.local_axes.deformed(self.F)
+        cells = self.state.cells
+        axes = cells.local_axes.deformed(self.F)
         return np.einsum("...ki,...ij,...kj->...k", axes, self.stress, axes)
 
     @cached_property
     def fibre_angle(self) -> Array:
-        """Reference fibre angle at all points (elements, points), degrees; NaN where there is none."""
+        """Reference fibre angle at all points, (elements, points), degrees; NaN without chains."""
         cells = self.state.cells
         return self._angle(cells.axis_values, cells.local_axes.axes)
 
     @cached_property
     def fibre_angle_unloaded(self) -> Array:
-        """Of the cells in the unloaded body, at all points (elements, points), degrees."""
+        """Fibre angle in the unloaded body, at all points (elements, points), degrees."""
         cells = self.state.cells
         axes = self.state.elastic_axes(cells.axis_values)
         return self._angle(axes, cells.local_axes.axes)
 
     @cached_property
     def fibre_angle_deformed(self) -> Array:
-        """Of the cells in the deformed body, at all points (elements, points), degrees."""
+        """Fibre angle in the deformed configuration, (elements, points), degrees."""
         cells = self.state.cells
         axes = self.state.elastic_axes(cells.axis_values, self.F)
         return self._angle(axes, cells.local_axes.deformed(self.F))
 
     @cached_property
     def radial_share(self) -> Array:
-        """Of the chains at all points (elements, points)."""
+        """Radial fraction of the chains at all points, (elements, points)."""
         cells = self.state.cells
         share = self.observer.shape.radial_share(
             cells.dimension_values, cells.axis_values, cells.local_axes.axes
@@ -221,8 +222,8 @@ class Measurement:
         return self.equilibrium.parameters.nan_without_chains(share)
 
     def _angle(self, axes: Array, local: Array) -> Array:
-        found = self.observer.shape.fibre_angle(self.state.cells.dimension_values, axes, local)
-        return self.equilibrium.parameters.nan_without_chains(found)
+        angle = self.observer.shape.fibre_angle(self.state.cells.dimension_values, axes, local)
+        return self.equilibrium.parameters.nan_without_chains(angle)
 
     @cached_property
     def chain_extension(self) -> Array:
@@ -264,17 +265,21 @@ class Measurement:
 
     def _over_face(self, face: str, deformed: bool, *nodal_values: Array | float) -> list[float]:
         field, form = self.cached((face, deformed), lambda: _face_form(self, face, deformed))
-        at_nodes, found = (
-            field.x.array.reshape(-1, field.function_space.dofmap.index_map_bs)[:, 0],
-            [],
-        )
+        block_size = field.function_space.dofmap.index_map_bs
+        at_nodes, integrals = field.x.array.reshape(-1, block_size)[:, 0], []
         for values in nodal_values:
             at_nodes[:] = values
-            found.append(integral(form))
-        return found
+            integrals.append(integral(form))
+        return integrals
 
     def end_force(self, face: str) -> EndForce:
-        """Of a tube whose inner face has this name, at the end z = length."""
+        """Compute the force at the end z = length of a tube.
+
+        Parameters
+        ----------
+        face
+            Name of the tube's inner face.
+        """
 
         def measured() -> EndForce:
             groups = self.cached(("end force", face), lambda: _end_forms(self, face))
@@ -285,7 +290,9 @@ class Measurement:
         return self.cached_for_step(("end force", face), measured)
 
     def support_force(self, face: str) -> float:
-        """Of an own body: force by which the support of a face pulls it, along the mean normal of each of its parts.
+        """Compute the force by which the support of a face pulls a user-supplied body.
+
+        The force is along the mean normal of each connected part of the face.
 
         Parameters
         ----------
@@ -295,7 +302,10 @@ class Measurement:
         return self.cached(("support", face), lambda: _support_force(self.equilibrium, face))()
 
     def lumen_volume(self) -> float:
-        """Of an own body (`MeshDomain`): volume inside the deformed inner face, with flat caps on its rims."""
+        """Compute the volume inside the deformed inner face, with flat caps on its rims.
+
+        Only for a user-supplied body (`MeshDomain`).
+        """
         return self.cached("lumen volume", lambda: _lumen_volume(self.observer))()
 
     def largest(self, values: Array) -> float:
@@ -319,10 +329,11 @@ class Measurement:
         return self.quadrature.minimum(values)
 
     def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
-        """Mask of the local elements with a reference point at this distance from the z axis, (elements,)."""
+        """Mask of the local elements that a circle about the z axis touches, (elements,)."""
 
         def touch() -> NDArray[np.bool_]:
-            nodes = self.domain.mesh.geometry.x[compat.geometry_dofmap(self.domain.mesh)]
+            mesh = self.domain.mesh
+            nodes = mesh.geometry.x[compat.geometry_dofmap(mesh)]
             radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size
             return (radii.min(axis=1) <= radius + tolerance) & (
                 radii.max(axis=1) >= radius - tolerance
@@ -331,28 +342,33 @@ class Measurement:
         return self.cached(("elements touching", radius), touch)  # type: ignore[no-any-return]
 
     def of_case(self, number: int) -> Measurement:
-        """The same step in another load case; the first one is 1.
+        """Return the measurement of the same step in another load case.
 
         Parameters
         ----------
         number
-            Of the load case, from 1.
+            Number of the load case, from 1.
         """
 
         def measured() -> Measurement:
             observer = self.observer.others[number - 2]
             return Measurement(observer, observer.stepper.seen(self.step))
 
-        return self if number == 1 else self.cached_for_step(("case", number), measured)  # type: ignore[no-any-return]
+        if number == 1:
+            return self
+        return self.cached_for_step(("case", number), measured)  # type: ignore[no-any-return]
 
     def cached(self, key: object, make: Callable[[], T]) -> T:
-        """What a column needs for every step, a compiled form say: made once, by make(), and kept under a key."""
+        """Return an object that a column needs at every step, for example a compiled form.
+
+        The first call for a key stores the result of make().
+        """
         if key not in self.observer.tools:
             self.observer.tools[key] = make()
         return self.observer.tools[key]
 
     def cached_for_step(self, key: object, make: Callable[[], T]) -> T:
-        """What several columns of one step share: made once for the step."""
+        """Return an object that several columns of this step use: make() runs once for the step."""
         if key not in self._of_step:
             self._of_step[key] = make()
         return self._of_step[key]
@@ -363,7 +379,7 @@ def _face_form(
 ) -> tuple[dolfinx.fem.Function, dolfinx.fem.Form]:
     """A nodal field, and its integral over the reference or the deformed area of a face."""
     state, mesh = measured.state, measured.domain.mesh
-    # first component of a function of the displacement's space: surely the same order of nodes
+    # first component of a function of the displacement's space, which has the same order of nodes
     field: dolfinx.fem.Function = dolfinx.fem.Function(state.kinematics.nodal_space(state.unknown))
     value, normal = field[0] if field.ufl_shape else field, ufl.FacetNormal(mesh)
     F = state.kinematics.deformation_gradient(state.unknown)
@@ -373,11 +389,12 @@ def _face_form(
 
 
 def _lumen_volume(observer: Observer) -> Callable[[], float]:
-    """-1/3 integral of x . cof(F) N over the inner face, and the cones over flat caps on its rims."""
+    """Return a function for -1/3 integral of x . cof(F) N over the inner face, plus flat caps."""
     from remodel_fenicsx.body.mesh_faces import cap_volume
 
     domain: Any = observer.domain  # a `MeshDomain`
-    state, mesh, middle = observer.state, domain.mesh, domain.boundary.parts("inner")[0].centre
+    state, mesh = observer.state, domain.mesh
+    middle = domain.boundary.parts("inner")[0].centre
     nodes = domain.gather_nodes(mesh.geometry.x - middle)
     place = ufl.SpatialCoordinate(mesh) - dolfinx.fem.Constant(mesh, middle)
     place += state.kinematics.displacement(state.unknown)
@@ -389,19 +406,20 @@ def _lumen_volume(observer: Observer) -> Callable[[], float]:
         caps = 0.0
         if displacement is not None:
             caps = sum(cap_volume(nodes + displacement, rim) for rim in domain.rims)
-        found = integral(form) + float(allreduce(domain.comm, caps, MPI.SUM))
-        return found if abs(found) > NO_LUMEN * domain.size**3 else math.nan
+        enclosed = integral(form) + float(allreduce(domain.comm, caps, MPI.SUM))
+        return enclosed if abs(enclosed) > NO_LUMEN * domain.size**3 else math.nan
 
     return volume
 
 
 def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
-    """What springs do in a shift along the normal, or what is out of balance at nodes that are held."""
+    """Return a function for the force of springs, or of constrained nodes, along the normal."""
     state, unknown = equilibrium.state, equilibrium.state.unknown
     domain: Any = state.loading.domain  # a `MeshDomain`
     if domain.boundary.goes_around(face):
         raise SceneError(
-            f"output.columns = 'support_force_{face}': the face goes around the body, so that there is no direction"
+            f"output.columns = 'support_force_{face}': the face goes around the body, "
+            "so that there is no direction"
         )
     if (potential := state.loading.supports[face]) is not None:
         form = jit.form(
@@ -430,27 +448,29 @@ def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
 
 
 class EndForce(NamedTuple):
-    """What a virtual lengthening v = z/L e_z of a tube does, per unit of its displacement of the end z = L."""
+    """Virtual work of a lengthening v = z/L e_z of a tube, per displacement of the end z = L."""
 
     internal: float
     inward: float
     lumen: float
 
     def wall_force(self, pressure: float) -> float:
-        """The force that the wall carries through its section at z = L, with a pressure on the inner face."""
+        """Return the force in the wall's section at z = L, with a pressure on the inner face."""
         return self.internal + pressure * self.inward
 
     def reduced(self, pressure: float) -> float:
-        """The same less pressure times the lumen's area at z = L: what must be applied if the ends are capped."""
+        """Return the force to apply if the ends are capped: less pressure times the lumen's area."""
         return self.internal - pressure * self.lumen
 
 
 def _end_forms(measured: Measurement, face: str) -> list[list[dolfinx.fem.Form]]:
     """The forms of `EndForce`, in any kinematics and formulation."""
-    state, equilibrium, mesh = measured.state, measured.equilibrium, measured.domain.mesh
+    state, equilibrium = measured.state, measured.equilibrium
+    mesh = measured.domain.mesh
     weight, F = state.kinematics.weight(mesh), state.kinematics.deformation_gradient(state.unknown)
     tissue, elastic = state.kinematics.stress_free_weight(mesh), state.kinematics.elastic
-    # a function where a number would do: UFL differentiates by functions only, and some kinematics prescribe F_zz
+    # a function in place of a number: UFL differentiates by functions only, and some kinematics
+    # prescribe F_zz
     change: dolfinx.fem.Function = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, ("DG", 0)))
     one, size = (
         dolfinx.fem.Constant(mesh, np.float64(v))

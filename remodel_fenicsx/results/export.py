@@ -23,7 +23,7 @@ from remodel_fenicsx.system.files import write_new
 
 
 log = logging.getLogger(__name__)
-LEAST_SAID = 0.01  # of a change between elements: less is below what a fit of angles resolves
+LEAST_SAID = 0.01  # change between elements: a fit of angles does not resolve less
 
 
 def write_vtu(
@@ -49,13 +49,15 @@ def write_vtu(
 
 
 # ---------------------------------------------------------------- cells as fibres of other programs
-# The cells of a recorded run as fibres of other programs: one structure tensor for each element. It needs no dolfinx.
-#  Elements and nodes have the numbers of the run's mesh file, counted from 1 in text. What is written where:
-# - febio: https://help.febio.org, User Manual 4, sections Mesh and MeshData; read by FEBioMeshDataSection4.cpp. Axis
-# 1 is   a, axis 2 lies in the plane of a and d; the cell dimensions are three data maps of the elements. - abaqus:
-# Keywords Reference Guide, *DISTRIBUTION TABLE, *DISTRIBUTION and *ORIENTATION, which CalculiX reads too
-# (https://www.openaircraft.com/ccx-doc/ccx/node256.html). Neither has a place for the dimensions, which stand in
-# comments: `** cell_dimensions, element, l1, l2, l3`.
+# The cells of a recorded run as fibres of other programs: one structure tensor for each element.
+# This needs no dolfinx. Elements and nodes have the numbers of the run's mesh file, counted from 1
+# in text. The formats:
+# - febio: https://help.febio.org, User Manual 4, sections Mesh and MeshData; read by
+#   FEBioMeshDataSection4.cpp. Axis 1 is a, axis 2 lies in the plane of a and d. The cell dimensions
+#   are three data maps of the elements.
+# - abaqus: Keywords Reference Guide, *DISTRIBUTION TABLE, *DISTRIBUTION and *ORIENTATION, which
+#   CalculiX reads too (https://www.openaircraft.com/ccx-doc/ccx/node256.html). Neither has an item
+#   for the dimensions, which are comments: `** cell_dimensions, element, l1, l2, l3`.
 
 Array = NDArray[np.float64]
 
@@ -63,7 +65,7 @@ TENSOR_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")  # of a tenso
 
 
 class ElementNames(NamedTuple):
-    """What other programs call an element, and how many of its nodes, in VTK's order, FEBio and Abaqus take."""
+    """Element type in other programs, and the number of its nodes in FEBio and Abaqus."""
 
     vtk: int
     febio: str
@@ -71,8 +73,8 @@ class ElementNames(NamedTuple):
     nodes: int
 
 
-# by number of nodes. Other programs count the nodes within faces and volume of quadratic hexahedra in other orders, and
-# CalculiX has no such element: theirs is that of 20 nodes
+# by number of nodes. Other programs count the nodes within faces and volume of quadratic hexahedra
+# in other orders, and CalculiX has no such element: these programs get the element of 20 nodes
 ELEMENTS = {
     4: ElementNames(10, "tet4", "C3D4", 4),
     8: ElementNames(12, "hex8", "C3D8", 8),
@@ -90,9 +92,8 @@ class Fibres:
     dimensions: Array
     axes: Array
     displacement: Array | None
-    others: Mapping[str, Array] = MappingProxyType(
-        {}
-    )  # prestretch, content, natural length, where there are any
+    # prestretch, content and natural length, if the run has any
+    others: Mapping[str, Array] = MappingProxyType({})
 
     @property
     def tensors(self) -> Array:
@@ -101,19 +102,19 @@ class Fibres:
 
     @property
     def names(self) -> ElementNames:
-        """Of the elements."""
+        """Names of the element type in other programs."""
         return ELEMENTS[self.elements.shape[1]]
 
     @property
     def reduced(self) -> NDArray[np.int64]:
-        """The elements with those of their nodes that other programs take."""
+        """Elements with the nodes that other programs use."""
         return self.elements[:, : self.names.nodes]
 
 
 def export(
     folder: Path | str, kind: str, path: Path | None = None, time: float | None = None
 ) -> Path:
-    """Write the mean structure tensor of each element with its axes and dimensions into a new file."""
+    """Write the mean structure tensor of each element, its axes and dimensions to a new file."""
     ending, write = FIBRE_FORMATS[kind]
     fibres = recorded_fibres(RecordedRun(folder), time)
     if fibres.others and kind not in WITH_OTHERS:
@@ -124,8 +125,8 @@ def export(
     share = unevenness(fibres.elements, fibres.tensors)
     if fibres.elements.shape[1] > 4 and share > LEAST_SAID:
         log.warning(
-            "each element has the mean of its points: at nodes they differ by up to %.1f %% of tr A, "
-            "and a run that begins with them is off by up to about as much there",
+            "each element has the mean of its points: at nodes they differ by up to %.1f %% "
+            "of tr A, and a run that begins with them has an error of up to about as much there",
             100 * share,
         )
     path = Path(folder) / f"fibres{ending}" if path is None else path
@@ -134,7 +135,10 @@ def export(
 
 
 def unevenness(elements: NDArray[np.int64], tensors: Array) -> float:
-    """Largest change of A (elements, 3, 3), over tr A, from an element to the mean of all at one of its nodes."""
+    """Compute the largest change of A (elements, 3, 3), relative to tr A, at the nodes.
+
+    It is the change from an element to the mean of all elements at one of its nodes.
+    """
     shares = (tensors / np.trace(tensors, axis1=1, axis2=2)[:, None, None]).reshape(-1, 9)
     sums = np.zeros((elements.max() + 1, 10))
     np.add.at(sums, elements, np.insert(shares, 9, 1.0, axis=1)[:, None])
@@ -143,7 +147,7 @@ def unevenness(elements: NDArray[np.int64], tensors: Array) -> float:
 
 
 def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:
-    """The cells of a run at a recorded time, the last one where None is given."""
+    """Read the cells of a run at a recorded time; None is the last one."""
     kinematics = recording.scene.model.kinematics
     if KINEMATICS[kinematics].reduced:
         remedy = "revolve writes the fields of the whole body, model.kinematics = 'full' runs it"
@@ -240,7 +244,8 @@ def _febio(path: Path, fibres: Fibres) -> None:
     _write(path, text)
 
 
-ABAQUS = """** mean cells of a run of remodel_fenicsx: local directions 1, 2 and 3 are the axes, longest first
+ABAQUS = """** mean cells of a run of remodel_fenicsx: \
+local directions 1, 2 and 3 are the axes, longest first
 *NODE
 {nodes}
 *ELEMENT, TYPE={kind}, ELSET=BODY
@@ -271,7 +276,7 @@ def _abaqus(path: Path, fibres: Fibres) -> None:
 
 
 WITH_OTHERS = ("vtu", "febio")
-# format: ending of its files, and what writes one
+# format: suffix of its files, and the function that writes one
 FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
     "vtu": (".vtu", _vtu),
     "febio": (".feb", _febio),
@@ -281,7 +286,7 @@ FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
 
 
 def _rows(pattern: str, *parts: NDArray[np.generic]) -> str:
-    """A line for each row of the parts (n, ...); numbers have commas between and are read back to the last bit."""
+    """Format one line for each row of the arrays (n, ...); numbers read back to the last bit."""
     texts = [[",".join(map(repr, row.ravel().tolist())) for row in part] for part in parts]
     return "\n".join(
         pattern.format(n, *row) for n, row in enumerate(zip(*texts, strict=True), start=1)

@@ -1,4 +1,4 @@
-"""Fields over time for ParaView and PyVista: element means on the mesh, and the chains of every element as lines."""
+"""Time series for ParaView and PyVista: element means on the mesh, and chains as lines."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def field_names(
     lacking: Collection[str] = (REGION, *NO_PRESTRETCH, *TURNED_OVER, GROWTH),
     constant: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """The fields that a scene's `output.fields` asks for; where it says all, without those that it lacks."""
+    """Return the fields that a scene's `output.fields` names; True is all that the scene has."""
     if isinstance(asked, bool):
         return (
             (*(name for name in FIELDS_BY_NAME if name not in lacking), *constant) if asked else ()
@@ -48,7 +48,10 @@ def field_names(
 
 
 def local_fields(local_axes: LocalAxes, quadrature: Quadrature) -> dict[str, Array]:
-    """CONSTANT_FIELDS of the local elements, by name: unit vectors (elements, 3), depth and station (elements,)."""
+    """Compute CONSTANT_FIELDS of the local elements, by name.
+
+    These are unit vectors (elements, 3), and depth and station (elements,).
+    """
     axes = quadrature.element_mean(local_axes.axes)
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     numbers = (quadrature.element_mean(values) for values in (local_axes.depth, local_axes.station))
@@ -59,16 +62,14 @@ class ElementFields:
     """Element means for pictures."""
 
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
-        self.observer, self.turnover, self.names = (
-            Observer(shape, stepper, ()),
-            stepper.part("turnover"),
-            tuple(names),
-        )
+        self.observer, self.turnover = Observer(shape, stepper, ()), stepper.part("turnover")
+        self.names = tuple(names)
         self.tissue, self._parameters = stepper.tissue, stepper.coupling.equilibrium.parameters
 
     def __call__(self) -> dict[str, Array]:
-        """By name, one row per local element."""
-        state, measured = self.observer.state, Measurement(self.observer, None)  # type: ignore[arg-type]
+        """Compute the fields by name, one row per local element."""
+        state = self.observer.state
+        measured = Measurement(self.observer, None)  # type: ignore[arg-type]
         quadrature, mean_cells = measured.quadrature, cache(self.mean_cells)
         mean, nanmean = quadrature.element_mean, quadrature.element_nanmean
         makers: dict[str, Callable[[], Array]] = {
@@ -97,45 +98,48 @@ class ElementFields:
         }
 
     def mean_cells(self) -> tuple[Array, Array]:
-        """Lengths (elements, 3) and axes as rows (elements, 3, 3) of the mean structure tensor, longest first."""
+        """Compute lengths (elements, 3) and axes as rows (elements, 3, 3), longest first.
+
+        They belong to the mean structure tensor of each element.
+        """
         cells = self.observer.state.cells
         means = cells.quadrature.element_mean(cells.structure_tensor())
         squared, axes = cells.kernels.principal(means, cells.axis_values[:, 0])
-        chains = self._parameters.has_chains()[
-            :, :1
-        ]  # of regions: all points of an element, or none
+        # of regions: all points of an element, or none
+        chains = self._parameters.has_chains()[:, :1]
         return np.sqrt(np.maximum(squared, 0.0)) * chains, axes
 
 
 class Fields(Watcher, ClosedAtEnd):
-    """Time series of fields: fields.vtkhdf (the mesh) and fields_chains.vtkhdf (four chain lines per element).
+    """Time series of fields in fields.vtkhdf (the mesh) and fields_chains.vtkhdf.
 
-    Both open in ParaView (5.12 or later) and PyVista as one time series. Nodes and elements stand in the mesh file's
-    order, whatever the number of ranks.
+    The second file has four chain lines per element. Both open in ParaView (5.12 or later) and
+    PyVista as one time series. Nodes and elements have the mesh file's order, whatever the number
+    of ranks.
 
     Parameters
     ----------
     folder
-        Where the files go.
+        Folder of the files.
     shape, stepper
-        What is written.
+        Body and simulation whose fields are written.
     every
-        Every so many steps; the first and the last one always.
+        Number of steps between two that are written; the first and the last one always are.
     after
-        Where a run goes on: time of the last step that was done. Fields of later ones are dropped.
+        Time of the last completed step if the run resumes. Fields of later steps are dropped.
     names
-        Of `settings.FIELDS_BY_NAME` and CONSTANT_FIELDS, what is written; the lines only with "chains".
+        Names from `settings.FIELDS_BY_NAME` and CONSTANT_FIELDS; "chains" writes the lines.
     times
         Further times that are written.
 
     Raises
     ------
     FileExistsError
-        If a new run finds such files.
+        If such files exist and the run is new.
     OSError
         If they cannot be written.
     RecordingError
-        On rank 0, if those to go on with are damaged.
+        On rank 0, if the files of a resumed run are corrupt.
 
     Examples
     --------
@@ -143,7 +147,9 @@ class Fields(Watcher, ClosedAtEnd):
     >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 3.0})
     >>> simulation = Simulation(scene)
     >>> with parts.RunFolder("with-fields", scene.to_toml()) as record:
-    ...     fields = parts.Fields(record.folder, scene.geometry, simulation.stepper, names=("displacement",))
+    ...     fields = parts.Fields(
+    ...         record.folder, scene.geometry, simulation.stepper, names=("displacement",)
+    ...     )
     ...     for step in simulation.steps([record, fields]):
     ...         pass
     ...     fields.close()
@@ -162,7 +168,8 @@ class Fields(Watcher, ClosedAtEnd):
         times: Sequence[float] = (),
     ):
         self.times = tuple(times)
-        self.state, self.every, self.names = stepper.state, every, tuple(names)
+        self.state, self.every = stepper.state, every
+        self.names = tuple(names)
         self.domain = domain = self.state.loading.domain
         needed = {*self.names, *(OF_CHAINS if "chains" in self.names else ())}
         self._element_fields = ElementFields(
@@ -193,23 +200,24 @@ class Fields(Watcher, ClosedAtEnd):
                 _continued(folder / CHAIN_LINES, after) if "chains" in self.names else None
             )
             self._mesh = points, elements
-            # a chain reaches half of the smallest mean distance between elements, so that pictures stay readable
+            # a chain is at most half of the smallest mean distance between elements, so that
+            # pictures stay readable
             self._scale = 0.4 * quadrature.extent
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:
-        """Write the start."""
+        """Write the fields at the start."""
         self.append(step.time)
         self.close()
 
     def solved(self, step: Step) -> None:
-        """Note the solved state, if it is its turn."""
+        """Store the fields of the solved state, if this step is to be written."""
         asked = any(math.isclose(time, step.time) for time in self.times)
         is_due = step.number % self.every == 0 or step.is_last or asked
         self._solved = self._gathered() if is_due else None
 
     def committed(self, step: Step) -> None:
-        """Write what was noted."""
+        """Write the stored fields."""
         if self._solved is not None:
             self._write(step.time, self._solved)
 
@@ -219,13 +227,13 @@ class Fields(Watcher, ClosedAtEnd):
         self._write(time, self._gathered())
 
     def _gathered(self) -> dict[str, Array]:
-        """The fields of the present state on rank 0, nothing on others. Collective."""
+        """Gather the fields of the present state on rank 0; empty on other ranks. Collective."""
         local = {
             name: self.domain.gather_elements(values)
             for name, values in self._element_fields().items()
         }
-        found = local | {"displacement": self.state.gathered_displacement()}
-        return {name: values for name, values in found.items() if values is not None}
+        fields = local | {"displacement": self.state.gathered_displacement()}
+        return {name: values for name, values in fields.items() if values is not None}
 
     def _write(self, time: float, fields: dict[str, Array]) -> None:
         if self._grid is None:
@@ -242,7 +250,7 @@ class Fields(Watcher, ClosedAtEnd):
             self._chains = append_chains(grid, time, *self._mesh, self._scale, displacement, fields)
 
     def close(self) -> None:
-        """Let readers see all that is written so far, and a run go on with it that is killed from here on."""
+        """Publish all steps so far, for readers and for a resumed run after a kill."""
         for grid in (self._grid, self._chains):
             if grid is not None:
                 grid.close()
@@ -251,12 +259,11 @@ class Fields(Watcher, ClosedAtEnd):
 
 
 def _continued(path: Path, after: float | None) -> TransientGrid | None:
-    """The file without the steps after this time, if a run goes on and has it."""
+    """Open the file of a resumed run without the steps after this time, if it exists."""
     if after is None:
         return None
     if not path.exists():
         log.warning("%s is missing: a new one begins with the next step", path.name)
         return None
-    return TransientGrid.continued(
-        path, after * (1 + 1e-9)
-    )  # as far as `math.isclose` takes times as the same
+    # `math.isclose` takes times within this tolerance as the same
+    return TransientGrid.continued(path, after * (1 + 1e-9))

@@ -1,4 +1,4 @@
-"""Reading back what a run has recorded. It needs h5py and numpy, no dolfinx: results are read on any machine."""
+"""Readers of recorded runs, which need h5py and numpy but no dolfinx."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
 
-# ---------------------------------------------------------------- what pictures of bodies have in common
-# What pictures of bodies have in common, figures and reports alike: colours of angles, how chains are drawn.
+# ---------------------------------------------------------------- style of pictures of bodies
+# Style of figures and reports: colours of angles and dimensions of drawn chains.
 
 LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
-# matplotlib's RdYlBu in LEVELS equal steps: red along the first direction (0 degrees), blue across it (90)
+# matplotlib's RdYlBu in LEVELS equal steps: red along the first direction (0 degrees), blue across
+# it (90)
 ANGLE_COLOURS = tuple(
     "#a50026 #c21c27 #dc3b2c #ed5f3c #f7844e #fcaa5f #fec87a #fee496 #fff6b1 #f6fbd0 "
     "#e4f4f1 #c7e7f1 #a8d6e8 #87bdd9 #69a0ca #4d7fb9 #3d5ba7 #313695".split()
@@ -47,19 +48,18 @@ ANGLE_COLOURS = tuple(
 CHAIN_LOOK: dict[str, Any] = {  # as the page takes it
     "colour": (0.08, 0.08, 0.10),
     "reach": 0.39,  # half a chain's length over the shorter side of its face, both undeformed
-    "room": 0.78,  # how far a chain goes at most, over the way from the middle to the edge of its face
+    "room": 0.78,  # maximum length of a chain, over the distance from its face's middle to its edge
     "width": 0.06,  # over the shorter side
-    "lift": 0.2,  # towards the eye, over the same: faces need not be plane
+    "lift": 0.2,  # towards the eye, over the shorter side: faces need not be plane
 }
-AMBIENT = 0.8  # share of a colour that does not depend on where its face looks: it must mean the same everywhere
-VIEWS = {
-    "front": (0.3, -1.0, 0.42),
-    "above": (0.0, -0.02, 1.0),
-}  # where the eye is, from the middle of the body
+# fraction of a colour that does not depend on the normal of its face: a colour must mean the same
+# everywhere
+AMBIENT = 0.8
+# position of the eye, from the middle of the body
+VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}
 
 
-# ---------------------------------------------------------------- which of the recorded times are shown
-# Which of the recorded times are shown where all would be too many.
+# ---------------------------------------------------------------- times to show
 
 Numbers = NDArray[np.float64]
 
@@ -71,20 +71,15 @@ def kept_times(times: Numbers, most: int) -> Numbers:
 
 Array = NDArray[np.float64]
 
-HISTORY, FIELDS, CHAIN_LINES, SCENE = (
-    "history.csv",
-    "fields.vtkhdf",
-    "fields_chains.vtkhdf",
-    "scene.toml",
-)
+HISTORY, SCENE = "history.csv", "scene.toml"
+FIELDS, CHAIN_LINES = "fields.vtkhdf", "fields_chains.vtkhdf"
 LOG = "run.log"
-LARGEST_HISTORY = (
-    10**9
-)  # bytes: the million steps that a scene may have, of a thousand characters each
+# bytes: the million steps that a scene may have, of a thousand characters each
+LARGEST_HISTORY = 10**9
 
 
 class RecordingError(RemodelError, ValueError):
-    """A folder is no recorded run, is damaged, or does not hold what was asked for; one line says which.
+    """A folder is no recorded run, is corrupt, or lacks requested data; the message has one line.
 
     Examples
     --------
@@ -113,12 +108,12 @@ class HistoryColumns(dict[str, Array]):
 class RecordedRun:
     """The folder of a run, finished or under way.
 
-    Everything is read when it is first asked for, and once: a new object sees what has been added since.
+    Data are read on first access and cached: create a new object to read later rows.
 
     Parameters
     ----------
     folder
-        What `remodel-fenicsx run -o` was given.
+        Folder of a run, as for `remodel-fenicsx run -o`.
 
     Attributes
     ----------
@@ -128,7 +123,7 @@ class RecordedRun:
     Raises
     ------
     RecordingError
-        If it is no folder of a run.
+        If the folder is not that of a run.
     """
 
     def __init__(self, folder: str | os.PathLike[str]):
@@ -152,13 +147,13 @@ class RecordedRun:
         Raises
         ------
         RecordingError
-            If scene.toml is damaged.
+            If scene.toml is corrupt.
         """
         return scene_as_run(self.path)
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """Versions of package and libraries, and sums of extensions, that the run wrote on top of its scene."""
+        """Versions of package and libraries, and hashes of extensions, from scene.toml."""
         return versions_as_run(self.path)
 
     # ------------------------------------------------------------ history
@@ -169,7 +164,7 @@ class RecordedRun:
         Raises
         ------
         RecordingError
-            If history.csv is damaged.
+            If history.csv is corrupt.
         """
         return read_history(self.path)
 
@@ -195,7 +190,7 @@ class RecordedRun:
         Raises
         ------
         RecordingError
-            If fields.vtkhdf is damaged.
+            If fields.vtkhdf is corrupt.
         """
         if not (self.path / FIELDS).exists():
             return np.zeros(0)
@@ -210,7 +205,7 @@ class RecordedRun:
         Raises
         ------
         RecordingError
-            If the run wrote no fields, or fields.vtkhdf is damaged.
+            If the run wrote no fields, or fields.vtkhdf is corrupt.
         """
         with self._fields_file() as root:
             return _block(root["Points"], 0, int(root["NumberOfPoints"][0]))
@@ -222,7 +217,7 @@ class RecordedRun:
         Raises
         ------
         RecordingError
-            If the run wrote no fields, or fields.vtkhdf is damaged.
+            If the run wrote no fields, or fields.vtkhdf is corrupt.
         """
         with self._fields_file() as root:
             count = int(root["NumberOfCells"][0])
@@ -232,40 +227,41 @@ class RecordedRun:
             return numbers
 
     def fields(self, time: float, names: Collection[str] | None = None) -> dict[str, Array]:
-        """The fields at a recorded time by name: at nodes, (nodes, ...), and means over elements, (elements, ...).
+        """Read the fields at a recorded time by name.
 
-        `displacement` belongs to the nodes; docs/commands.md lists the others. Values have 7 digits.
+        Fields at nodes are (nodes, ...), means over elements are (elements, ...). `displacement`
+        belongs to the nodes; docs/commands.md lists the other fields. Values have 7 digits.
 
         Parameters
         ----------
         time
-            As recorded.
+            Time as recorded.
         names
-            Read no others than these; those that were not recorded are not there.
+            Names of the fields to read; fields that were not recorded are omitted.
 
         Raises
         ------
         RecordingError
-            If no fields are recorded at this time, or fields.vtkhdf is damaged.
+            If no fields are recorded at this time, or fields.vtkhdf is corrupt.
         """
         number = self._number_of(time, self.times, "fields")
-        found: dict[str, Array] = {}
+        fields: dict[str, Array] = {}
         with self._fields_file() as root:
             for kind, unit in (("PointData", "NumberOfPoints"), ("CellData", "NumberOfCells")):
                 for name in (name for name in root[kind] if names is None or name in names):
                     values = root[kind][name]
                     start = int(root["Steps"][f"{kind}Offsets"][name][number])
-                    found[name] = _block(values, start, int(root[unit][0]))
-        return found
+                    fields[name] = _block(values, start, int(root[unit][0]))
+        return fields
 
     def _number_of(self, time: float, times: Array, what: str) -> int:
-        """Which of the times this one is."""
-        found = [number for number, recorded in enumerate(times) if math.isclose(recorded, time)]
-        if not found:
+        """Return the index of a recorded time."""
+        numbers = [number for number, recorded in enumerate(times) if math.isclose(recorded, time)]
+        if not numbers:
             raise RecordingError(
                 f"{self.path}: no {what} at time {time:g}; recorded are {_in_words(times)}"
             )
-        return found[0]
+        return numbers[0]
 
     @contextmanager
     def _fields_file(self) -> Iterator[h5py.Group]:
@@ -278,7 +274,7 @@ class RecordedRun:
 
 @contextmanager
 def series_file(path: Path, remedy: str = "") -> Iterator[h5py.Group]:
-    """A file of fields; HDF5's errors say in one line that it is damaged, those of the disk stay."""
+    """Open a file of fields; HDF5's errors become a `RecordingError`, errors of the disk stay."""
     import h5py  # late: a run without fields needs none
 
     try:
@@ -286,13 +282,12 @@ def series_file(path: Path, remedy: str = "") -> Iterator[h5py.Group]:
         with h5py.File(path, "r") as file:
             yield file["VTKHDF"]
     except (KeyError, ValueError, TypeError, IndexError, RuntimeError, OSError) as error:
-        if (
-            isinstance(error, OSError) and error.errno is not None
-        ):  # the disk's have a number, HDF5's none
+        # errors of the disk have a number, HDF5's have none
+        if isinstance(error, OSError) and error.errno is not None:
             raise
-        # h5py's own words can be several lines
+        # h5py's message can have several lines
         words = f"{' '.join(str(error).split())}{remedy}"
-        raise RecordingError(f"{path}: is damaged or of another kind: {words}") from error
+        raise RecordingError(f"{path}: is corrupt or of another kind: {words}") from error
 
 
 def scene_as_run(folder: Path) -> Scene:
@@ -308,7 +303,7 @@ def scene_as_run(folder: Path) -> Scene:
 
 
 def versions_as_run(folder: Path) -> dict[str, str]:
-    """What stands on top of the scene of a run's folder, by name."""
+    """Return the versions at the head of scene.toml in a run's folder, by name."""
     path = folder / SCENE
     text = read_regular(path, LARGEST_HISTORY).decode(errors="replace") if path.is_file() else ""
     lines = takewhile(lambda line: line.startswith("#"), text.splitlines()[1:])
@@ -316,7 +311,7 @@ def versions_as_run(folder: Path) -> dict[str, str]:
 
 
 def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
-    """The columns of a folder's history.csv by name, arrays over its rows; before the first step only `time`, empty."""
+    """Read the columns of history.csv by name; before the first step, an empty `time`."""
     path = Path(folder) / HISTORY
     try:
         return _columns(read_regular(path, LARGEST_HISTORY).decode())
@@ -327,7 +322,7 @@ def read_history(folder: str | os.PathLike[str]) -> HistoryColumns:
 
 
 def _columns(text: str) -> HistoryColumns:
-    """Those of a history's text, or ValueError."""
+    """Read the columns of a history's text. Raise ValueError if it is not valid."""
     if not text:
         return HistoryColumns(time=np.zeros(0))
     if not text.endswith("\n"):
@@ -356,7 +351,7 @@ def _block(dataset: h5py.Dataset, start: int, length: int) -> Array:
     return values
 
 
-# ---------------------------------------------------------------- columns, numbers and units as people read them
+# ---------------------------------------------------------------- labels, numbers and units
 
 WORDS = {
     "max_chain_extension": "largest r/L",
@@ -366,20 +361,20 @@ WORDS = {
 
 
 def words(name: str) -> str:
-    """A column's name."""
+    """Return a column's label for people."""
     known = next((known for known in WORDS if f"{name}_".startswith(f"{known}_")), "")
     return WORDS.get(known, "") + name.removeprefix(known).replace("_", " ")
 
 
 def number(value: float) -> str:
-    """Three digits, all of them: 3.40 beside 2.45."""
+    """Format a number with three digits, all of them: 3.40 next to 2.45."""
     if value == 0:
         return "0"
     return f"{value:#.3g}".rstrip(".") if 1e-3 <= abs(value) < 1e5 else f"{value:.2e}"
 
 
 def with_unit(value: float, unit: str) -> str:
-    """A number and its unit."""
+    """Format a number with its unit."""
     return number(value) + (unit if unit == "°" else f" {unit}" if unit else "")
 
 
@@ -393,7 +388,7 @@ FORCES = {
 
 
 def unit_of(scene: Scene, dimension: str) -> str:
-    """The unit of a `Column` by what it measures, where the scene says what it is, else nothing."""
+    """Return the unit of a `Column` by its dimension; empty if the scene does not specify it."""
     names = {
         "stress": scene.material.stress_unit,
         "length": scene.geometry.length_unit,
@@ -422,7 +417,7 @@ LOCK = "run.lock"
 
 
 class FolderTaken(RemodelError, ValueError):
-    """The folder asked for holds something already, or a run writes in it.
+    """The requested folder is not empty, or a run writes in it.
 
     Examples
     --------
@@ -434,12 +429,12 @@ class FolderTaken(RemodelError, ValueError):
     >>> parts.chosen_folder("taken", "cube", MPI.COMM_WORLD)
     Traceback (most recent call last):
         ...
-    remodel_fenicsx.results.recording.FolderTaken: folder taken: is not empty; allowed is a new or an empty folder
+    remodel_fenicsx.results.recording.FolderTaken: folder taken: is not empty; must be new or empty
     """
 
 
 class RunLock(ClosedAtEnd):
-    """This process writes alone in a folder, as long as it lives: the system gives back a lock of a killed process."""
+    """Exclusive right to write in a folder; the system releases the lock of a killed process."""
 
     def __init__(self, folder: Path, ranks: int = 1):
         self._path = folder / LOCK
@@ -465,13 +460,13 @@ class RunLock(ClosedAtEnd):
         )
 
     def close(self) -> None:
-        """Let others in."""
+        """Release the lock and remove its file."""
         self._path.unlink(missing_ok=True)
         os.close(self._descriptor)
 
 
 def lock_holder(folder: Path) -> tuple[str | None, bool]:
-    """The process that writes in a folder, or wrote in it when it was killed, in words; and whether it lives."""
+    """Return text on the process that holds, or held, a folder's lock, and whether it lives."""
     try:
         descriptor = open_own(folder / LOCK, os.O_RDONLY)
     except FileNotFoundError:
@@ -487,6 +482,6 @@ def lock_holder(folder: Path) -> tuple[str | None, bool]:
 
 
 def is_unused(folder: Path) -> bool:
-    """Whether a folder is empty, or holds only what a process leaves that is killed before its scene has its name."""
+    """Return whether a folder is empty, except for files of a process killed before its scene."""
     left = {LOCK, partial_path(Path(SCENE)).name}
     return {entry.name for entry in folder.iterdir()} <= left and not lock_holder(folder)[1]

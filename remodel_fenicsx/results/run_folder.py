@@ -1,4 +1,4 @@
-"""What a run leaves in its folder: history.csv (a row for each accepted step) and the scene as run. Rank 0 writes."""
+"""The folder of a run: history.csv (a row for each accepted step) and the scene. Rank 0 writes."""
 
 from __future__ import annotations
 
@@ -35,14 +35,12 @@ from remodel_fenicsx.system.files import ClosedAtEnd, numbered, open_own, read_r
 
 
 def choose_folder(requested: Path | None, name: str) -> Path:
-    """The folder of a run: the one asked for, which must be new or empty, or the first free results/NAME."""
+    """Return the requested folder, which must be new or empty, or the first free results/NAME."""
     if requested is not None:
         if requested.exists() and not requested.is_dir():
-            raise FolderTaken(f"folder {requested}: is a file; allowed is a new or an empty folder")
+            raise FolderTaken(f"folder {requested}: is a file; must be a new or an empty folder")
         if requested.is_dir() and not is_unused(requested):
-            raise FolderTaken(
-                f"folder {requested}: is not empty; allowed is a new or an empty folder"
-            )
+            raise FolderTaken(f"folder {requested}: is not empty; must be new or empty")
         return requested
     Path("results").mkdir(exist_ok=True)
     for folder in numbered(Path("results") / name):
@@ -53,28 +51,28 @@ def choose_folder(requested: Path | None, name: str) -> Path:
 
 
 def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) -> Path:
-    """The folder for a run's results: what is decided on rank 0 holds on all ranks. Collective.
+    """Choose the folder for a run's results on rank 0, for all ranks. Collective.
 
     Parameters
     ----------
     requested
-        A new or empty folder; None: results/NAME, with a number where that is taken.
+        A new or empty folder; None: results/NAME, with a number if that is taken.
     name
-        Of the run.
+        Name of the run.
     comm
         MPI communicator.
 
     Returns
     -------
     Path
-        The folder; it is not made yet.
+        The folder, which is not created yet.
 
     Raises
     ------
     FolderTaken
-        If the folder asked for is not empty; on all ranks.
+        If the requested folder is not empty; on all ranks.
     OSError
-        If it cannot be looked at; on rank 0.
+        If the folder cannot be read; on rank 0.
 
     Examples
     --------
@@ -92,7 +90,7 @@ def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) 
 
 @contextmanager
 def locked(folder: Path, comm: MPI.Intracomm, new: bool) -> Iterator[None]:
-    """Within, this run alone writes in the folder. Collective."""
+    """Lock the folder for this run while the block runs. Collective."""
     lock = raise_on_all_ranks(
         comm, lambda: _lock(folder, comm.size, new) if comm.rank == 0 else nullcontext()
     )
@@ -106,12 +104,12 @@ def _lock(folder: Path, ranks: int, new: bool) -> RunLock:
     lock = RunLock(folder, ranks)
     if new and (folder / SCENE).exists():
         lock.close()
-        raise FolderTaken(f"folder {folder}: is not empty; allowed is a new or an empty folder")
+        raise FolderTaken(f"folder {folder}: is not empty; must be new or empty")
     return lock
 
 
 def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) -> None:
-    """Look at all that a run goes on with, before anything is changed."""
+    """Check all files that a resumed run continues, before any change."""
     for name in (LOG, HISTORY):
         with suppress(FileNotFoundError):
             os.close(open_own(folder / name, os.O_RDONLY))
@@ -119,7 +117,8 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
         return
     if not (folder / HISTORY).exists():
         raise RecordingError(
-            f"{folder}: has a checkpoint, but no {HISTORY}: rows that are gone are not computed again"
+            f"{folder}: has a checkpoint, but no {HISTORY}: "
+            "rows that are gone are not computed again"
         )
     size_of_rows(folder / HISTORY, after)
     for name in (FIELDS, CHAIN_LINES) if fields else ():
@@ -128,7 +127,7 @@ def check_before_resuming(folder: Path, after: LastStep | None, fields: bool) ->
 
 
 def remove_partial_results(folder: Path) -> None:
-    """Take away what a run has kept that was killed before its first checkpoint: it starts again."""
+    """Remove the results of a run that was killed before its first checkpoint: it starts again."""
     for name in (HISTORY, FIELDS, CHAIN_LINES):
         (folder / name).unlink(missing_ok=True)
 
@@ -136,11 +135,11 @@ def remove_partial_results(folder: Path) -> None:
 # ---------------------------------------------------------------- history.csv
 # Whole rows only, whatever happens.
 
-FLUSHED_AFTER = 0.5  # seconds: rows that come faster are brought to the disk together
+FLUSHED_AFTER = 0.5  # seconds: rows that come faster are flushed to the disk together
 
 
 class LastStep(NamedTuple):
-    """Where a run goes on: columns of its history, number and time of the last step that was done."""
+    """Last completed step of a resumed run: columns of its history, number and time."""
 
     columns: Sequence[str]
     number: int
@@ -157,9 +156,8 @@ class History:
         self._columns = (
             None if after is None else next(csv.reader([self._file.readline().decode()]))
         )
-        self._sizes = [
-            size
-        ]  # bytes up to the end of the last whole row, and before of the one before it
+        # bytes up to the end of the last complete row, and before it of the previous row
+        self._sizes = [size]
         self._flushed_at = -math.inf
         self._cut()
 
@@ -174,7 +172,7 @@ class History:
         self._columns = list(writer.fieldnames)
 
     def _write(self, data: bytes) -> None:
-        """All of it or nothing: a number that was cut short would read as another number."""
+        """Write all of the data or none: a truncated number would read as another number."""
         view = memoryview(data)
         try:
             while view:
@@ -187,7 +185,7 @@ class History:
         self._sizes = [self._sizes[-1], self._sizes[-1] + len(data)]
 
     def flush(self) -> None:
-        """Bring all rows to the disk."""
+        """Flush all rows to the disk."""
         os.fsync(self._file.fileno())
         if os.fstat(self._file.fileno()).st_nlink == 0:
             lost = "the rows of this run, and what else was in its folder"
@@ -197,7 +195,7 @@ class History:
         self._flushed_at = clock.monotonic()
 
     def drop_last(self) -> None:
-        """Take the last row back; only once after each row."""
+        """Remove the last row; only once after each row."""
         self._sizes.pop()
         self._cut()
 
@@ -206,7 +204,7 @@ class History:
         self._file.seek(self._sizes[-1])
 
     def close(self) -> None:
-        """Flush and close the file; more than once does no harm."""
+        """Flush and close the file, unless it is closed."""
         if not self._file.closed:
             try:
                 self.flush()
@@ -215,21 +213,21 @@ class History:
 
 
 def size_of_rows(path: Path, after: LastStep) -> int:
-    """Bytes of a history's head and of its rows up to a step."""
+    """Return the bytes of a history's head and of its rows up to a step."""
     rows = after.number + 1
     lines = read_regular(path, LARGEST_HISTORY).splitlines(keepends=True)[: rows + 1]
     try:
         texts = [line.decode("utf-8") for line in lines]
-        found, *read = csv.reader(texts)
+        columns, *read = csv.reader(texts)
         whole = len(read) == rows and texts[-1].endswith("\n")
-        right = whole and math.isclose(float(read[-1][found.index("time")]), after.time)
+        right = whole and math.isclose(float(read[-1][columns.index("time")]), after.time)
     except (ValueError, IndexError, csv.Error):
         right = False
     if not right:
         raise RecordingError(
             f"{path}: lacks rows: the checkpoint belongs to {rows} rows up to time {after.time:g}"
         )
-    if found != list(after.columns):
+    if columns != list(after.columns):
         raise RecordingError(
             f"{path}: has other columns than this run; output.columns must stay as it was"
         )
@@ -237,7 +235,7 @@ def size_of_rows(path: Path, after: LastStep) -> int:
 
 
 def _number(value: float) -> str:
-    """Shortest text that reads back as the same number; none for what was not computed."""
+    """Format a number as the shortest text that reads back the same; NaN is empty."""
     if math.isnan(value):
         return ""
     return str(value) if isinstance(value, int) else repr(float(value))
@@ -252,24 +250,24 @@ class RunFolder(Watcher, ClosedAtEnd):
     Parameters
     ----------
     folder
-        Must not hold a run; it is made with its parents.
+        Folder without a run; it is created with its parents.
     scene_text
         The scene as run, written to scene.toml.
     rank
         Rank in the communicator: all but rank 0 write nothing.
     after
-        Where a run goes on: the history is cut there.
+        Last completed step of a resumed run: the history is cut after it.
     files
-        Contents of further files by name, which the scene needs.
+        Contents of further files that the scene needs, by name.
 
     Raises
     ------
     FileExistsError
-        If a new run finds another one's history.
+        If the run is new and a history exists.
     OSError
-        If the folder cannot be made or written.
+        If the folder cannot be created or written.
     RecordingError
-        If the history does not hold the steps that were done; nothing has changed then.
+        If the history lacks completed steps; nothing has changed then.
 
     Examples
     --------
@@ -296,7 +294,7 @@ class RunFolder(Watcher, ClosedAtEnd):
         self._last_row = -1  # number of its step
         if rank == 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            if after is not None:  # what is refused leaves the scene as it is
+            if after is not None:  # a refusal leaves the scene as it is
                 self.history = History(self.folder / HISTORY, after)
             for name, data in files.items():
                 write_whole(self.folder / name, data)
@@ -314,17 +312,17 @@ class RunFolder(Watcher, ClosedAtEnd):
             self._last_row = step.number
 
     def undone(self, step: Step) -> None:
-        """Take its row back, if it was written."""
+        """Remove the step's row, if it was written."""
         if self.history is not None and self._last_row == step.number:
             self.history.drop_last()
             self._last_row = -1
 
     def flush(self) -> None:
-        """Bring the rows to the disk."""
+        """Flush the rows to the disk."""
         if self.history is not None:
             self.history.flush()
 
     def close(self) -> None:
-        """Close the history."""
+        """Flush and close the history."""
         if self.history is not None:
             self.history.close()

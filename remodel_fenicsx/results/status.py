@@ -1,4 +1,4 @@
-"""Where a run is, from its folder alone: what `remodel-fenicsx status DIR` says. It needs no dolfinx."""
+"""The state of a run from its folder, for `remodel-fenicsx status DIR`, without dolfinx."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ from remodel_fenicsx.system.files import read_regular, command_name
 from remodel_fenicsx.system.terminal import duration
 
 RECENT = 20  # steps whose mean is the rate
-BEGUN, FAILED, STOPPED = (
-    "scene ",
-    "failed: ",
-    "ended: ",
-)  # how lines of run.log on a run's beginning and end begin
+# beginnings of the lines of run.log on a run's start and end
+BEGUN = "scene "
+FAILED, STOPPED = "failed: ", "ended: "
 _LOG_ENTRY = re.compile(
     r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*?)\n?(?=^\d{4}-\d\d-|\Z)", re.M | re.S
 )
 
 
 def status(folder: Path) -> list[str]:
-    """Lines for people: where the run is, whether it is alive, its rate, its checkpoint; or what a study's runs do."""
+    """Return lines for people on a run, or on the runs of a study.
+
+    A run's lines have its step, whether its process lives, its rate and its checkpoint.
+    """
     if runs := (
         []
         if (folder / SCENE).exists()
@@ -46,7 +47,7 @@ def status(folder: Path) -> list[str]:
         return _of_study(folder, runs)
     holder, lives = lock_holder(folder)
     if not lives or (folder / HISTORY).exists():
-        recording = RecordedRun(folder)  # what is no run's folder is refused
+        recording = RecordedRun(folder)  # rejects a folder without a run
     else:
         return [f"{folder}: starting, {holder or 'a process'} is at work"]
     scene, history = recording.scene, recording.history
@@ -61,12 +62,12 @@ def status(folder: Path) -> list[str]:
     rate = float(np.mean(seconds)) if len(seconds) else 0.0
     if lives:
         age = clock.time() - os.stat(folder / HISTORY).st_mtime
-        per_step = (
-            number / behind if behind else 1.0
-        )  # those of a tolerance are longer or shorter than the first
+        # adaptive steps are longer or shorter than the first
+        per_step = number / behind if behind else 1.0
         left = f", {duration(rate * per_step * (steps - behind))} left" if rate else ""
         lines.append(
-            f"running: {holder or 'a process'}{left}; the last step was done {duration(max(0.0, age))} ago"
+            f"running: {holder or 'a process'}{left}; "
+            f"the last step was done {duration(max(0.0, age))} ago"
         )
     elif state == "finished":
         lines.append(state)
@@ -74,9 +75,8 @@ def status(folder: Path) -> list[str]:
         if state == "failed":
             lines.append(f"{FAILED}{reason}")
         when = f"{datetime.fromtimestamp(os.stat(folder / HISTORY).st_mtime):%Y-%m-%d %H:%M:%S}"
-        lines.append(
-            f"not running, the last step was done at {when}{f'; {holder} was killed' if holder else ''}"
-        )
+        killed = f"; {holder} was killed" if holder else ""
+        lines.append(f"not running, the last step was done at {when}{killed}")
         if state == "stopped" and reason:  # a signal, or the whole sentence of a stop on purpose
             lines[-1] += f"; {reason if reason.startswith('stopped') else f'stopped by {reason}'}"
     if rate:
@@ -86,13 +86,13 @@ def status(folder: Path) -> list[str]:
     lines.append(
         kept
         if lives or state == "finished"
-        else f"{kept}; it goes on with: {command_name()} run --resume {folder}"
+        else f"{kept}; resume it with: {command_name()} run --resume {folder}"
     )
     return lines
 
 
 def log_entries(folder: Path) -> list[tuple[str, str, str]]:
-    """Stamp, level and text of each entry of run.log, which may have several lines."""
+    """Return stamp, level and text of each entry of run.log; a text may have several lines."""
     text = (
         read_regular(folder / LOG, LARGEST_HISTORY).decode(errors="replace")
         if (folder / LOG).exists()
@@ -102,7 +102,7 @@ def log_entries(folder: Path) -> list[tuple[str, str, str]]:
 
 
 def state_of(recording: RecordedRun) -> tuple[str, str]:
-    """Whether a run has "finished", "failed", "stopped" or is "running", and what run.log says of why."""
+    """Return "finished", "failed", "stopped" or "running", and the reason in run.log."""
     times = recording.history["time"]
     if len(times) and math.isclose(float(times[-1]), recording.scene.last_time):
         return "finished", ""
@@ -111,7 +111,7 @@ def state_of(recording: RecordedRun) -> tuple[str, str]:
 
 
 def _outcome_from_log(folder: Path) -> tuple[str, str]:
-    """What run.log says since the run last began: "failed" or "stopped", and why; no reason where it was killed."""
+    """Return "failed" or "stopped" and the reason from run.log; no reason if the run was killed."""
     said = [text.partition("\n")[0] for _, _, text in log_entries(folder)]
     last = next(
         (text for text in reversed(said) if text.startswith((BEGUN, FAILED, STOPPED))), BEGUN
@@ -122,7 +122,7 @@ def _outcome_from_log(folder: Path) -> tuple[str, str]:
 
 
 def _of_study(folder: Path, runs: list[Path]) -> list[str]:
-    """How many of its runs are where, and which have failed and why."""
+    """Return lines that count a study's runs by state and give the reasons of failed runs."""
     states = {run.name: _state(run) for run in runs}
     counted = Counter(state for state, _ in states.values())
     lines = [
@@ -134,7 +134,7 @@ def _of_study(folder: Path, runs: list[Path]) -> list[str]:
 
 
 def _state(folder: Path) -> tuple[str, str]:
-    """Of a run of a study in a word; and why it has failed."""
+    """Return the state of a study's run, and the reason if it has failed."""
     if lock_holder(folder)[1]:
         return "running", ""
     try:

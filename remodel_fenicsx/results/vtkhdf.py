@@ -1,8 +1,9 @@
-"""Fields on an unstructured grid over time in one VTKHDF file, which ParaView (from 5.12) and PyVista open as a series.
+"""Time series on an unstructured grid in one VTKHDF file, for ParaView (from 5.12) and PyVista.
 
-The format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format, version 2.2, type UnstructuredGrid, one
-partition. The mesh is written once; each step appends its point and cell data, and its points if they move. Serial: in
-a parallel run rank 0 writes arrays that were gathered in the mesh file's order.
+The format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format, version 2.2, type
+UnstructuredGrid, one partition. The mesh is written once; each step appends its point and cell
+data, and its points if they move. Serial: in a parallel run rank 0 writes arrays that were gathered
+in the mesh file's order.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ LINE = 3
 _STEPS_PER_CHUNK = 256
 _OF_TOPOLOGY = ("Steps/CellOffsets", "Steps/ConnectivityIdOffsets")
 _ALWAYS_0 = ("Steps/PartOffsets", *_OF_TOPOLOGY)  # of each step
-# of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not compressed: noisy
-# floats become smaller by a fifth only, and a step would take twice as long
+# of the mesh, which is written once; shuffle and deflate are built into every HDF5. Fields are not
+# compressed: noisy floats become smaller by a fifth only, and a step would take twice as long
 _COMPRESSION: dict[str, object] = {
     "compression": "gzip",
     "compression_opts": 1,
@@ -54,7 +55,7 @@ _COMPRESSION: dict[str, object] = {
 
 
 class DeferredErrorFile(io.FileIO):
-    """The file below h5py. A write that fails is said when HDF5 has returned, which would crash the process."""
+    """File below h5py that defers errors until HDF5 has returned: HDF5 would crash the process."""
 
     fault: OSError | None = None
 
@@ -75,13 +76,13 @@ class DeferredErrorFile(io.FileIO):
             return self.tell()
 
     def check(self) -> None:
-        """Raise what went wrong."""
+        """Raise the deferred error, if there is one."""
         if self.fault is not None:
             raise self.fault
 
 
 class TransientGrid(ClosedAtEnd):
-    """A time series on one grid, written beside its place: `close` gives it its name, whole."""
+    """A time series on one grid, written to a partial file; `close` gives it its name."""
 
     def __init__(
         self,
@@ -108,7 +109,7 @@ class TransientGrid(ClosedAtEnd):
 
     @classmethod
     def continued(cls, path: Path, time: float) -> TransientGrid:
-        """With the steps of a file up to `time`, to append more."""
+        """Open a copy of a file with its steps up to `time`, to append more."""
         grid = cls.__new__(cls)
         grid.path, grid._part = path, partial_path(path)
         grid._part.unlink(missing_ok=True)
@@ -132,7 +133,7 @@ class TransientGrid(ClosedAtEnd):
 
     @contextmanager
     def _written(self) -> Iterator[h5py.File]:
-        """Within, HDF5 writes; no signal comes between, whose handler might raise in `DeferredErrorFile.write`."""
+        """Hold back signals while HDF5 writes: a handler might raise in the file's `write`."""
         with held_back():
             yield self._file
             self._file.flush()
@@ -146,7 +147,7 @@ class TransientGrid(ClosedAtEnd):
         points: ArrayLike | None = None,
         constant: Fields | None = None,
     ) -> None:
-        """Add one step; points are given at every step or at none."""
+        """Append one step; pass points at every step or at none."""
         if self._disk.closed:
             self._reopen()
         step = self.number_of_steps
@@ -155,7 +156,7 @@ class TransientGrid(ClosedAtEnd):
             ("CellData", cell_data, step),
             ("CellData", constant, 0),
         )
-        # offsets that stay 0 say that the mesh is the one of the first step
+        # offsets that stay 0 mean that the mesh is the one of the first step
         numbers: dict[str, float] = dict.fromkeys(_ALWAYS_0, 0)
         numbers |= {"Steps/NumberOfParts": 1, "Steps/PointOffsets": 0, "Steps/Values": time}
         with self._written() as file:
@@ -180,14 +181,14 @@ class TransientGrid(ClosedAtEnd):
             self.number_of_steps = step + 1
 
     def __exit__(self, *error: object) -> None:
-        if error[0] is not None:  # not whole
+        if error[0] is not None:  # not complete
             with held_back():
                 self._file.close()
             self._disk.close()
         self.close()
 
     def close(self) -> None:
-        """Give the file its name, if it is whole; a next step goes on in a copy."""
+        """Give the file its name, if it is complete; a next step continues in a copy."""
         try:
             if not self._disk.closed:
                 with held_back():
@@ -195,7 +196,7 @@ class TransientGrid(ClosedAtEnd):
                 self._disk.check()
                 os.fsync(self._disk.fileno())
                 self._part.replace(self.path)
-        finally:  # what is not whole goes
+        finally:  # an incomplete file is removed
             self._disk.close()
             self._part.unlink(missing_ok=True)
 
@@ -226,12 +227,12 @@ def _begin(root: h5py.Group, points: Array, cells: Array, cell_type: int) -> Non
 
 
 def _offsets(field: str) -> str:
-    """Where the offsets of a field stand."""
+    """Return the name of the dataset with the offsets of a field."""
     return "Steps/" + field.replace("/", "Offsets/", 1)
 
 
 def _create(group: h5py.Group, name: str, dtype: DTypeLike, chunk: tuple[int, ...]) -> None:
-    """An empty dataset that grows by rows, with a check sum of every chunk."""
+    """Create an empty dataset that grows by rows, with a check sum of every chunk."""
     shape = (0, *chunk[1:]), dtype
     group.create_dataset(name, *shape, maxshape=(None, *chunk[1:]), chunks=chunk, fletcher32=True)
 
@@ -246,7 +247,7 @@ def _write(dataset: h5py.Dataset, number: int, block: ArrayLike) -> None:
 def vtk_cells(
     cell_name: str, degree: int, elements: NDArray[np.int64]
 ) -> tuple[int, NDArray[np.int64]]:
-    """VTK's cell type, and the elements with their nodes in VTK's order."""
+    """Return VTK's cell type, and the elements with their nodes in VTK's order."""
     # here and not above: whoever reads or writes lines alone need not wait for dolfinx
     from dolfinx import cpp
     from dolfinx.mesh import to_type
@@ -255,13 +256,13 @@ def vtk_cells(
     return CELL_TYPES[cell_name][degree > 1], elements[:, np.argsort(from_vtk)]
 
 
-# ---------------------------------------------------------------- files that somebody else may have made
+# ---------------------------------------------------------------- untrusted files
 
-WITHOUT_IT = "; the run goes on without this file"
+WITHOUT_IT = "; without this file the run can continue"
 
 
 def check_series(path: Path) -> None:
-    """Read all of a file of `TransientGrid`; what does not belong there is an error."""
+    """Read all of a file of `TransientGrid`. Raise an error for any invalid content."""
     with series_file(path, WITHOUT_IT) as root:
         number = int(root["Steps"].attrs["NSteps"])
         times = root["Steps/Values"][:number]

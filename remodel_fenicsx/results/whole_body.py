@@ -1,4 +1,4 @@
-"""The body of a run as it is shown: what is recorded, of reductions turned into the whole body. It needs no dolfinx."""
+"""The whole body of a recorded run, for reductions too, without dolfinx."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ MOST_LAYERS = 40  # of a mesh in layers; others are divided into FEW_LAYERS
 FEW_LAYERS = 8
 
 
-# ---------------------------------------------------------------- fields of a reduction, turned to their places
+# ---------------------------------------------------------------- rotated fields of a reduction
 
 DIRECTION_FIELDS = ("axis_c", "axis_a", "axis_r")
 TENSOR_FIELDS = ("deformation_gradient", "cauchy_stress")
 
 
 class RotatedFields:
-    """Which node and element of a reduction stands for each of a body's own, and its fields there."""
+    """Map from the nodes and elements of a whole body to those of its reduction, with fields."""
 
     def __init__(
         self, points: Array, elements: Numbers, own_points: Array, own_elements: Numbers, turn: Turn
@@ -49,38 +49,39 @@ class RotatedFields:
         self.owners = owner[self.nodes]
         self.centres = points[elements].mean(axis=1)
         self.element_turns = turn(self.centres)
-        # the mean of nodes that were turned back each by itself: chords of a coarse mesh lie inside of their circles
+        # each node is rotated back by itself before the mean: chords of a coarse mesh lie inside of
+        # their circles
         self.sources = spatial.cKDTree(own_points[own_elements].mean(axis=1)).query(
             back[elements].mean(axis=1)
         )[1]
 
     def __call__(self, fields: dict[str, Array]) -> tuple[Array | None, dict[str, Array]]:
-        """Displacement of the body's nodes, where it was recorded, and fields of its elements."""
-        found = {
+        """Return the displacement of the body's nodes, if recorded, and fields of its elements."""
+        rotated = {
             name: values[self.sources] for name, values in fields.items() if name != "displacement"
         }
-        for name in set(found) & {*AXIS_FIELDS, *DIRECTION_FIELDS}:
-            found[name] = np.einsum("nij,nj->ni", self.element_turns, found[name])
-        for name in set(found) & {*TENSOR_FIELDS, NATURAL_GRADIENT}:
-            tensors = found[name].reshape(-1, 3, 3)
+        for name in set(rotated) & {*AXIS_FIELDS, *DIRECTION_FIELDS}:
+            rotated[name] = np.einsum("nij,nj->ni", self.element_turns, rotated[name])
+        for name in set(rotated) & {*TENSOR_FIELDS, NATURAL_GRADIENT}:
+            tensors = rotated[name].reshape(-1, 3, 3)
             turned = self.element_turns @ tensors @ np.swapaxes(self.element_turns, 1, 2)
-            found[name] = turned.reshape(-1, 9)
+            rotated[name] = turned.reshape(-1, 9)
         if not {"displacement", "deformation_gradient"} <= set(fields):
-            return None, found
+            return None, rotated
         gradient = fields["deformation_gradient"].reshape(-1, 3, 3)[self.owners] - np.eye(3)
         moved = fields["displacement"][self.nodes] + np.einsum("nij,nj->ni", gradient, self.offsets)
-        return np.einsum("nij,nj->ni", self.turns, moved), found
+        return np.einsum("nij,nj->ni", self.turns, moved), rotated
 
 
-# ---------------------------------------------------------------- chains of unit cells as lines, and a file of them
+# ---------------------------------------------------------------- chains of unit cells as lines
 
 AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
-# fields that the lines are made of
+# fields that the lines need
 OF_CHAINS = ("cell_dimensions", *AXIS_FIELDS, "deformation_gradient", "fibre_angle")
 
 
 def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tuple[Array, Numbers]:
-    """The four chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 through each centre (paper, Fig. 2)."""
+    """Return the chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 (paper, Fig. 2)."""
     signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
     half = scale * signs @ (lengths[:, :, None] * axes)
     ends = centres[:, None, None, :] + np.stack([half, -half], axis=2)
@@ -90,7 +91,7 @@ def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tu
 def chain_displacement(
     points: Array, centres: Array, displacement: Array, deformation_gradient: Array
 ) -> Array:
-    """Displacement of the ends that `chain_lines` gives, shape (8 m, 3): u + (F - I)(X_end - X_centre)."""
+    """Compute the displacement of the chains' ends, (8 m, 3): u + (F - I)(X_end - X_centre)."""
     ends = points.reshape(-1, 8, 3) - centres[:, None, :]
     gradient = deformation_gradient - np.eye(3)
     return (displacement[:, None, :] + ends @ np.swapaxes(gradient, 1, 2)).reshape(-1, 3)
@@ -105,7 +106,7 @@ def append_chains(
     displacement: Array,
     fields: Mapping[str, Array],
 ) -> TransientGrid:
-    """Add a step to a file of chain lines; it is made at its first step, where `grid` is still its path."""
+    """Append a step to a file of chain lines; `grid` is the path of a new file at the first step."""
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     centres, middle = (values[elements].mean(axis=1) for values in (points, displacement))
     ends, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
@@ -123,7 +124,7 @@ def append_chains(
 
 
 class WholeBody:
-    """The body whose fields a run has recorded; RecordingError where there are none."""
+    """The body whose fields a run has recorded; RecordingError if there are none."""
 
     def __init__(self, recording: RecordedRun):
         if not has_a_body(recording):
@@ -150,29 +151,30 @@ class WholeBody:
         self.layer, self.depth = _layers(depth, self.elements)
 
     def notes(self, is_deformed: bool) -> list[str]:
-        """What is to be known of pictures of it."""
-        turned = f"Solved with the kinematics {self.recording.scene.model.kinematics!r}, shown as the whole body."
-        reference = "Displacements were not recorded: this is the reference body."
+        """Return notes for the captions of the body's pictures."""
+        model = self.recording.scene.model
+        turned = f"Solved with the kinematics {model.kinematics!r}, shown as the whole body."
+        reference = "Displacements were not recorded: this is the reference configuration."
         return [*([turned] if self.is_turned else []), *([] if is_deformed else [reference])]
 
     def fields(self, time: float, names: Collection[str] | None = None) -> Fields:
-        """Displacement of the points, where it was recorded, and fields of the elements, at a recorded time."""
+        """Read displacements of the points, if recorded, and fields of the elements at a time."""
         fields = self.recording.fields(time, names)
-        displacement, found = (
+        displacement, of_elements = (
             self._turned(fields) if self._turned else (fields.pop("displacement", None), fields)
         )
-        return None if displacement is None else displacement[self._used], found
+        return None if displacement is None else displacement[self._used], of_elements
 
 
 def has_a_body(recording: RecordedRun) -> bool:
-    """Whether a run recorded fields of a body that can be shown."""
+    """Return whether a run recorded fields of a body that can be shown."""
     scene = recording.scene
     reduction = scene.geometry.reductions.get(scene.model.kinematics)
     return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
 
 
 def _layers(depth: Array, elements: Numbers) -> tuple[Numbers, Array]:
-    """Number of each element's layer and the mean depth of each: those of the mesh, or equal parts of the way."""
+    """Return each element's layer and the layers' mean depths: of the mesh, or equal intervals."""
     nodes = np.bincount(
         elements.ravel(), weights=np.repeat(depth, elements.shape[1])
     ) / np.bincount(elements.ravel())
@@ -197,16 +199,17 @@ def revolve(folder: Path | str) -> list[Path]:
     name = recording.scene.model.kinematics
     if not KINEMATICS[name].reduced:
         raise RecordingError(
-            f"{recording.path}: its kinematics are {name!r}: the fields are those of the body already"
+            f"{recording.path}: its kinematics are {name!r}: "
+            "the fields are those of the body already"
         )
     paths = [recording.path / file for file in (BODY, BODY_CHAINS)]
     for path in paths:
         if path.exists():
-            raise RecordingError(f"{path}: is there already; nothing is overwritten")
+            raise RecordingError(f"{path}: already exists; nothing is overwritten")
     whole = WholeBody(recording)
     scale = 0.4 * float(np.prod(np.ptp(whole.points, axis=0)) / len(whole.elements)) ** (1 / 3)
     kind = CELL_TYPES["hexahedron" if whole.elements.shape[1] == 8 else "tetrahedron"][0]
-    with ExitStack() as stack:  # the body is closed last: where it is, all are
+    with ExitStack() as stack:  # the body is closed last: if it exists, all do
         grid = stack.enter_context(TransientGrid(paths[0], whole.points, whole.elements, kind))
         chains: TransientGrid | None = None
         for time in recording.times:

@@ -349,7 +349,7 @@ def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(
         copy = shutil.copy(folder / name, folder.with_name("copy.vtkhdf"))
         with h5py.File(copy, "r+") as file:
             file[f"VTKHDF/{place}"][2] = wrong
-        with pytest.raises(ValueError, match="is damaged"):
+        with pytest.raises(ValueError, match="is corrupt"):
             check_series(Path(copy))
     path = folder / name
     with h5py.File(path) as file:
@@ -359,11 +359,11 @@ def test_a_flipped_bit_in_fields_is_noticed_before_anything_changes(
     data[chunk.byte_offset + chunk.size // 2] ^= 1
     path.write_bytes(data)
     before = content(folder)
-    with pytest.raises(RecordingError, match=f"{name}: is damaged"):
+    with pytest.raises(RecordingError, match=f"{name}: is corrupt"):
         resume(folder, LONGER, SELF)
     assert content(folder) == before
     if name == "fields.vtkhdf":
-        with pytest.raises(RecordingError, match="is damaged"):
+        with pytest.raises(RecordingError, match="is corrupt"):
             for recorded in Recording(folder).times:
                 Recording(folder).fields(recorded)
 

@@ -227,10 +227,7 @@ def test_a_folder_with_files_is_never_touched(
 ) -> None:
     done, folder = on_ranks("taken", ranks)
     assert done.returncode == 2
-    assert (
-        done.stderr
-        == f"remodel-fenicsx: folder {folder}: is not empty; allowed is a new or an empty folder\n"
-    )
+    assert done.stderr == f"remodel-fenicsx: folder {folder}: is not empty; must be new or empty\n"
     assert [path.name for path in folder.iterdir()] == ["mine.txt"]
 
 

@@ -160,7 +160,7 @@ def test_the_generation_before_counts_where_the_newest_is_damaged(half: Path, wh
     assert_same(half, whole)
     log = (half / "run.log").read_text()
     assert "resumes from the checkpoint of time 5, step 5" in log
-    assert f"WARNING {path}: is damaged" in log
+    assert f"WARNING {path}: is corrupt" in log
 
 
 @pytest.mark.parametrize("missing", [(), ("history.csv",), ("fields.vtkhdf", "history.csv")])

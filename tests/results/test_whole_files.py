@@ -76,7 +76,7 @@ def test_revolve_of_damaged_fields_leaves_nothing(
     data[chunk.byte_offset + 8] ^= 1
     (folder / "fields.vtkhdf").write_bytes(data)
     before = sorted(path.name for path in folder.iterdir())
-    assert "fields.vtkhdf: is damaged" in refused("revolve", folder)
+    assert "fields.vtkhdf: is corrupt" in refused("revolve", folder)
     assert sorted(path.name for path in folder.iterdir()) == before
 
 
