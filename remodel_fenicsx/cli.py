@@ -74,7 +74,7 @@ TYPE_OF_METAVAR: dict[str, Callable[[str], object]] = {
     **dict.fromkeys(("DATA", "DIR", "FILE", "FOLDER", "SCENE"), Path),
     **{"K": int, "LENGTH": float, "N": positive, "SEED": int, "T": float, "TIME": wall_time},
 }
-# what a mark behind a value means: required, may be left out, one or more, may be given several times
+# marks behind values: required, optional, one or more, may be repeated
 MARKS: dict[str, dict[str, Any]] = {
     "": {},
     "!": {"required": True},
@@ -123,24 +123,24 @@ def parser() -> argparse.ArgumentParser:
     """Make the parser of all commands."""
     raw = argparse.RawDescriptionHelpFormatter
     text = "Predict how collagen in living tissue reorients under load (Kuhl & Holzapfel 2007)."
-    found = _Parser(
+    root = _Parser(
         prog="remodel-fenicsx", description=text, epilog=MAIN_EPILOG, formatter_class=raw
     )
-    _add(found, WITH)
-    found.add_argument(
+    _add(root, WITH)
+    root.add_argument(
         "--version", action="version", version=__version__, help="Print the version and exit."
     )
-    commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = root.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, each in COMMANDS.items():
         text, epilog = each.function.__doc__ or "", f"example:\n  remodel-fenicsx {each.example}"
         about: dict[str, Any] = {"description": text, "epilog": epilog, "formatter_class": raw}
         if text:  # Commands without help text are for the processes of a study.
             about["help"] = text.replace("%", "%%")
         _add(commands.add_parser(name, **about), *each.usage, WITH)
-    return found
+    return root
 
 
-def _add(found: argparse.ArgumentParser, *usage: str) -> None:
+def _add(target: argparse.ArgumentParser, *usage: str) -> None:
     """Add options from blocks with a line each: names, value with a mark, " = DEFAULT", meaning."""
     for line in "\n".join(map(inspect.cleandoc, usage)).replace("\n    ", " ").splitlines():
         words, _, text = line.partition("  ")
@@ -161,7 +161,7 @@ def _add(found: argparse.ArgumentParser, *usage: str) -> None:
             settings["choices" if "|" in kind else "metavar"] = (
                 kind.split("|") if "|" in kind else kind
             )
-        found.add_argument(*names, **settings)
+        target.add_argument(*names, **settings)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -490,7 +490,8 @@ def _validate(options: argparse.Namespace) -> None:
     """Check a scene without running it, and show the settings that a run would use."""
     from remodel_fenicsx.body.reductions import describe_choice
 
-    scene, unseen, warnings = options.scene, "", []
+    scene, unseen = options.scene, ""
+    warnings = []
     if interrupts.is_first_rank():
         unseen, warnings = _unseen_files(scene), scene.warnings()
     _print(f"{options.file}: a valid scene ({scene.geometry.name}, {scene.time.in_words()})")
@@ -568,10 +569,10 @@ def _schema(options: argparse.Namespace) -> None:
 def _run_study(study: Callable[..., tuple[Path, StudyResult]], *wishes: object) -> int:
     """Run a study; print its result, its folder and its failed runs."""
     with _stopping("all recorded results are saved; repeat the command to resume"):
-        folder, found = study(*wishes)
-    _print(f"{found.in_words()}\nresults in {folder}")
-    _print_failures(found.failed)
-    return SOLVE_FAILED if found.failed else 0
+        folder, result = study(*wishes)
+    _print(f"{result.in_words()}\nresults in {folder}")
+    _print_failures(result.failed)
+    return SOLVE_FAILED if result.failed else 0
 
 
 @command(
@@ -671,8 +672,8 @@ def _stability(options: argparse.Namespace) -> None:
     """Run a scene and report whether its remodeling passes damp or amplify small errors."""
     from remodel_fenicsx.studies.stability import stability
 
-    place, found = stability(options.scene, options.output, options.times, quiet=options.quiet)
-    _print(f"{found.in_words()}\nresults in {place}")
+    place, result = stability(options.scene, options.output, options.times, quiet=options.quiet)
+    _print(f"{result.in_words()}\nresults in {place}")
 
 
 @command("info", needs=COMPUTES)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 
 LONGEST_MESSAGE = 900  # characters; longer messages lose their middle
-BAD_INPUT, SOLVE_FAILED, PAUSED, BAD_ENVIRONMENT = 2, 3, 4, 5
+BAD_INPUT, SOLVE_FAILED = 2, 3
+PAUSED, BAD_ENVIRONMENT = 4, 5
 
 
 class RemodelError(Exception):

@@ -90,7 +90,8 @@ class Simulation:
     ):
         if not isinstance(scene, Scene):
             raise TypeError(
-                f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, preset_scene one of a preset"
+                f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, "
+                "preset_scene one of a preset"
             )
         restore_signal_handlers()
         parts = build(scene, comm, domain, coupling)

@@ -743,7 +743,8 @@ def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
 def _with_one_matrix(
     tissues: Mapping[str, Tissue], properties: Mapping[str, Properties], matrices: Sequence[str]
 ) -> dict[str, Tissue]:
-    mixture = mixture_matrix([MATRICES[name] for name in matrices])  # type: ignore[misc]  # see rules.tissue_of_regions
+    # rules.tissue_of_regions has checked the matrices
+    mixture = mixture_matrix([MATRICES[name] for name in matrices])  # type: ignore[misc]
     defaults = {name: number.default for name, number in mixture.parameters.items()}
     mixtures = {}
     for name, tissue in tissues.items():

@@ -459,7 +459,7 @@ class EndForce(NamedTuple):
         return self.internal + pressure * self.inward
 
     def reduced(self, pressure: float) -> float:
-        """Return the force to apply if the ends are capped: less pressure times the lumen's area."""
+        """Return the force to apply to capped ends: less pressure times the lumen's area."""
         return self.internal - pressure * self.lumen
 
 

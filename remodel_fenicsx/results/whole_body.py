@@ -106,7 +106,7 @@ def append_chains(
     displacement: Array,
     fields: Mapping[str, Array],
 ) -> TransientGrid:
-    """Append a step to a file of chain lines; `grid` is the path of a new file at the first step."""
+    """Append a step to a file of chain lines; for the first step, `grid` is the file's path."""
     axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     centres, middle = (values[elements].mean(axis=1) for values in (points, displacement))
     ends, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)

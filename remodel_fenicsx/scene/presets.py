@@ -76,11 +76,11 @@ class Profile:
 
     def settings(self, scene: Any) -> dict[str, object]:
         """Return the profile's values for a scene by dotted key."""
-        found = dict(self.values)
+        values = dict(self.values)
         if self.is_for_means and (part := for_means(scene)) != AUTO:
             # A sector has fewer cells, so that each draw scatters more.
-            found |= {"model.kinematics": part, "cells.antithetic": True}
-        return found
+            values |= {"model.kinematics": part, "cells.antithetic": True}
+        return values
 
 
 PROFILES, RANDOM_CELLS = (
@@ -121,7 +121,8 @@ def aligned_stiffness(chain: Chain, end_to_end_length: float, contour_length: fl
 
 def _chain_density(one: Properties, initial_stiffness: float) -> float:
     tissue = one._replace(material=one.material.model_copy(update={"chain_density": 1.0})).tissue
-    chain, r0, length = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+    chain, r0 = tissue.chain, tissue.end_to_end_length
+    length = tissue.contour_length
     if chain is None or (chain.locks and r0 >= length):  # The rules reject this value.
         return one.material.chain_density
     return initial_stiffness / (tissue.network_modulus * aligned_stiffness(chain, r0, length))

@@ -45,9 +45,11 @@ def named_regions(scene: Scene) -> Faults:
     for name in scene.regions:
         key = f"regions.{quoted(name)}"
         if not isinstance(shape, WithRegions):
-            yield f"a {shape.name} has no regions; shapes with regions: {_shapes(WithRegions)}", key, None
+            rule = f"a {shape.name} has no regions; shapes with regions: {_shapes(WithRegions)}"
+            yield rule, key, None
         if not re.fullmatch(NAME, name):
-            yield "the name of a region must be a letter, then letters, digits and _, at most 40 in all", key, None
+            rule = "must be a letter, then letters, digits and _, at most 40 in all"
+            yield f"the name of a region {rule}", key, None
         columns = [column for column in scene.column_names if column.endswith(f"_{name}")]
         if twice := {column for column in columns if columns.count(column) > 1}:
             yield f"the column {min(twice)!r} already exists; choose another name", key, None
@@ -59,8 +61,8 @@ def tissue_of_regions(scene: Scene) -> Faults:
     for name, (material, cells, kappa) in scene.properties().items():
         region, length = in_region(name), cells.end_to_end_length
         if CHAINS[material.chain].locks and length >= material.contour_length:
-            rule = f"must be smaller than {region}material.contour_length = {format_value(material.contour_length)}"
-            yield rule, f"{region}cells.end_to_end_length", length
+            most = f"{region}material.contour_length = {format_value(material.contour_length)}"
+            yield f"must be smaller than {most}", f"{region}cells.end_to_end_length", length
         if (words := cells.length_problem()) is not None:
             yield words, f"{region}cells.initial", cells.initial
         if cells.initial == MEASURED_CELLS and cells.fibres is None:
@@ -80,10 +82,12 @@ def tissue_of_regions(scene: Scene) -> Faults:
         if not turnover.is_on:
             continue
         if not material.chain_density:
-            yield f"needs chains: {region}material.chain_density above 0", "remodeling.turnover", None
+            rule = f"needs chains: {region}material.chain_density above 0"
+            yield rule, "remodeling.turnover", None
         longest = material.contour_length / length
         if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
-            rule = f"must be smaller than {region}contour_length / end_to_end_length = {format_value(longest)}"
+            most = f"{region}contour_length / end_to_end_length = {format_value(longest)}"
+            rule = f"must be smaller than {most}"
             yield rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch
 
 
@@ -163,14 +167,17 @@ def axes_of_the_shape(scene: Scene) -> Faults:
     """Check that the shape has the axes of the cells."""
     shape, axes = scene.geometry, scene.cells.axes
     if axes not in shape.axis_kinds:
-        yield f"must be {' or '.join(map(repr, shape.axis_kinds))} for shape {shape.name!r}", "cells.axes", axes
+        rule = f"must be {' or '.join(map(repr, shape.axis_kinds))} for shape {shape.name!r}"
+        yield rule, "cells.axes", axes
 
 
 def supports_of_the_shape(scene: Scene) -> Faults:
     """Check that the shape has the supports."""
-    shape, ends, faces = scene.geometry, scene.supports.ends, scene.geometry.supported_faces
+    shape, ends = scene.geometry, scene.supports.ends
+    faces = shape.supported_faces
     if ends not in shape.ends:
-        yield f"must be {' or '.join(map(repr, shape.ends))} for shape {shape.name!r}", "supports.ends", ends
+        rule = f"must be {' or '.join(map(repr, shape.ends))} for shape {shape.name!r}"
+        yield rule, "supports.ends", ends
     if faces is None:
         return
     for name, support in scene.supports.faces.items():
@@ -185,7 +192,8 @@ def supports_of_the_shape(scene: Scene) -> Faults:
 
 def cells_of_the_loaded_body(scene: Scene) -> Faults:
     """Check the conditions of natural.cells = "equilibrium"."""
-    key, cells, shape = "natural.cells", scene.natural.cells, scene.geometry
+    key, cells = "natural.cells", scene.natural.cells
+    shape = scene.geometry
     if cells != "equilibrium":
         return
     if not (shape.is_loaded and isinstance(shape, RoundWall)):
@@ -209,13 +217,15 @@ def measured_natural_state(scene: Scene) -> Faults:
 
 def natural_state(scene: Scene) -> Faults:
     """Check that shape, formulation and cells allow residual stress."""
-    natural, shape, able, none = scene.natural, scene.geometry, Walled, "none"
+    natural, shape = scene.natural, scene.geometry
+    able, none = Walled, "none"
     if natural.is_trivial or natural.fibres:
         return
     value: float
     key, value = "natural.layers", len(natural.layers)
     if natural.opening_angle:
-        key, value, able, none = "natural.opening_angle", natural.opening_angle, RoundWall, "0"
+        key, value = "natural.opening_angle", natural.opening_angle
+        able, none = RoundWall, "0"
     needs = [
         ("geometry.shape", isinstance(shape, able), _shapes(able, " or ")),
         ("mesh.formulation", scene.formulation == "displacement", "'displacement'"),
@@ -253,8 +263,12 @@ def loads_of_the_body(scene: Scene) -> Faults:
             for case in scene.each_case():
                 full = case.loads[name].value * factor
                 if full <= least:
-                    words = f"with the factor {format_value(full / load.value if load.value else factor)} it is {full:.6g}"
-                    yield f"must be greater than {least:g} at every time; {words}", f"{key}.value", load.value
+                    total = full / load.value if load.value else factor
+                    rule = (
+                        f"must be greater than {least:g} at every time; "
+                        f"with the factor {format_value(total)} it is {full:.6g}"
+                    )
+                    yield rule, f"{key}.value", load.value
 
 
 def weights_and_factors(scene: Scene) -> Faults:
@@ -278,7 +292,8 @@ def coupling_and_mean(scene: Scene) -> Faults:
     if remodeling.mean != "tensor" and not scene.cases:
         yield "needs [[cases]]", "remodeling.mean", remodeling.mean
     if MEANS_OF_CASES[remodeling.mean].of_targets and LAWS[remodeling.law].target is None:
-        yield f"needs a remodeling.law with a target: {laws_with_a_target()}", "remodeling.mean", remodeling.mean
+        rule = f"needs a remodeling.law with a target: {laws_with_a_target()}"
+        yield rule, "remodeling.mean", remodeling.mean
     if scene.cases[1:] and not coupling.takes_cases:
         able = join_names(COUPLINGS, lambda kind: kind.takes_cases)
         yield f"must be one of {able} with [[cases]]", "remodeling.coupling", remodeling.coupling
@@ -289,11 +304,12 @@ def growth(scene: Scene) -> Faults:
     turnover, time = scene.remodeling.turnover, scene.time
     if not turnover.grows:
         return
-    key, volume, start = "remodeling.turnover.from", turnover.volume, turnover.start
+    key, volume = "remodeling.turnover.volume", turnover.volume
     if not isinstance(scene.geometry, Walled):
-        yield f"must be 0 unless geometry.shape is {_shapes(Walled, ' or ')}", "remodeling.turnover.volume", volume
+        yield f"must be 0 unless geometry.shape is {_shapes(Walled, ' or ')}", key, volume
     if scene.formulation != "displacement":
-        yield "must be 0 unless mesh.formulation is 'displacement'", "remodeling.turnover.volume", volume
+        yield "must be 0 unless mesh.formulation is 'displacement'", key, volume
+    key, start = "remodeling.turnover.from", turnover.start
     if turnover.starts_at_rest:
         if not time.is_equilibrium:
             yield "needs time.end = 'equilibrium'; otherwise set a time", key, AT_REST
@@ -311,12 +327,8 @@ def growth(scene: Scene) -> Faults:
 
 def equilibrium(scene: Scene) -> Faults:
     """Check that the cells have a steady state that is independent of the load path."""
-    law, parts, key, end = (
-        scene.remodeling.law,
-        scene.properties().items(),
-        "time.end",
-        scene.time.end,
-    )
+    law, parts = scene.remodeling.law, scene.properties().items()
+    key, end = "time.end", scene.time.end
     if not scene.time.is_equilibrium:
         return
     if not LAWS[law].has_limit:
@@ -366,7 +378,8 @@ def fields_of_the_body(scene: Scene) -> Faults:
 
 def columns_of_the_history(scene: Scene) -> Faults:
     """Check that the scene has the output columns."""
-    shape, turnover, key = scene.geometry, scene.remodeling.turnover, "output.columns"
+    shape, turnover = scene.geometry, scene.remodeling.turnover
+    key = "output.columns"
     of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
     for name in scene.output.columns:
         if name == "time_error" and scene.time.is_equilibrium:

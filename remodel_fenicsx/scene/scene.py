@@ -111,11 +111,8 @@ def doubts(
     end: float,
 ) -> Iterator[str]:
     """Yield a line for each implausible value; none for plausible tissue."""
-    unit, pascal, density = (
-        material.stress_unit,
-        STRESS_UNITS[material.stress_unit],
-        material.chain_density,
-    )
+    unit, density = material.stress_unit, material.chain_density
+    pascal = STRESS_UNITS[unit]
     network = chain_stress(material, end_to_end_length)
     ratio, stiffness = network / material.lame_mu, material.lame_mu + network
     if network and (way := _outside_decades(ratio, NETWORK)):
@@ -126,26 +123,25 @@ def doubts(
         )
         yield (
             f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} "
-            f"{unit}) is {_format_factor(ratio)} {'softer' if way < 0 else 'stiffer'} than the matrix "
-            f"(lame_mu = {material.lame_mu:.4g} {unit}); check its unit, which is 1/m^3{of_pascal}"
+            f"{unit}) is {_format_factor(ratio)} {'softer' if way < 0 else 'stiffer'} "
+            f"than the matrix (lame_mu = {material.lame_mu:.4g} {unit}); "
+            f"check its unit, which is 1/m^3{of_pascal}"
         )
     for key, words, ratio, decades in geometry.proportions:
         if _outside_decades(ratio, decades):
             one = "check the units, all lengths are in geometry.length_unit"
             yield f"geometry.{key} = {getattr(geometry, key):g}: {words} is {ratio:.3g}; {one}"
     for name, load in loads.items():
-        key, kind, value = (
-            f"loads.{name}.value",
-            geometry.loads_on(faces_of(loads))[name],
-            load.largest(end),
-        )
+        key, kind = f"loads.{name}.value", geometry.loads_on(faces_of(loads))[name]
+        value = load.largest(end)
         if words := convention_doubt(name, value):
             yield f"{key}: {words}"
         stress = abs(largest_stress(kind, value, geometry) or 0.0)
         if stress and (way := _outside_decades(stress / stiffness, LOAD)):
             yield (
-                f"{key}: the largest stress, {stress:.3g} {unit}, is {_format_factor(stress / stiffness)} "
-                f"{'more' if way > 0 else 'less'} than the stiffness of matrix and network "
+                f"{key}: the largest stress, {stress:.3g} {unit}, is "
+                f"{_format_factor(stress / stiffness)} {'more' if way > 0 else 'less'} "
+                "than the stiffness of matrix and network "
                 f"(lame_mu + c g(r0) r0^2 = {stiffness:.3g} {unit}); check material.stress_unit"
             )
 
@@ -161,7 +157,8 @@ def borne(tissue: Tissue, is_loaded: bool) -> float:
     Radii are as prescribed; length and volume are constant. Without chains: the limit load.
     """
     # The stretch is the square of the circumferential one.
-    chain, modulus, stretch = tissue.chain, tissue.lame_mu, math.inf
+    chain, modulus = tissue.chain, tissue.lame_mu
+    stretch = math.inf
     if tissue.matrix is not neo_hookean:
         return math.inf
     if chain is not None:
@@ -285,7 +282,8 @@ class Scene(Table):
         default="scene",
         pattern=r"^\w(?:[\w .+-]{0,98}[\w+-])?$",
         json_schema_extra={
-            "allowed": "a file name: letters, digits, spaces and . + - _, at most 100, a letter or digit first"
+            "allowed": "a file name: letters, digits, spaces and . + - _, at most 100, "
+            "a letter or digit first"
         },
     )
     """Name of the scene and of its results folder. Default: the file name without `.toml`."""
@@ -321,9 +319,12 @@ class Scene(Table):
             return handler(values)
         own = _with_measured_cells(_in_present_format(_plain(values)))
         for name in ("regions", "loads", "cases", "supports"):
-            if isinstance(found := own.get(name), dict | list | tuple) and len(found) > MOST_TABLES:
+            if (
+                isinstance(tables := own.get(name), dict | list | tuple)
+                and len(tables) > MOST_TABLES
+            ):
                 raise validation_error(
-                    f"has {len(found)} tables; must have at most {MOST_TABLES}", name, None
+                    f"has {len(tables)} tables; must have at most {MOST_TABLES}", name, None
                 )
         presets.check_exclusive(own)
         preset, profile = own.get("preset"), own.get("profile")
@@ -429,13 +430,13 @@ class Scene(Table):
     def last_hold(self) -> tuple[float, float] | None:
         """Start and end of the last hold of all loads before a further change, or None."""
         corners = sorted({time for load in self.loads.values() for time, _ in load.ramp})
-        found, held = None, None
+        last, held = None, None
         for start, end in itertools.pairwise(corners):
             if all(load.factor(start) == load.factor(end) for load in self.loads.values()):
                 held = start, end
             else:
-                found = held
-        return found
+                last = held
+        return last
 
     @property
     def last_time(self) -> float:
@@ -448,15 +449,15 @@ class Scene(Table):
 
     def each_case(self) -> list[Scene]:
         """Return a scene for each load case with its loads; the scene itself if it has no cases."""
-        found = []
+        scenes = []
         for case in self.cases:
             loads = dict(self.loads)
             for name in {*case.loads} & {*loads}:
                 loads[name] = loads[name].model_copy(
                     update={"value": loads[name].value * case.loads[name]}
                 )
-            found.append(self.model_copy(update={"loads": loads, "cases": ()}))
-        return found or [self]
+            scenes.append(self.model_copy(update={"loads": loads, "cases": ()}))
+        return scenes or [self]
 
     def whole(self) -> Properties:
         """Return the properties of the whole body, which hold unless a region sets its own."""
@@ -465,15 +466,15 @@ class Scene(Table):
     def properties(self) -> dict[str, Properties]:
         """Return the properties of each region, and under "" of the remaining body, if any."""
         body = self.whole()
-        found = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
+        properties = {"": body} | {name: region.over(body) for name, region in self.regions.items()}
         if self.regions and isinstance(self.geometry, RoundWall):
-            del found[""]
-        has_chains = any(one.material.chain_density for one in found.values())
-        for name, one in found.items():
+            del properties[""]
+        has_chains = any(one.material.chain_density for one in properties.values())
+        for name, one in properties.items():
             stays = has_chains and not one.material.chain_density  # These cells have no collagen.
             kappa = 0.0 if stays else self.remodeling.speed(one.kappa, one.material.temperature)
-            found[name] = one._replace(kappa=kappa)
-        return found
+            properties[name] = one._replace(kappa=kappa)
+        return properties
 
     @property
     def has_random_cells(self) -> bool:
@@ -497,8 +498,8 @@ class Scene(Table):
     @property
     def measured_cells(self) -> dict[str, Cells]:
         """Cells from fibre files by region, under "" for the remaining body."""
-        found = {name: properties.cells for name, properties in self.properties().items()}
-        return {name: cells for name, cells in found.items() if cells.initial == MEASURED_CELLS}
+        by_region = {name: properties.cells for name, properties in self.properties().items()}
+        return {name: cells for name, cells in by_region.items() if cells.initial == MEASURED_CELLS}
 
     @property
     def column_names(self) -> list[str]:
@@ -576,9 +577,9 @@ class Scene(Table):
             if stress is not None:
                 is_force = self.load_kinds[name].dimension == FORCE
                 loads[f"largest {name}{' over its area' if is_force else ''}"] = stress
-        found = self.properties()
         parts = [
-            _words(name) + properties.material.summary(loads) for name, properties in found.items()
+            _words(name) + properties.material.summary(loads)
+            for name, properties in self.properties().items()
         ]
         turnover = self.remodeling.turnover
         if turnover.is_on:
@@ -595,7 +596,7 @@ class Scene(Table):
         wall
             Domain of a meshed wall, for the areas of its faces.
         """
-        found: dict[str, None] = {}
+        warnings: dict[str, None] = {}
         properties = self.properties()
         if self.geometry.covers_body(self.regions):
             properties.pop("", None)  # The entry holds nowhere.
@@ -604,16 +605,16 @@ class Scene(Table):
                 lines = doubts(
                     material, self.geometry, case.loads, cells.end_to_end_length, self.last_time
                 )
-                found |= dict.fromkeys(
+                warnings |= dict.fromkeys(
                     line if line.startswith("geometry.") else _words(name) + line for line in lines
                 )
         # Doubtful units explain a soft wall.
-        found |= {} if found else dict.fromkeys(too_soft(self, wall))
-        found |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
+        warnings |= {} if warnings else dict.fromkeys(too_soft(self, wall))
+        warnings |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
         tables = self.model_dump(exclude={"loads", "cases"})
-        found |= dict.fromkeys(_doubted_keys(tables))
+        warnings |= dict.fromkeys(_doubted_keys(tables))
         return [
-            *found,
+            *warnings,
             *self.loaded_shape_warnings(),
             *self._turnover_warnings(),
             *self.remodeling.warnings(),
@@ -647,7 +648,10 @@ class Scene(Table):
             says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
             if power <= 2:
                 least = 2 * turnover.gain / power if turnover.gain else math.inf
-                yield f"{says}: no stable homeostasis with this deposition_stretch; must exceed {least:.3g}"
+                yield (
+                    f"{says}: no stable homeostasis with this deposition_stretch; "
+                    f"must exceed {least:.3g}"
+                )
             elif power < SLOW_REST:
                 words = "if collagen alone carries the loads, shorter with a matrix"
                 yield f"{says}: reaches equilibrium slowly, time constant {slowly:.3g} {words}"
@@ -659,7 +663,8 @@ class Scene(Table):
         ):
             yield (
                 f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: "
-                "content and natural length overshoot in each step; reduce time.step or set time.tolerance"
+                "content and natural length overshoot in each step; reduce time.step or set "
+                "time.tolerance"
             )
 
     def _values(self) -> dict[str, Any]:
@@ -685,7 +690,8 @@ class Scene(Table):
         for key, value in changes.items():
             if not isinstance(key, str):
                 raise SceneError(
-                    f"{format_value(key)} = {format_value(value)}: a key must be text, as in 'cells.seed'"
+                    f"{format_value(key)} = {format_value(value)}: a key must be text, "
+                    "as in 'cells.seed'"
                 )
             set_nested(values, key, value)
         _follow(values, changes, is_whole=True)
@@ -807,15 +813,15 @@ def _with_numbers_of_loads(values: Mapping[str, object], shape: type[Shape]) -> 
     loads = values.get("loads")
     if not isinstance(loads, Mapping):
         return dict(values)
-    found = dict(loads)
+    converted = dict(loads)
     for name, kind in shape.loads_on(faces_of(loads)).items():
         load = loads.get(name)
         if isinstance(load, Mapping) and "value" in load and kind.dimension is not None:
-            found[name] = {
+            converted[name] = {
                 **load,
                 "value": kind.dimension.number(load["value"], f"loads.{quoted(name)}.value"),
             }
-    return {**values, "loads": found}
+    return {**values, "loads": converted}
 
 
 def _check_load_names(shape: str, loads: object) -> None:
@@ -850,7 +856,8 @@ def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object
         )
     if not re.fullmatch(NAME, name) or name in {column.name for column in columns_of(shape)}:
         raise validation_error(
-            "its name must be a letter, then letters, digits and _, at most 40 in all, and not the name of a column",
+            "its name must be a letter, then letters, digits and _, at most 40 in all, "
+            "and not the name of a column",
             key,
             None,
         )
@@ -1013,7 +1020,10 @@ SAME_LOAD = 1e-12  # relative difference below which two loads are equal
 
 def check_continuation(old: Scene, new: Scene, time: float) -> None:
     """Check that a scene has the physics of the recorded run until `time`."""
-    rule = f"a resumed run may change time.end, output, solver, and loads after its checkpoint at {time:g}"
+    rule = (
+        "a resumed run may change time.end, output, solver, and loads after its checkpoint "
+        f"at {time:g}"
+    )
     before, now = (
         dict(leaves(scene.model_dump(mode="json"), RESUMABLE_KEYS)) for scene in (old, new)
     )
@@ -1025,7 +1035,8 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
         first, second = old.loads.get(name), new.loads.get(name)
         if first and second and first.face != second.face:
             raise SceneError(
-                f"loads.{name}.face = {format_value(second.face)}: was {format_value(first.face)}; {rule}"
+                f"loads.{name}.face = {format_value(second.face)}: "
+                f"was {format_value(first.face)}; {rule}"
             )
         for moment in sorted({0.0, time, *_ramp_times(first), *_ramp_times(second)}):
             old_value, value = (
@@ -1039,7 +1050,8 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
                 )
     if new.last_time < time:
         raise SceneError(
-            f"time.end = {format_value(new.time.end)}: must be at least {time:g}, the checkpoint's time"
+            f"time.end = {format_value(new.time.end)}: must be at least {time:g}, "
+            "the checkpoint's time"
         )
 
 

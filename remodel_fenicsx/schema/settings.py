@@ -161,7 +161,8 @@ class Support(Table):
 
     def _faults(self) -> Faults:
         if self.kind == "elastic" and self.stiffness is None:
-            yield "missing; a support of kind 'elastic' needs it, as in '10 kPa/mm'", "stiffness", None
+            rule = "missing; a support of kind 'elastic' needs it, as in '10 kPa/mm'"
+            yield rule, "stiffness", None
 
 
 class Supports(Table):
@@ -196,8 +197,9 @@ class Supports(Table):
 class Material(Table):
     """Tissue: an isotropic matrix (Lame constants) with a network of collagen chains.
 
-    Its keyword arguments are the keys of `[material]` in a scene (docs/scene.md; paper, eqs. 2 to 4). Stresses are in
-    `stress_unit`, lengths of chains in link lengths, `chain_density` in 1/m^3, `temperature` in kelvin.
+    Its keyword arguments are the keys of `[material]` in a scene (docs/scene.md; paper, eqs. 2
+    to 4). Stresses are in `stress_unit`, lengths of chains in link lengths, `chain_density` in
+    1/m^3, `temperature` in kelvin.
 
     Raises
     ------
@@ -209,8 +211,10 @@ class Material(Table):
     The paper's tissue, in kPa:
 
     >>> from remodel_fenicsx import parts
-    >>> material = parts.Material(lame_lambda=27.293, lame_mu=3.103, chain_density=7e21, contour_length=2.125,
-    ...                           persistence_length=1.82, temperature=310.0)
+    >>> material = parts.Material(
+    ...     lame_lambda=27.293, lame_mu=3.103, chain_density=7e21, contour_length=2.125,
+    ...     persistence_length=1.82, temperature=310.0,
+    ... )
     >>> round(material.network_modulus, 3)  # c of docs/theory.md
     4.116
     >>> tissue = material.tissue(end_to_end_length=1.0)
@@ -238,7 +242,8 @@ class Material(Table):
     temperature: Annotated[float, TEMPERATURE] = Field(default=310.0, gt=0)
     """Absolute temperature theta, in K."""
     energy_factor: Annotated[int, OneOf((1, 4))] = 1
-    """Factor omega of the chain energy. 1: the stress as printed (eq. 7). 4: the energy as printed (eq. 4b)."""
+    """Factor omega of the chain energy. 1: the stress as printed (eq. 7). 4: the energy as printed
+    (eq. 4b)."""
     matrix: Annotated[str, OneOf(MATRICES)] = "neo-hookean"
     """Energy of the matrix."""
     chain: Annotated[str, OneOf(CHAINS)] = "wormlike"
@@ -248,7 +253,8 @@ class Material(Table):
     in the stretches along the cell axes. 'log': in the structure tensor only (A : ln C); the
     default with the law 'tensor'. 'length': in the length of the chains only."""
     stress_unit: Annotated[str, OneOf(STRESS_UNITS)] = "Pa"
-    """Unit of every stress of the scene. Forces are in this unit times the unit of length squared."""
+    """Unit of every stress of the scene. Forces are in this unit times the unit of length
+    squared."""
 
     @property
     def has_volumetric_split(self) -> bool:
@@ -433,8 +439,8 @@ InitialCells = Literal["random", "isotropic", "aligned", "fibres"] | _Lengths
 class Cells(Table):
     """Orthotropic unit cells of the collagen network before the first remodeling pass.
 
-    Its keyword arguments are the keys of `[cells]` in a scene (docs/scene.md); lengths are in link lengths. Fig. 2 of
-    the paper shows such a cell.
+    Its keyword arguments are the keys of `[cells]` in a scene (docs/scene.md); lengths are in link
+    lengths. Fig. 2 of the paper shows such a cell.
 
     Raises
     ------
@@ -466,8 +472,8 @@ class Cells(Table):
         min_length=1,
         json_schema_extra={"allowed": "the name of a file .vtu, .xdmf or .csv"},
     )
-    """File of measured fibres, relative to the scene: axes and dimensions of the cells at t = 0 (docs/my_own_vessel.md,
-    Measured fibres in)."""
+    """File of measured fibres, relative to the scene: axes and dimensions of the cells at t = 0
+    (docs/my_own_vessel.md, Measured fibres in)."""
     fibres_sha256: str | None = Field(
         default=None,
         pattern="^[0-9a-f]{64}$",
@@ -482,13 +488,14 @@ class Cells(Table):
     aligned_axis: Annotated[int, OneOf((1, 2, 3))] = 3
     """Number of the axis of 'aligned' cells: x, y, z, or circumferential, axial, radial."""
     seed: int = Field(default=1, ge=0)
-    """Seed of the random cells. The same seed and mesh give the same cells on any number of ranks."""
+    """Seed of the random cells. The same seed and mesh give the same cells on any number of
+    ranks."""
     antithetic: bool = False
     """For random cells: seeds 1 to 3 share one draw, with l_1, l_2 and l_3 permuted cyclically, and
     so do seeds 4 to 6. Means over complete groups of three seeds scatter less."""
     end_to_end_length: float = Field(default=1.0, gt=0)
-    """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It stays in the repulsive
-    energy while the cells remodel."""
+    """Length r0 of a chain at t = 0, in link lengths, smaller than material.contour_length. It
+    stays in the repulsive energy while the cells remodel."""
 
     def _faults(self) -> Faults:
         if (rule := self.length_problem()) is not None:
@@ -562,7 +569,9 @@ class CouplingKind:
     >>> class Late(Staggered):
     ...     def remodel(self, time):
     ...         return super().remodel(time) if time > 1.0 else 0.0
-    >>> COUPLINGS["late"] = CouplingKind("as staggered, but the cells stay as they are up to t = 1", Late)
+    >>> COUPLINGS["late"] = CouplingKind(
+    ...     "as staggered, but the cells stay as they are up to t = 1", Late
+    ... )
     >>> late = {"remodeling.coupling": "late", "time.end": 3.0}
     >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values(late)
     >>> [round(step.row["mean_fibre_angle"], 2) for step in Simulation(scene).steps()]
@@ -733,8 +742,8 @@ REMODELS = {"turnover": RemodelsKind(Turnover, "remodel_fenicsx.evolution.turnov
 class Remodeling(Table):
     """Evolution of the cells under load: driving tensor, evolution law, frame and rate.
 
-    Its keyword arguments are the keys of `[remodeling]` in a scene (docs/scene.md; paper, eqs. 8 to 11); `kappa` is in
-    1/time.
+    Its keyword arguments are the keys of `[remodeling]` in a scene (docs/scene.md; paper, eqs. 8
+    to 11); `kappa` is in 1/time.
 
     Raises
     ------
@@ -753,8 +762,8 @@ class Remodeling(Table):
     """
 
     driver: Annotated[str, OneOf(DRIVERS)] = "cauchy"
-    """Tensor whose positive eigenvalues the cells follow. 'cauchy': the Cauchy stress. 'pk2': the second
-    Piola-Kirchhoff stress. 'finger': the Finger tensor b."""
+    """Tensor whose positive eigenvalues the cells follow. 'cauchy': the Cauchy stress. 'pk2': the
+    second Piola-Kirchhoff stress. 'finger': the Finger tensor b."""
     law: Annotated[str, OneOf(LAWS)] = "explicit"
     """Evolution law of the cells. 'explicit': eq. (11), in absolute time. 'rate': eq. (10).
     'relaxation': dl/dt = kappa (r0 e - l), right for changing loads. 'tensor': 'relaxation' of the
@@ -844,22 +853,24 @@ class Remodeling(Table):
         return self.exponent != 2.0 or self.threshold != 0.0
 
     def _faults(self) -> Faults:
-        law, driver, coupling = LAWS[self.law], DRIVERS[self.driver], COUPLINGS[self.coupling]
+        law, driver = LAWS[self.law], DRIVERS[self.driver]
+        coupling = COUPLINGS[self.coupling]
         able = join_names(LAWS, lambda law: law.takes_set_points)
         for key, plain in (("exponent", 2), ("threshold", 0)):
             if getattr(self, key) != plain and not law.takes_set_points:
                 yield f"must be {plain} unless remodeling.law is {able}", key, getattr(self, key)
         if self.threshold and not driver.is_stress:
             drivers = join_names(DRIVERS, lambda driver: driver.is_stress)
-            yield f"must be 0 unless remodeling.driver is a stress: {drivers}", "threshold", self.threshold
+            rule = f"must be 0 unless remodeling.driver is a stress: {drivers}"
+            yield rule, "threshold", self.threshold
         if self.turnover.is_on and not law.takes_set_points:
             yield f"needs remodeling.law = {able}", "turnover", None
         if self.turnover.is_on and not coupling.takes_turnover:
             able = join_names(COUPLINGS, lambda kind: kind.takes_turnover)
             yield f"must be one of {able} with remodeling.turnover", "coupling", self.coupling
         if coupling.needs_a_target and law.target is None:
-            rule = f"needs a remodeling.law with a target that can be extrapolated: {laws_with_a_target()}"
-            yield rule, "coupling", self.coupling
+            rule = "needs a remodeling.law with a target that can be extrapolated"
+            yield f"{rule}: {laws_with_a_target()}", "coupling", self.coupling
 
 
 def laws_with_a_target() -> str:
@@ -902,9 +913,18 @@ def _for_regions(table: type[Table], key: str, *names: str) -> Any:
 
 
 _SomeMaterial: Any = _for_regions(
-    Material, "material", "lame_lambda", "lame_mu", "chain_density", "contour_length", "persistence_length",
-    "initial_stiffness", "locking_stretch", "temperature", "matrix",
-)  # fmt: skip
+    Material,
+    "material",
+    "lame_lambda",
+    "lame_mu",
+    "chain_density",
+    "contour_length",
+    "persistence_length",
+    "initial_stiffness",
+    "locking_stretch",
+    "temperature",
+    "matrix",
+)
 _SomeCells: Any = _for_regions(
     Cells, "cells", "initial", "fibres", "fibres_sha256", "aligned_axis", "end_to_end_length"
 )
@@ -1002,7 +1022,8 @@ class Load(Table):
                 yield rule, f"ramp[{index}][0]", time
         for given, missing in (("kind", "face"), ("face", "kind")):
             if getattr(self, given) is not None and getattr(self, missing) is None:
-                yield f"missing; {given} = {format_value(getattr(self, given))} needs it", missing, None
+                rule = f"missing; {given} = {format_value(getattr(self, given))} needs it"
+                yield rule, missing, None
 
     def factor(self, time: float) -> float:
         """Return the load factor at a time: piecewise linear, constant outside the ramp."""
@@ -1108,7 +1129,10 @@ class Time(Table):
         if not self.is_step_time(time):
             below = math.floor(time / self.step)
             nearest = f"{below * self.step:.12g} and {(below + 1) * self.step:.12g}"
-            rule = f"must be a multiple of time.step = {format_value(self.step)}; the nearest are {nearest}"
+            rule = (
+                f"must be a multiple of time.step = {format_value(self.step)}; "
+                f"the nearest are {nearest}"
+            )
             raise validation_error(rule, key, time)
 
     @property
@@ -1166,8 +1190,8 @@ class Solver(Table):
     method: Annotated[str, OneOf(SOLVER_METHODS, (AUTO,), REMOVED)] = Field(
         default=AUTO,
         description=f"Solver of each step's equations. 'auto' takes 'direct' up to {MAX_DIRECT_3D} "
-        f"unknowns ({MAX_DIRECT_REDUCED} of a reduction), then 'lagged', and above {MIN_MULTIGRID} 'iterative'. "
-        f"{meanings(SOLVER_METHODS)} "
+        f"unknowns ({MAX_DIRECT_REDUCED} of a reduction), then 'lagged', and above "
+        f"{MIN_MULTIGRID} 'iterative'. {meanings(SOLVER_METHODS)} "
         "(docs/speed_and_accuracy.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
@@ -1201,7 +1225,8 @@ class Solver(Table):
             if not re.fullmatch(r"[A-Za-z]\w*", name):
                 yield "not a PETSc option; write its name without the leading '-'", key, value
             if name in ("snes_rtol", "snes_atol", "snes_stol"):
-                yield "has no effect; use solver.relative_tolerance, solver.absolute_tolerance", key, value
+                rule = "has no effect; use solver.relative_tolerance, solver.absolute_tolerance"
+                yield rule, key, value
             if refused := option_problem(name, value):
                 yield refused, key, value
         if self.absolute_tolerance == 0.0 and self.relative_tolerance == 0.0:
@@ -1209,10 +1234,23 @@ class Solver(Table):
 
 
 FIELDS_BY_NAME = (
-    "displacement", "deformation_gradient", "cauchy_stress", "cell_dimensions", "axis_1", "axis_2", "axis_3",
-    "fibre_angle", "fibre_angle_unloaded", "fibre_angle_deformed", "chain_extension", *TURNED_OVER, GROWTH,
-    NATURAL_GRADIENT, "region", "chains",
-)  # fmt: skip
+    "displacement",
+    "deformation_gradient",
+    "cauchy_stress",
+    "cell_dimensions",
+    "axis_1",
+    "axis_2",
+    "axis_3",
+    "fibre_angle",
+    "fibre_angle_unloaded",
+    "fibre_angle_deformed",
+    "chain_extension",
+    *TURNED_OVER,
+    GROWTH,
+    NATURAL_GRADIENT,
+    "region",
+    "chains",
+)
 """Names for `output.fields` (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
 REGION = "region"  # field of bodies with regions
 TURNOVER_POWER = "turnover_power"  # column of bodies with turnover, next to means of its fields

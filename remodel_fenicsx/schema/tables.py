@@ -126,8 +126,8 @@ class Table(BaseModel):
         cls, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
         """Return the schema with each key's meaning, without the entries that only scripts need."""
-        found = handler(schema)
-        table = handler.resolve_ref_schema(found)
+        result = handler(schema)
+        table = handler.resolve_ref_schema(result)
         table.pop("title", None)
         table["description"] = meaning(cls)
         for name, entry in table["properties"].items():
@@ -135,7 +135,7 @@ class Table(BaseModel):
             entry |= {"description": text} if (text := description(cls, name)) else {}
         if cls.further is not None:
             table["additionalProperties"] = handler(cls.further.__pydantic_core_schema__)
-        return found
+        return result
 
     if not TYPE_CHECKING:  # the type checker reads the arguments from the fields
 
@@ -330,7 +330,8 @@ def listed(names: Iterable[str], wrong: str, most: int = 24) -> str:
     names = list(names)
     if len(names) <= most:
         return ", ".join(names)
-    return f"{', '.join(difflib.get_close_matches(wrong, names, most, 0.0))} and {len(names) - most} more"
+    close = ", ".join(difflib.get_close_matches(wrong, names, most, 0.0))
+    return f"{close} and {len(names) - most} more"
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -364,7 +365,8 @@ def one_line(error: ValidationError, table: type[Table]) -> str:
 
 def _describe(detail: ErrorDetails, table: type[Table]) -> str:
     key, owner, field = locate(table, detail["loc"])
-    kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
+    kind, value = detail["type"], detail["input"]
+    context = detail.get("ctx", {})
     if kind == "fault":
         key, rule = _joined(key, context["key"]), context["rule"]
         value = context.get("value", value)
@@ -383,7 +385,8 @@ def locate(
     table: type[Table], location: tuple[int | str, ...]
 ) -> tuple[str, type[Table], FieldInfo | None]:
     """Return the dotted key at a location, the table class that owns it, and its field or None."""
-    key, owner, field = "", table, None
+    key, owner = "", table
+    field = None
     inside: type[Table] | None = table  # the table that owns the next item as a key
     items = list(location)
     while items:
@@ -396,7 +399,8 @@ def locate(
             if isinstance(item, str):
                 break  # the remaining items are pydantic's names of the types of the value
             continue
-        key, owner, field = _joined(key, _step(item)), inside, inside.model_fields.get(str(item))
+        key, owner = _joined(key, _step(item)), inside
+        field = inside.model_fields.get(str(item))
         if field is None:
             inside = owner.further
             if inside is not None:
@@ -407,11 +411,8 @@ def locate(
         if several and "" not in several and items:
             inside = several[str(items.pop(0))][1]
         elif suffix and items and inside is not None:
-            key, owner, field = (
-                _joined(key, _step(items.pop(0))),
-                inside,
-                FieldInfo.from_annotation(inside),
-            )
+            key, owner = _joined(key, _step(items.pop(0))), inside
+            field = FieldInfo.from_annotation(inside)
     return key, owner, field
 
 

@@ -73,8 +73,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def _marks(text: str) -> str:
     """Return a remark on typographic quotes in a text, which word processors insert, or nothing."""
-    found = re.search("[\u2018-\u201f\u00ab\u00bb]", text)
-    return f'; {found[0]} is not a quote of TOML: type " instead' if found else ""
+    match = re.search("[\u2018-\u201f\u00ab\u00bb]", text)
+    return f'; {match[0]} is not a quote of TOML: type " instead' if match else ""
 
 
 def _depth_exceeds(value: object, most: int) -> bool:
@@ -92,7 +92,8 @@ def parse_override(text: str) -> tuple[str, object]:
         raise SceneError(f"--set {format_value(text)}: must be KEY=VALUE, as in cells.seed=2")
     if len(key.split(".")) > MOST_PARTS:
         raise SceneError(
-            f"--set {format_value(text)}: a key of more than {MOST_PARTS} parts; a scene has up to 4"
+            f"--set {format_value(text)}: a key of more than {MOST_PARTS} parts; "
+            "a scene has up to 4"
         )
     if not all(key.split(".")):
         raise SceneError(
@@ -119,7 +120,8 @@ def set_nested(values: dict[str, object], key: str, value: object) -> None:
         if not isinstance(table, dict):
             place = ".".join(parents[: depth + 1])
             raise SceneError(
-                f"{key} = {format_value(value)}: {place} = {format_value(table)} is a value, not a table"
+                f"{key} = {format_value(value)}: {place} = {format_value(table)} is a value, "
+                "not a table"
             )
         values = table
     values[name] = value
@@ -191,7 +193,7 @@ def read_columns(
     allowed, unused = list(allowed), set(unused)
     known = {name.lower(): name for name in (*allowed, *unused)}
     head = [known.get((spellings or {}).get(name.lower(), name.lower()), "") for name in names]
-    if unknown := [name for name, found in zip(names, head, strict=True) if not found]:
+    if unknown := [name for name, meant in zip(names, head, strict=True) if not meant]:
         if all(_number(name, ".") is not None for name in names):
             raise UnreadableFile(
                 "begins with a row of numbers; the first row must have the names of the columns"

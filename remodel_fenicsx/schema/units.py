@@ -112,31 +112,29 @@ class Dimension:
         units = _UNITS.get()
         if not isinstance(value, str) or units is None:
             return value
-        rule, found = (
-            f"a unit of {self.name} as in {format_value(self.example)}",
-            _QUANTITY.fullmatch(value.strip()),
-        )
-        if found is None:
+        rule = f"a unit of {self.name} as in {format_value(self.example)}"
+        match = _QUANTITY.fullmatch(value.strip())
+        if match is None:
             raise validation_error(f"must be a number, or one with {rule}", key, value)
-        source = _unit(found[2])
+        source = _unit(match[2])
         powers = {units.get(name, name): power for name, power in self.powers}
         # The metre replaces a unit of length that is not set, so that a wrong dimension is reported
         # first.
         target = _unit(" * ".join(f"{unit or 'm'}**{power}" for unit, power in powers.items()))
         if source is None or target is None or source.dimensionality != target.dimensionality:
             raise validation_error(
-                f"{format_value(found[2])} is no unit of {self.name}; must be {rule}", key, value
+                f"{format_value(match[2])} is no unit of {self.name}; must be {rule}", key, value
             )
         if unset := [name for name, _ in self.powers if units.get(name, name) is None]:
             remedy = f"set {unset[0]} (m, cm, mm or um), or omit the unit"
             raise validation_error(
                 f"a unit of {self.name} needs the scene's unit of length: {remedy}", key, value
             )
-        number = float(found[1])  # rejects exponents that would make a fraction of a billion digits
+        number = float(match[1])  # rejects exponents that would make a fraction of a billion digits
         if abs(number) > LARGEST_NUMBER:
             raise validation_error(NUMBER_TOO_LARGE, key, value)
         return float(
-            _registry().Quantity(Fraction(found[1]) if number else 0, source).to(target).magnitude
+            _registry().Quantity(Fraction(match[1]) if number else 0, source).to(target).magnitude
         )
 
     def __get_pydantic_json_schema__(
@@ -161,8 +159,8 @@ NUMBER_DENSITY = Dimension("number per volume", "2e21 / m^3", (("m", -3),))
 
 def is_quantity(text: str) -> bool:
     """Return whether a text is a number followed by a possible unit."""
-    found = _QUANTITY.fullmatch(text)
-    return found is not None and _UNIT.fullmatch(found[2].rstrip()) is not None
+    match = _QUANTITY.fullmatch(text)
+    return match is not None and _UNIT.fullmatch(match[2].rstrip()) is not None
 
 
 @contextmanager
@@ -234,7 +232,8 @@ CONVENTIONS = (
     Doubt(
         "elongation",
         lambda x, _: x.min() > 0.98,
-        "reaches {high:.4g}: a stretch? A stretch of 1.1 is an elongation of 0.1, an engineering strain",
+        "reaches {high:.4g}: a stretch? A stretch of 1.1 is an elongation of 0.1, "
+        "an engineering strain",
     ),
     Doubt(
         "stretch",
@@ -266,12 +265,14 @@ CONVENTIONS = (
     Doubt(
         r"\(length\)",  # units of length differ by a factor of ten or more
         lambda x, model: abs(np.log(np.median(x / model))) > np.log(5.0),
-        "{ratio:.3g} times those of the scene at the start; another unit than geometry.length_unit? See units",
+        "{ratio:.3g} times those of the scene at the start; another unit than "
+        "geometry.length_unit? See units",
     ),
     Doubt(
         "wall_thickness / inner_radius",
         lambda x, model: bool(np.median(x) > 1.0 >= np.median(model)),
-        "a wall thicker than the lumen's radius, and {ratio:.3g} times the scene's at the start: another unit?",
+        "a wall thicker than the lumen's radius, and {ratio:.3g} times the scene's at the start: "
+        "another unit?",
     ),
 )
 

@@ -158,12 +158,14 @@ NO_ROOM = (errno.EFBIG, errno.ENOSPC, errno.EDQUOT)
 # Prefixes and addresses in VTK's error messages.
 _HEAD = r"\S+ \S+ \( *[\d.]+s\) \[ *\w+\] ?\S+ ERR\| "
 _LOGGED = re.compile(
-    rf"\x1b\[[0-9;]*m|{_HEAD}vtkCompositeDataPipeline.*|{_HEAD}(\w+ \(0x[0-9a-f]+\): )?|\(0x[0-9a-f]+\)"
+    rf"\x1b\[[0-9;]*m|{_HEAD}vtkCompositeDataPipeline.*|"
+    rf"{_HEAD}(\w+ \(0x[0-9a-f]+\): )?|\(0x[0-9a-f]+\)"
 )
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks
 _COUNTS = re.compile(r"(?i)^(number.*|dimensions|offset)$")
 _LINES = re.compile(
-    rb"(?im)^\s*(?:points|cells|cell_types|point_data|cell_data|offsets|connectivity)\b[^\n]{0,99}\s-\d"
+    rb"(?im)^\s*(?:points|cells|cell_types|point_data|cell_data|offsets|connectivity)\b"
+    rb"[^\n]{0,99}\s-\d"
 )
 
 
@@ -193,14 +195,14 @@ def made_apart(
     """Call a reader on these bytes in a child with limits; return the arrays."""
     with (
         os.fdopen(os.memfd_create("read"), "wb") as source,
-        os.fdopen(os.memfd_create("found"), "rb") as found,
+        os.fdopen(os.memfd_create("found"), "rb") as output,
     ):
         try:
             with open(source.fileno(), "wb", closefd=False) as copy:
                 copy.write(data)
         except OSError as error:
             raise NoRoomError from error
-        ends = source.fileno(), found.fileno()
+        ends = source.fileno(), output.fileno()
         words = [reader, *map(str, (*ends, int(seconds), memory))]
         try:
             done = subprocess.run(
@@ -231,23 +233,24 @@ def made_apart(
             )
         if done.returncode < 0:
             raise UnreadableFile(
-                f"{DAMAGED}file is corrupt, its reader has crashed ({signal.Signals(-done.returncode).name})"
+                f"{DAMAGED}file is corrupt, its reader has crashed "
+                f"({signal.Signals(-done.returncode).name})"
             )
         if done.returncode or said:
             raise UnreadableFile(
                 DAMAGED + (said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]} ...")
             )
-        found.seek(0)
+        output.seek(0)
         import numpy as np  # Imported late because most commands need no arrays.
 
-        with np.load(io.BytesIO(found.read()), allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(output.read()), allow_pickle=False) as arrays:
             return dict(arrays)
 
 
 # ---------------------------------------------------------------- child process
 
 
-def read_as_child(reader: str, source: str, found: str, seconds: str, memory: str) -> None:
+def read_as_child(reader: str, source: str, output: str, seconds: str, memory: str) -> None:
     """Read a file in the child: set limits, guard, read, and save the arrays."""
     for limit, most in (
         (resource.RLIMIT_CPU, seconds),
@@ -269,7 +272,7 @@ def read_as_child(reader: str, source: str, found: str, seconds: str, memory: st
         arrays = read(file)
         import numpy as np
 
-        with os.fdopen(int(found), "wb") as target:
+        with os.fdopen(int(output), "wb") as target:
             np.savez(target, **arrays)
     except OSError as error:
         sys.exit(BAD_ENVIRONMENT if error.errno in NO_ROOM else str(error))
@@ -286,8 +289,8 @@ def _guard(file: str) -> None:
     data = Path(file).read_bytes()
     if data.startswith(UTF_16) or b"<" in data.lstrip(b"\0 \t\r\n")[:4]:
         _check_xml(data)
-    if found := _LINES.search(data[: 10**6]):
-        raise UnreadableFile(f"has a negative number: {found[0].decode().strip()}")
+    if match := _LINES.search(data[: 10**6]):
+        raise UnreadableFile(f"has a negative number: {match[0].decode().strip()}")
     own = tuple(
         {
             *map(os.path.realpath, sysconfig.get_paths().values()),

@@ -120,8 +120,10 @@ def blas_library() -> str:
     except OSError:
         return "unknown"
     names = {line.split()[-1] for line in maps}
-    found = sorted(name for name in names if re.match(r"lib(open)?blas", name.rsplit("/", 1)[-1]))
-    return ", ".join(found) or "unknown"
+    libraries = sorted(
+        name for name in names if re.match(r"lib(open)?blas", name.rsplit("/", 1)[-1])
+    )
+    return ", ".join(libraries) or "unknown"
 
 
 # ---------------------------------------------------------------- extensions
@@ -191,7 +193,7 @@ def blamed(error: BaseException) -> str:
 
 def extension_hashes() -> dict[str, str]:
     """Return the hashes of the loaded extensions by name."""
-    return {name: found for name, (_, found) in _loaded.items()}
+    return {name: digest for name, (_, digest) in _loaded.items()}
 
 
 def extensions_for_children() -> dict[str, str]:

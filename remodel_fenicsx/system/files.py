@@ -56,10 +56,10 @@ def refusal_in_words(error: OSError) -> str:
 
 def read_regular(path: Path, most: int) -> bytes:
     """Read a regular file of at most `most` bytes, following symbolic links."""
-    descriptor, found = _regular(path, os.O_RDONLY)
+    descriptor, status = _regular(path, os.O_RDONLY)
     with open(descriptor, "rb") as file:
-        data = file.read(found.st_size + 1) if found.st_size <= most else b""
-    if max(found.st_size, len(data)) > most:
+        data = file.read(status.st_size + 1) if status.st_size <= most else b""
+    if max(status.st_size, len(data)) > most:
         raise ForeignFileError(errno.EFBIG, f"is larger than {most / 1e6:g} MB", str(path))
     return data
 
@@ -71,8 +71,8 @@ def check_regular(path: Path) -> None:
 
 def open_own(path: Path, flags: int) -> int:
     """Open a file to write in place: a regular file with no second name. Return its descriptor."""
-    descriptor, found = _regular(path, flags | os.O_NOFOLLOW)
-    if found.st_nlink > 1:
+    descriptor, status = _regular(path, flags | os.O_NOFOLLOW)
+    if status.st_nlink > 1:
         os.close(descriptor)
         raise ForeignFileError(
             errno.EMLINK, "has a second name (a hard link); nothing is written to it", str(path)
@@ -153,12 +153,12 @@ def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
         if error.errno in FOREIGN and (error.errno != errno.EEXIST or path.is_symlink()):
             raise ForeignFileError(error.errno, FOREIGN[error.errno], str(path)) from None
         raise
-    found = os.fstat(descriptor)
-    if not stat.S_ISREG(found.st_mode):
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode):
         os.close(descriptor)
-        number = errno.EISDIR if stat.S_ISDIR(found.st_mode) else errno.EINVAL
+        number = errno.EISDIR if stat.S_ISDIR(status.st_mode) else errno.EINVAL
         raise ForeignFileError(number, FOREIGN.get(number, NO_FILE), str(path))
-    return descriptor, found
+    return descriptor, status
 
 
 class ClosedAtEnd:
@@ -179,9 +179,9 @@ class ClosedAtEnd:
 
 def wall_time(text: str) -> float:
     """Convert a duration such as 90s, 30min or 2h to seconds."""
-    found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
+    match = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*(s|min|h|d)", text)
     seconds = (
-        float(found[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[found[2]] if found else 0.0
+        float(match[1]) * {"s": 1, "min": 60, "h": 3600, "d": 86400}[match[2]] if match else 0.0
     )
     if seconds <= 0:
         raise argparse.ArgumentTypeError(
@@ -205,8 +205,8 @@ def positive(text: str) -> int:
 def command_name() -> str:
     """Return the command name for messages: with the launcher, if it provides the command."""
     launcher = Path(__file__).resolve().parents[2] / "with-fenicsx"
-    found = shutil.which("remodel-fenicsx")
-    if found is None or Path(found).resolve() != launcher.parent / "bin" / "remodel-fenicsx":
+    program = shutil.which("remodel-fenicsx")
+    if program is None or Path(program).resolve() != launcher.parent / "bin" / "remodel-fenicsx":
         return "remodel-fenicsx"
     near = os.path.relpath(launcher)
     return f"{shlex.quote(str(launcher) if near.startswith('..') else f'./{near}')} remodel-fenicsx"

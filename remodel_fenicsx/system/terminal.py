@@ -37,7 +37,8 @@ class Progress:
         interval: float = 60.0,
         done: float = 0,
     ):
-        self._total, self._title, self._done = total_steps, title, done
+        self._total, self._title = total_steps, title
+        self._done = done
         self._silent, self._interval = comm_rank != 0, interval
         self._line_is_due = -math.inf
         # First step and its clock time; the estimate excludes compilation.
@@ -106,7 +107,7 @@ def _bar(title: str, total: int | None, done: float) -> RichProgress:
     console = Console(stderr=True, markup=False, highlight=False)
     # The ^C that a terminal echoes would break a line of full width and leave a copy of it.
     console.width -= 3
-    found = RichProgress(
+    bar = RichProgress(
         "{task.description}",
         BarColumn(24),
         "{task.fields[count]}",
@@ -117,10 +118,10 @@ def _bar(title: str, total: int | None, done: float) -> RichProgress:
         refresh_per_second=4,
         redirect_stdout=sys.stdout.isatty(),
     )
-    found.update(
-        found.add_task(title, total=total, count="", state="starting", left=""), completed=done
+    bar.update(
+        bar.add_task(title, total=total, count="", state="starting", left=""), completed=done
     )
-    return found
+    return bar
 
 
 def _is_terminal() -> bool:
