@@ -1,4 +1,4 @@
-"""Checkpoints of a state: written as a watcher, brought back on any number of ranks."""
+"""Checkpoints of a state: a watcher writes them; any number of ranks restores them."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ T = TypeVar("T")
 MAX_LOSS_SECONDS = 600.0  # seconds
 # seconds between two checkpoints that are chosen by time: a shorter pause saves too little work
 SHORTEST_PAUSE = 10.0
-MAX_TIME_FRACTION = 0.04  # of the time of a run, that checkpoints chosen by time may cost
+MAX_TIME_FRACTION = 0.04  # of the time of a run, for checkpoints that are chosen by time
 
 
 class Checkpoints(Watcher):
-    """Writes a checkpoint of the state now and then, and of the last step always."""
+    """A watcher that writes checkpoints of the state at intervals, and of the last step."""
 
     def __init__(
         self,
@@ -48,15 +48,15 @@ class Checkpoints(Watcher):
         self._mesh = mesh_arrays(state.loading.domain)
         self._versions = versions() if state.comm.rank == 0 else {}
         self._written_at, self._cost = clock.monotonic(), 0.0
-        self._number = 0  # of the newest checkpoint; where none is, the run starts again at t = 0
+        self._number = 0  # of the newest checkpoint; without one the run starts again at t = 0
 
     # ------------------------------------------------------------ as a watcher
     def resumed(self, step: Step) -> None:
-        """The state is that of a checkpoint."""
+        """Note the number of the checkpoint that the state comes from."""
         self._number = step.number
 
     def committed(self, step: Step) -> None:
-        """Write it, if it is its turn."""
+        """Write a checkpoint, if one is due."""
         if step.is_last or self._is_due(step.number):
             self.write()
 
@@ -112,7 +112,7 @@ def gather_state(state: State) -> dict[str, Array] | None:
 
 
 def restore_state(state: State, checkpoint: Checkpoint | None) -> None:
-    """Bring a state to a checkpoint. Collective."""
+    """Restore a state from a checkpoint. Collective."""
     domain, comm = state.loading.domain, state.comm
     mesh, first = mesh_arrays(domain), comm.rank == 0
     raise_on_all_ranks(
@@ -149,9 +149,8 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
     begins_anew = {name: shape for name, shape in wanted.items() if name in counts}
     stored = {name: arrays[f"function/{name}"].shape for name in checkpoint.functions}
     own = marked(state, lambda case: case.loading.values)
-    loads = {
-        name for name, value in checkpoint.loads.items() if value
-    }  # earlier versions kept all, zero or not
+    # earlier versions stored all loads, zero or not
+    loads = {name for name, value in checkpoint.loads.items() if value}
     if not wanted.items() <= (begins_anew | stored).items() or not loads <= own.keys():
         there, here = (
             f"functions {a} and loads {sorted(b)}" for a, b in ((stored, loads), (wanted, own))

@@ -32,16 +32,16 @@ NO_LUMEN = 1e-9  # of the body's size cubed: a flat inner face encloses that by 
 
 
 class Observer(Watcher):
-    """Gives every step its row.
+    """A watcher that fills every step's row.
 
     Parameters
     ----------
     shape
-        Says which columns there are, and what the fibre angle is.
+        Body shape, which defines the columns and the fibre angle.
     stepper
-        What is measured, with its further load cases; nothing here changes it.
+        Time stepper with the measured state and its further load cases; stays unchanged.
     columns
-        Other columns than `columns_of(shape)` of the loads that there are.
+        Columns to use instead of `columns_of(shape)` with the scene's loads.
 
     Examples
     --------
@@ -70,12 +70,12 @@ class Observer(Watcher):
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:
-        """Measure the start; every form that a column needs is compiled now."""
+        """Measure the start, which compiles every form that a column needs."""
         self.solved(step)
         self.completed(step)
 
     def resumed(self, step: Step) -> None:
-        """Compile every form that a column needs; nobody keeps this row."""
+        """Compile every form that a column needs; this row is not recorded."""
         self.started(step)
 
     def solved(self, step: Step) -> None:
@@ -109,7 +109,7 @@ class Measurement:
     Parameters
     ----------
     observer
-        Whose measurement it is.
+        Observer that the measurement belongs to.
     step
         The step.
 
@@ -118,9 +118,9 @@ class Measurement:
     step
         The step.
     observer
-        Whose measurement it is.
+        Observer that the measurement belongs to.
     domain, quadrature, state
-        The body, its quadrature points and its state.
+        Body, quadrature points and state.
 
     Examples
     --------
@@ -147,7 +147,7 @@ class Measurement:
 
     @property
     def equilibrium(self) -> Equilibrium:
-        """The forms of the solved state."""
+        """Equilibrium with the forms of the solved state."""
         coupling = self.observer.stepper.coupling
         return coupling.equilibrium
 
@@ -236,7 +236,7 @@ class Measurement:
         )
 
     def elements_of_region(self, name: str) -> NDArray[np.bool_]:
-        """Mask of the local elements of a region, (elements,)."""
+        """Return a mask of the local elements of a region, (elements,)."""
         return np.asarray(self.domain.element_region == self.domain.regions[name])
 
     @cached_property
@@ -245,22 +245,22 @@ class Measurement:
         return self.quadrature.element_mean(self.F[..., 2, 2])
 
     def face_mean(self, face: str, nodal_values: Array, deformed: bool = False) -> float:
-        """Mean of nodal values (nodes,) over a named face, by its reference or its deformed area.
+        """Compute the mean of nodal values over a named face, by reference or deformed area.
 
         Parameters
         ----------
         face
-            Its name, of `Domain.faces`.
+            Name from `Domain.faces`.
         nodal_values
-            At the local nodes, (nodes,); the mean is in their unit.
+            Values at the local nodes, (nodes,); the mean is in their unit.
         deformed
-            Whether by the deformed area.
+            Whether to average by the deformed area.
         """
         weighted, area = self._over_face(face, deformed, nodal_values, 1.0)
         return weighted / area
 
     def face_area(self, face: str, deformed: bool = False) -> float:
-        """Reference or deformed area of a named face."""
+        """Compute the reference or deformed area of a named face."""
         return self._over_face(face, deformed, 1.0)[0]
 
     def _over_face(self, face: str, deformed: bool, *nodal_values: Array | float) -> list[float]:
@@ -297,7 +297,7 @@ class Measurement:
         Parameters
         ----------
         face
-            Its name, of `Domain.faces`.
+            Name from `Domain.faces`.
         """
         return self.cached(("support", face), lambda: _support_force(self.equilibrium, face))()
 
@@ -309,27 +309,27 @@ class Measurement:
         return self.cached("lumen volume", lambda: _lumen_volume(self.observer))()
 
     def largest(self, values: Array) -> float:
-        """Largest of one value per local element, over all ranks.
+        """Return the largest of one value per local element, over all ranks.
 
         Parameters
         ----------
         values
-            One a local element, (elements,).
+            One value per local element, (elements,).
         """
         return self.quadrature.maximum(values)
 
     def smallest(self, values: Array) -> float:
-        """Smallest of one value per local element, over all ranks.
+        """Return the smallest of one value per local element, over all ranks.
 
         Parameters
         ----------
         values
-            One a local element, (elements,).
+            One value per local element, (elements,).
         """
         return self.quadrature.minimum(values)
 
     def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
-        """Mask of the local elements that a circle about the z axis touches, (elements,)."""
+        """Return a mask of the local elements at a radius from the z axis, (elements,)."""
 
         def touch() -> NDArray[np.bool_]:
             mesh = self.domain.mesh
@@ -377,7 +377,7 @@ class Measurement:
 def _face_form(
     measured: Measurement, face: str, deformed: bool
 ) -> tuple[dolfinx.fem.Function, dolfinx.fem.Form]:
-    """A nodal field, and its integral over the reference or the deformed area of a face."""
+    """Make a nodal field, and its integral over the reference or deformed area of a face."""
     state, mesh = measured.state, measured.domain.mesh
     # first component of a function of the displacement's space, which has the same order of nodes
     field: dolfinx.fem.Function = dolfinx.fem.Function(state.kinematics.nodal_space(state.unknown))
@@ -464,7 +464,7 @@ class EndForce(NamedTuple):
 
 
 def _end_forms(measured: Measurement, face: str) -> list[list[dolfinx.fem.Form]]:
-    """The forms of `EndForce`, in any kinematics and formulation."""
+    """Make the forms of `EndForce`, in any kinematics and formulation."""
     state, equilibrium = measured.state, measured.equilibrium
     mesh = measured.domain.mesh
     weight, F = state.kinematics.weight(mesh), state.kinematics.deformation_gradient(state.unknown)

@@ -65,7 +65,7 @@ Numbers = NDArray[np.float64]
 
 
 def kept_times(times: Numbers, most: int) -> Numbers:
-    """Keep so many of the recorded times, spaced evenly; the first and the last among them."""
+    """Select at most `most` recorded times, evenly spaced, with the first and the last."""
     return times[np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))]
 
 
