@@ -188,8 +188,8 @@ class Sheet(Box):
     may be prescribed; without either the edge is free. Lengths: 1e-6 to 1e6, one up to 10,000 times
     the other.
 
-    Its keyword arguments are the keys of `[geometry]`: lengths in the unit `length_unit`, or in any one
-    unit.
+    Its keyword arguments are the keys of `[geometry]`: lengths in the unit `length_unit`,
+    or in any one unit.
 
     Raises
     ------

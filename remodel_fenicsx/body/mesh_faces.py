@@ -93,8 +93,8 @@ def boundary_of(
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
     for name, numbers in (*groups.items(), *others.items()):
         keys = as_rows(np.sort(file.facets[np.isin(file.facet_groups, numbers)], axis=1))
-        rows: list[Any] = [index.get(key) for key in keys]
-        for key, row in zip(keys, rows, strict=True):
+        indices: list[Any] = [index.get(key) for key in keys]
+        for key, row in zip(keys, indices, strict=True):
             if row is not None and owner[row] in ("", name):
                 continue
             if name in others:
@@ -110,7 +110,7 @@ def boundary_of(
                 f"{words}, the first at {format_position(file.points[list(key)].mean(axis=0))}",
             )
         else:
-            owner[rows] = name
+            owner[indices] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
         where, share = format_position(places[bare][0].mean(axis=0)), bare.sum()
