@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import methodcaller
+from operator import attrgetter, methodcaller
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
@@ -144,11 +144,7 @@ def _profile(number: int, m: Any) -> float:
     return m.quadrature.nanmean(m.fibre_angle, hats[..., number])
 
 
-def _remodeling(m: Any) -> Any:
-    stepper = m.observer.stepper
-    return stepper.remodeling
-
-
+_remodeling = attrgetter("observer.stepper.remodeling")
 _PROFILE_COLUMNS = tuple(
     Column(
         name,
