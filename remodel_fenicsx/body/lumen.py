@@ -102,7 +102,7 @@ def _signed_volume(points: Array, triangles: Integers) -> float:
 def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
     """Remesh the surface by Gmsh with triangles of a size, rounded.
 
-    Also return the nearest corner of the given surface for each new corner.
+    Also return the nearest corner of the original surface for each new corner.
     """
     from scipy.spatial import cKDTree
 
@@ -187,7 +187,7 @@ class ExtrudedWall(NamedTuple):
 def extrude_wall(
     surface: Surface, given: Surface, thickness: Array, layers: Mapping[str, float], through: int
 ) -> ExtrudedWall:
-    """Extrude prisms from a surface outwards, curved as the given one, by a thickness (points,).
+    """Extrude prisms from a surface outwards, curved as the original one, by a thickness (points,).
 
     Each layer has its fraction of the thickness.
     """

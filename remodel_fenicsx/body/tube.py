@@ -59,7 +59,7 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 def build_in_half_plane(
     dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None = None
 ) -> Domain:
-    """Mesh the wall on the x axis (1) or in the half-plane y = 0, x > 0 (2), as the body is."""
+    """Mesh the wall with the body's elements on the x axis (1) or in the half-plane y = 0 (2)."""
     from remodel_fenicsx.body.domain import lattice_domain
 
     shape, degree = scene.geometry, scene.mesh.degree
@@ -437,7 +437,7 @@ class Tube(RoundWall):
                 warn_of_twist(face, support, loading.domain.comm)
 
     def wall(self, elements: int, regions: Regions) -> Wall:
-        """Return its wall with so many elements through it."""
+        """Return the layered wall with this number of elements through it."""
         return Wall.from_regions(self.inner_radius, self.outer_radius, elements, regions)
 
     @model_validator(mode="after")

@@ -302,7 +302,8 @@ def growth(scene: Scene) -> Faults:
         if scene.cases:
             yield "needs a scene without [[cases]]", key, EQUILIBRIUM
     elif start and time.is_equilibrium:
-        yield "must be 0 or 'equilibrium' with time.end = 'equilibrium', which has no times", key, start
+        rule = "must be 0 or 'equilibrium' with time.end = 'equilibrium', which has no times"
+        yield rule, key, start
     elif start and start > time.end:
         yield f"must be at most time.end = {format_value(time.end)}", key, start
     elif start:

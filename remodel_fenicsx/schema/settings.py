@@ -642,9 +642,9 @@ _WithStart: Any = with_key(
     Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_Start))],
     default=0.0,
     json_schema_extra={"allowed": "a finite number of at least 0, or 'equilibrium'"},
-    description="Time from which turnover adds volume; a step ends there. 0: always. 'equilibrium', "
-    "with time.end = 'equilibrium': from the steady state under the loads before their last change. "
-    "The older name 'rest' means the same.",
+    description="Time from which turnover adds volume; a step ends there. 0: always. "
+    "'equilibrium', with time.end = 'equilibrium': from the steady state under the loads before "
+    "their last change. The older name 'rest' means the same.",
 )
 
 

@@ -225,7 +225,7 @@ class Continuation:
                 work.substeps += 1
 
     def check_for_jump(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
-        """Repeat a step in substeps if it may have jumped. Return whether it was. Collective."""
+        """Repeat a step in substeps if it may have jumped. Return True if so. Collective."""
         # `again`: the same step was solved before, with other cells.
         vector, jumps = self.state.unknown.x, self._jumps
         moved, last = self._size(vector.array - before), jumps["moved"]

@@ -58,7 +58,7 @@ class LimitedMemoryUpdate:
         self._last = None
 
     def improve(self, x: Vec, residual: Vec, step: Vec) -> bool:
-        """Improve the step H r (trial: x - step) in place. Return whether it was. Collective."""
+        """Improve the step H r (trial: x - step) in place. Return True if so. Collective."""
         now = np.array([x.array_r, residual.array_r, step.array_r])
         if self._last is not None:
             pair = now - self._last
